@@ -1,11 +1,11 @@
 """`python -m imgcal` is the command `imgcal`."""
 
-from imgcal.cli.interruption import ends_at_once
+from imgcal.cli.interruption import end_at_once
 
 
 def run() -> None:
     """Entry point of the installed command."""
-    with ends_at_once():
+    with end_at_once():
         from imgcal.cli.main import run as run_command
     run_command()
 

@@ -10,20 +10,20 @@ MOST_QUOTED = 200  # characters of a file's or another program's text
 LONGEST = 1000  # characters of a message
 
 
-def shortened(text: str) -> str:
+def shorten(text: str) -> str:
     """Keep a name or a cell that a message quotes to a readable length."""
     return text if len(text) <= 40 else text[:37] + "..."
 
 
-def quoted(text: str) -> str:
+def quote(text: str) -> str:
     """Keep what a message repeats of another program's words, or of a whole value, to a readable length."""
     return text if len(text) <= MOST_QUOTED else text[: MOST_QUOTED - 3] + "..."
 
 
-def listed(names: Iterable[str]) -> str:
+def list_names(names: Iterable[str]) -> str:
     """List names, as many as fit."""
     whole = list(names)
-    shown = [shortened(name) for name in whole]
+    shown = [shorten(name) for name in whole]
     if len(", ".join(shown)) <= MOST_QUOTED:
         return ", ".join(shown)
     return f"{', '.join(shown[: MOST_QUOTED // 50])}, ... ({len(whole)} in all)"

@@ -65,14 +65,14 @@ class Operator:
     @property
     def pulled(self) -> list[str]:
         """Names of all that a gradient is computed from: inputs, outputs, and gradients by outputs."""
-        return [*self.inputs, *self.outputs, *self.wanted(self.outputs, self.outputs)]
+        return [*self.inputs, *self.outputs, *self.select_differentiable(self.outputs, self.outputs)]
 
     @property
     def pushed(self) -> list[str]:
         """Names of all that a tangent is computed from: inputs, outputs, and tangents of inputs."""
         return [*self.inputs, *self.outputs, *self.leaves]
 
-    def wanted(self, names: Sequence[str], values: Iterable[Any]) -> list[Any]:
+    def select_differentiable(self, names: Sequence[str], values: Iterable[Any]) -> list[Any]:
         """Keep what belongs to differentiable inputs or outputs."""
         return [value for name, value in zip(names, values, strict=True) if name in self.differentiable]
 
@@ -84,7 +84,7 @@ class Operator:
 
     def gradients(self, inputs: Tensors, outputs: Tensors, upstream: Tensors, options: str) -> Tensors:
         """Pull gradients by differentiable outputs back to those by differentiable inputs."""
-        leaves, pairs = self._attached(inputs, outputs, upstream, options)
+        leaves, pairs = self._attach(inputs, outputs, upstream, options)
         if not pairs:
             return tuple(torch.zeros_like(x, memory_format=torch.contiguous_format) for x in leaves)
         attached, weights = zip(*pairs, strict=True)
@@ -96,8 +96,10 @@ class Operator:
 
         Pulling back is linear; its transpose pushes forward.
         """
-        weights = tuple(torch.zeros_like(x, requires_grad=True) for x in self.wanted(self.outputs, outputs))
-        leaves, pairs = self._attached(inputs, outputs, weights, options)
+        weights = tuple(
+            torch.zeros_like(x, requires_grad=True) for x in self.select_differentiable(self.outputs, outputs)
+        )
+        leaves, pairs = self._attach(inputs, outputs, weights, options)
         if not pairs:
             return tuple(torch.zeros_like(x) for x in weights)
         attached, used = zip(*pairs, strict=True)
@@ -107,7 +109,7 @@ class Operator:
         found = torch.autograd.grad(ends, weights, along, allow_unused=True, materialize_grads=True)
         return tuple(x.contiguous() for x in found)
 
-    def _attached(
+    def _attach(
         self, inputs: Tensors, outputs: Tensors, weights: Tensors, options: str
     ) -> tuple[Tensors, list[tuple[Tensor, Tensor]]]:
         """Differentiable inputs, and pairs of an output that depends on them and its weight."""
@@ -117,15 +119,17 @@ class Operator:
                 for name, x in zip(self.inputs, inputs, strict=True)
             )
             attached = self.attach(given, tuple(x.detach() for x in outputs), options)
-        pairs = zip(self.wanted(self.outputs, attached), weights, strict=True)
-        return tuple(self.wanted(self.inputs, given)), [(x, w) for x, w in pairs if x.requires_grad]
+        pairs = zip(self.select_differentiable(self.outputs, attached), weights, strict=True)
+        return tuple(self.select_differentiable(self.inputs, given)), [(x, w) for x, w in pairs if x.requires_grad]
 
 
 def _register(operator: Operator) -> None:
     """Make the operator known to PyTorch, and another one for its gradient."""
     inputs = ", ".join(f"Tensor {name}" for name in operator.inputs)
     outputs = ", ".join(f"Tensor {name}_" for name in operator.outputs)
-    upstream = ", ".join(f"Tensor by_{name}" for name in operator.wanted(operator.outputs, operator.outputs))
+    upstream = ", ".join(
+        f"Tensor by_{name}" for name in operator.select_differentiable(operator.outputs, operator.outputs)
+    )
     returned = ", ".join("Tensor" for _ in operator.outputs)
     schema = f"({inputs}, {outputs}, {upstream}, str options) -> Tensor[]"
     name = f"{NAMESPACE}::{operator.name}"
@@ -136,7 +140,7 @@ def _register(operator: Operator) -> None:
 
     @torch.library.custom_op(f"{name}_gradients", mutates_args=(), schema=schema)
     def backward(*given: Any) -> list[Tensor]:
-        return list(_with_autograd(lambda: _gradients(operator, *given)))
+        return list(_call_with_autograd(lambda: _gradients(operator, *given)))
 
     @forward.register_fake
     def _(*given: Any) -> Tensors:
@@ -144,14 +148,14 @@ def _register(operator: Operator) -> None:
 
     @backward.register_fake
     def _(*given: Any) -> list[Tensor]:
-        likes = operator.wanted(operator.inputs, given[: len(operator.inputs)])
+        likes = operator.select_differentiable(operator.inputs, given[: len(operator.inputs)])
         return [torch.empty_like(x, memory_format=torch.contiguous_format) for x in likes]
 
     def save(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:
         _save(ctx, operator, inputs, output)
 
     def pull(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        weights = operator.wanted(operator.outputs, upstream)
+        weights = operator.select_differentiable(operator.outputs, upstream)
         return _spread(operator, backward(*ctx.saved_tensors, *weights, ctx.options))
 
     forward.register_autograd(pull, setup_context=save)
@@ -162,16 +166,14 @@ def _register(operator: Operator) -> None:
             found: Tensors = forward(*x, given[-1])
             return found
 
-        return _mapped(operator, call, info.batch_size, axes[:-1], given[:-1], operator.inputs, operator.outputs)
+        return _map(operator, call, info.batch_size, axes[:-1], given[:-1], operator.inputs, operator.outputs)
 
     @backward.register_vmap
     def _(info: Any, axes: tuple[int | None, ...], *given: Any) -> Any:
         def call(*x: Tensor) -> Tensors:
             return tuple(backward(*x, given[-1]))
 
-        found, out_axes = _mapped(
-            operator, call, info.batch_size, axes[:-1], given[:-1], operator.pulled, operator.leaves
-        )
+        found, out_axes = _map(operator, call, info.batch_size, axes[:-1], given[:-1], operator.pulled, operator.leaves)
         return list(found), list(out_axes)
 
 
@@ -194,15 +196,15 @@ class _Outputs(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        weights = ctx.operator.wanted(ctx.operator.outputs, upstream)
+        weights = ctx.operator.select_differentiable(ctx.operator.outputs, upstream)
         found = _Gradients.apply(ctx.operator, *ctx.saved_tensors, *weights, ctx.options)
         return (None, *_spread(ctx.operator, found))
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> tuple[Tensor | None, ...]:
         operator, saved = ctx.operator, ctx.saved_tensors
-        primals = operator.wanted(operator.inputs, saved[: len(operator.inputs)])
-        given = operator.wanted(operator.inputs, tangents[1:-1])
+        primals = operator.select_differentiable(operator.inputs, saved[: len(operator.inputs)])
+        given = operator.select_differentiable(operator.inputs, tangents[1:-1])
         filled = [torch.zeros_like(x) if t is None else t for x, t in zip(primals, given, strict=True)]
         found = iter(_Tangents.apply(operator, *saved, *filled, ctx.options))
         return tuple(next(found) if name in operator.differentiable else None for name in operator.outputs)
@@ -213,7 +215,7 @@ class _Outputs(torch.autograd.Function):
             found: Tensors = _Outputs.apply(operator, *x, given[-1])
             return found
 
-        return _mapped(operator, call, info.batch_size, axes[1:-1], given[:-1], operator.inputs, operator.outputs)
+        return _map(operator, call, info.batch_size, axes[1:-1], given[:-1], operator.inputs, operator.outputs)
 
 
 class _Linear(torch.autograd.Function):
@@ -239,13 +241,13 @@ class _Gradients(_Linear):
             found: Tensors = _Gradients.apply(operator, *x, given[-1])
             return found
 
-        return _mapped(operator, call, info.batch_size, axes[1:-1], given[:-1], operator.pulled, operator.leaves)
+        return _map(operator, call, info.batch_size, axes[1:-1], given[:-1], operator.pulled, operator.leaves)
 
 
 class _Tangents(_Linear):
     @staticmethod
     def forward(operator: Operator, *given: Any) -> Tensors:
-        inputs, outputs, tangents = _parted(operator, given[:-1])
+        inputs, outputs, tangents = _split(operator, given[:-1])
         return operator.tangents(inputs, outputs, tangents, given[-1])
 
     @staticmethod
@@ -254,15 +256,15 @@ class _Tangents(_Linear):
             found: Tensors = _Tangents.apply(operator, *x, given[-1])
             return found
 
-        return _mapped(operator, call, info.batch_size, axes[1:-1], given[:-1], operator.pushed, operator.outputs)
+        return _map(operator, call, info.batch_size, axes[1:-1], given[:-1], operator.pushed, operator.outputs)
 
 
 def _gradients(operator: Operator, *given: Any) -> Tensors:
-    inputs, outputs, upstream = _parted(operator, given[:-1])
+    inputs, outputs, upstream = _split(operator, given[:-1])
     return operator.gradients(inputs, outputs, upstream, given[-1])
 
 
-def _with_autograd(work: Callable[[], Tensors]) -> Tensors:
+def _call_with_autograd(work: Callable[[], Tensors]) -> Tensors:
     """Call where autograd records: PyTorch switches it off inside of operators, but not for other threads."""
     with torch.enable_grad():
         records = (torch.zeros((), requires_grad=True) + 0).requires_grad
@@ -272,7 +274,7 @@ def _with_autograd(work: Callable[[], Tensors]) -> Tensors:
         return pool.submit(work).result()
 
 
-def _parted(operator: Operator, given: Tensors) -> tuple[Tensors, Tensors, Tensors]:
+def _split(operator: Operator, given: Tensors) -> tuple[Tensors, Tensors, Tensors]:
     """Inputs, outputs, and what else is given."""
     first, second = len(operator.inputs), len(operator.inputs) + len(operator.outputs)
     return given[:first], given[first:second], given[second:]
@@ -289,7 +291,7 @@ def _spread(operator: Operator, gradients: Iterable[Tensor]) -> tuple[Tensor | N
     return (*(next(found) if name in operator.differentiable else None for name in operator.inputs), None)
 
 
-def _mapped(
+def _map(
     operator: Operator,
     call: Callable[..., Tensors],
     size: int,
@@ -303,7 +305,7 @@ def _mapped(
     if operator.batched.issuperset(returned) and all(
         axis is None or has for axis, has in zip(axes, batched, strict=True)
     ):
-        folded = (_folded(x, axis, size) if has else x for x, axis, has in zip(given, axes, batched, strict=True))
+        folded = (_fold(x, axis, size) if has else x for x, axis, has in zip(given, axes, batched, strict=True))
         found = call(*folded)
         return tuple(x.unflatten(0, (size, len(x) // size)) for x in found), (0,) * len(found)
     rows = [
@@ -313,6 +315,6 @@ def _mapped(
     return tuple(torch.stack(column) for column in zip(*rows, strict=True)), (0,) * len(rows[0])
 
 
-def _folded(x: Tensor, axis: int | None, size: int) -> Tensor:
+def _fold(x: Tensor, axis: int | None, size: int) -> Tensor:
     moved = x.expand(size, *x.shape) if axis is None else x.movedim(axis, 0)
     return moved.flatten(0, 1)

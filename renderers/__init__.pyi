@@ -1,4 +1,4 @@
-from .clutter import Clutter, draped, sample_clutter
+from .clutter import Clutter, drape_spots, sample_clutter
 from .clutter_model import NO_BLOBS, BlobRange, ClutterModel
 from .crops import render_crops
 from .infrared import InfraredFrames, infrared_frames, render_blobs
@@ -20,7 +20,7 @@ __all__ = [
     "Smear",
     "Spots",
     "Surface",
-    "draped",
+    "drape_spots",
     "ellipse_reference",
     "expose",
     "in_crop",

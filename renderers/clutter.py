@@ -39,7 +39,7 @@ def sample_clutter(
 
     Returns:
         The clutter, which is also the truth about it: reflections come first in ``false_blobs``, then small blobs,
-        speckles of textures, neighbours of markers. Drapes have cut the false blobs; ``draped`` cuts the markers.
+        speckles of textures, neighbours of markers. Drapes have cut the false blobs; ``drape_spots`` cuts the markers.
     """
     batch = markers.uv.shape[:-2]
 
@@ -47,24 +47,26 @@ def sample_clutter(
         unit = torch.rand(*batch, *shape, generator=generator, dtype=markers.uv.dtype, device=markers.uv.device)
         return interval[0] + (interval[1] - interval[0]) * unit
 
-    small = [_scattered(kind, image_size, uniform) for kind in (model.reflections, model.blobs)]
+    small = [_scatter(kind, image_size, uniform) for kind in (model.reflections, model.blobs)]
     occluders = _occluders(model, markers, uniform)
     large = []
     if model.streaks.count:
-        large.append(_scattered(model.streaks, image_size, uniform))
+        large.append(_scatter(model.streaks, image_size, uniform))
     if model.textures.count:
-        large.append(_scattered(model.textures, image_size, uniform))
+        large.append(_scatter(model.textures, image_size, uniform))
         small.append(_speckles(model, large[-1], uniform))
     if model.neighbours > 0:
         small.append(_neighbours(model, markers, uniform))
-    false_blobs = joined(small)
+    false_blobs = join_spots(small)
     if not model.drapes:
         return Clutter(false_blobs, occluders, tuple(large))
     drapes = _drapes(model, image_size, uniform)
-    return Clutter(draped(false_blobs, drapes), occluders, tuple(draped(part, drapes) for part in large), drapes)
+    return Clutter(
+        drape_spots(false_blobs, drapes), occluders, tuple(drape_spots(part, drapes) for part in large), drapes
+    )
 
 
-def draped(spots: Spots, drapes: Tensor) -> Spots:
+def drape_spots(spots: Spots, drapes: Tensor) -> Spots:
     """Cut spots at the edges of drapes that they lie next to.
 
     A drape is large beside a spot: the edge that is nearest to being passed cuts it. Exact but at a drape's corners.
@@ -84,7 +86,7 @@ def draped(spots: Spots, drapes: Tensor) -> Spots:
     return replace(spots, surface=surface)
 
 
-def joined(parts: list[Spots]) -> Spots:
+def join_spots(parts: list[Spots]) -> Spots:
     """Put plain spots (*B, N) of one batch side by side."""
     return Spots(
         torch.cat([part.uv for part in parts], dim=-2),
@@ -95,7 +97,7 @@ def joined(parts: list[Spots]) -> Spots:
     )
 
 
-def _scattered(kind: BlobRange, image_size: tuple[int, int], uniform: Uniform) -> Spots:
+def _scatter(kind: BlobRange, image_size: tuple[int, int], uniform: Uniform) -> Spots:
     """Put blobs anywhere in the frame."""
     height, width = image_size
     major = uniform(kind.radius, kind.count)

@@ -48,7 +48,7 @@ def njit(**options: Any) -> Callable[[Function], Function]:
         before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, cache_folder()  # type: ignore[attr-defined]
         try:
             compiled = numba.njit(**options)(function)
-            return cast(Function, _kept(compiled) if options["cache"] else compiled)
+            return cast(Function, _keep_cached(compiled) if options["cache"] else compiled)
         except RuntimeError:  # nowhere to write: compiled anew in every process
             return cast(Function, numba.njit(**(options | {"cache": False}))(function))
         finally:
@@ -57,7 +57,7 @@ def njit(**options: Any) -> Callable[[Function], Function]:
     return decorate
 
 
-def _kept(compiled: Any) -> Any:
+def _keep_cached(compiled: Any) -> Any:
     """Keep machine code as long as all that went into it stays the same, and let no other process save meanwhile.
 
     Numba numbers the files of a function's signatures without a lock: of two processes that save two of them at once,
@@ -120,7 +120,7 @@ def cache_folder() -> str:
         writable = os.access(folder, os.W_OK)
     except OSError:
         return given
-    return str(folder) if writable else _linked(folder)
+    return str(folder) if writable else _link_folder(folder)
 
 
 def is_shared() -> bool:
@@ -138,7 +138,7 @@ def _user_folder() -> Path:
     return Path(user) / "imgcal" / release
 
 
-def _linked(folder: Path) -> str:
+def _link_folder(folder: Path) -> str:
     """Make a folder of this process, which numba takes because it can be written, with links to all that is there."""
     links = Path(tempfile.mkdtemp(prefix="imgcal-compiled-"))
     shutil.copytree(folder, links, copy_function=os.symlink, dirs_exist_ok=True)

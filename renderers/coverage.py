@@ -54,14 +54,14 @@ def ellipse_coverage(
     slant = shape[:, 0, 1] / half_height
     u = (centre[:, 0] - windows.columns)[:, None] + slant[:, None] * middle  # (P, slabs) chord centres in the window
     v = (centre[:, 1] - windows.rows)[:, None] + half_height[:, None] * edge  # (P, slabs + 1)
-    along_v = _blurred_box(v[:, :-1], v[:, 1:], windows.size[0], windows.finer, blur)
+    along_v = _blur_box(v[:, :-1], v[:, 1:], windows.size[0], windows.finer, blur)
     if surface is None:
         low, high = u - half_width[:, None] * chord, u + half_width[:, None] * chord
-        along_u = _blurred_box(low, high, windows.size[1], windows.finer, blur)
+        along_u = _blur_box(low, high, windows.size[1], windows.finer, blur)
         return (along_v.mT @ along_u).clamp(0, 1)[:, None]
-    x = _kept(surface.cuts, (half_width, half_height, slant), middle, chord)  # (P, slabs, 2)
+    x = _cut_chords(surface.cuts, (half_width, half_height, slant), middle, chord)  # (P, slabs, 2)
     edges = u[..., None] + half_width[:, None, None] * x
-    hiding = _blurred_box(edges[..., 0], edges[..., 1], windows.size[1], windows.finer, blur)
+    hiding = _blur_box(edges[..., 0], edges[..., 1], windows.size[1], windows.finer, blur)
     if surface.limb is None and surface.bumps is None:
         return (along_v.mT @ hiding).clamp(0, 1)[:, None]
     x, edges = (torch.lerp(e[..., :1], e[..., 1:], torch.linspace(0, 1, PIECES + 1).to(e)) for e in (x, edges))
@@ -75,7 +75,7 @@ def ellipse_coverage(
     return torch.cat([both[:, :1].clamp(0, 1), both[:, 1:].clamp(min=0)], dim=1)
 
 
-def smeared(fine: Tensor, smear: Smear, finer: int) -> Tensor:
+def smear_windows(fine: Tensor, smear: Smear, finer: int) -> Tensor:
     """Spread windows along straight paths and over discs of confusion, and keep one sample a pixel.
 
     Both are exact factors of the spectrum: sinc(k path / 2) of a uniform way, 2 J1(R |k|) / (R |k|) of a disc. The
@@ -101,7 +101,7 @@ def smeared(fine: Tensor, smear: Smear, finer: int) -> Tensor:
     return spread[..., ::finer, ::finer].clamp(min=0)
 
 
-def _kept(cuts: Tensor, axes: tuple[Tensor, Tensor, Tensor], y: Tensor, chord: Tensor) -> Tensor:
+def _cut_chords(cuts: Tensor, axes: tuple[Tensor, Tensor, Tensor], y: Tensor, chord: Tensor) -> Tensor:
     """Find what cuts leave of each chord: (P, S, 2) its ends in surface coordinates.
 
     A cut by n p <= o is a x + b y <= o there, with a, b = L^T n; what it keeps of a chord is an interval.
@@ -129,7 +129,7 @@ def _brightness(surface: Surface, x: Tensor, y: Tensor) -> Tensor:
     return light
 
 
-def _blurred_box(low: Tensor, high: Tensor, length: int, finer: int, blur: float) -> Tensor:
+def _blur_box(low: Tensor, high: Tensor, length: int, finer: int, blur: float) -> Tensor:
     """Blur the interval [low, high] (...) by a Gaussian and integrate it over pixels 0 .. length - 1: (..., n)."""
     return _pixels(_twice_integrated(low, length, finer, blur) - _twice_integrated(high, length, finer, blur), finer)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from renderers.clutter import Clutter
 from renderers.compositing import Canvas, composite_windows, window_starts
-from renderers.coverage import Windows, ellipse_coverage, smeared
+from renderers.coverage import Windows, ellipse_coverage, smear_windows
 from renderers.sensor import expose
 from renderers.sensor_model import SensorModel
 from renderers.spots import Spots
@@ -162,7 +162,9 @@ def _windows(
         finer = next(samples for least, samples in FINER if blur >= least)
         first = [(flat.uv[:, i].detach() - (length[i] - 1) / 2).round().long() for i in (0, 1)]
         windows = Windows(first[1], first[0], (length[1], length[0]), finer)
-        drawn = smeared(ellipse_coverage(flat.uv, flat.shape, windows, blur, slabs, flat.surface), flat.smear, finer)
+        drawn = smear_windows(
+            ellipse_coverage(flat.uv, flat.shape, windows, blur, slabs, flat.surface), flat.smear, finer
+        )
         drawn = _cut_out(drawn, rows.flatten() - first[1], inside[1], dim=-2)
         drawn = _cut_out(drawn, columns.flatten() - first[0], inside[0], dim=-1)
     drawn = drawn.unflatten(0, blobs.depth.shape)

@@ -19,7 +19,7 @@ def source_digest(module: str) -> str:
     packages = {*PACKAGES, module.partition(".")[0]}
     found, waiting = {module}, [module]
     while waiting:
-        new = {name for name in _imported(waiting.pop()) if name.partition(".")[0] in packages} - found
+        new = {name for name in _imported_modules(waiting.pop()) if name.partition(".")[0] in packages} - found
         found |= new
         waiting += new
     return hashlib.sha256("".join(map(_digest, sorted(found))).encode()).hexdigest()
@@ -39,7 +39,7 @@ def _digest(module: str) -> str:
 
 
 @cache
-def _imported(module: str) -> frozenset[str]:
+def _imported_modules(module: str) -> frozenset[str]:
     """Modules that its import statements name; of a name that a package lends, the module that it comes from."""
     source = _source(module).decode()
     found = set(re.findall(r"^import ([\w.]+)", source, re.MULTILINE))

@@ -52,7 +52,7 @@ class Spots:
             >>> spots.of_each(lambda values: values[:2]).shape.shape
             torch.Size([2, 1, 2, 2])
         """
-        return _changed(self, change)
+        return _apply(self, change)
 
 
 def roll_rows(spots: Spots, speed: Tensor, reference_row: float) -> Spots:
@@ -101,13 +101,13 @@ def in_crop(spots: Spots, centre: Tensor, scale: float, size: tuple[int, int]) -
     )
 
 
-def _changed(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
+def _apply(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
     """Apply a function to every tensor of nested value types."""
     parts = {field.name: getattr(value, field.name) for field in fields(value)}
     return replace(
         value,
         **{
-            name: change(part) if isinstance(part, Tensor) else _changed(part, change)
+            name: change(part) if isinstance(part, Tensor) else _apply(part, change)
             for name, part in parts.items()
             if part is not None
         },

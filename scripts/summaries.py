@@ -191,7 +191,7 @@ def _recalibration_rows() -> list[list[str]]:
         return " / ".join(f"{fmean(row['over_bound'].values()):.2f}" for row in rows)
 
     def time(row: Mapping[str, Any]) -> float:
-        return row["p50"]  # type: ignore[no-any-return]
+        return row["p50"]
 
     mrcal = f"mrcal {cell('mrcal', time)} ms"
     at, converged = result["basin"]["scales"].index(8), result["basin"]["converged"]["1"]

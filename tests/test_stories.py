@@ -16,7 +16,7 @@ import pytest
 from imgcal.cli.main import main
 from imgcal.formats import in_millimetres, load_rig, read_foreign_rig, worst_difference
 from imgcal.formats.conversion import from_camera_rig
-from imgcal.formats.writing import selected
+from imgcal.formats.writing import select_cameras
 
 ROOT = Path(__file__).parents[1]
 FENCE = re.compile(r"^```(python|console)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -54,10 +54,10 @@ def test_stories_end_as_they_are_told(tmp_path: Path, monkeypatch: pytest.Monkey
     # ROS has the pair where it is now, not where it was.
     factory = load_rig("camchain.yaml")
     pair = ("cam3", "cam4")
-    true = selected(from_camera_rig(factory.retract(names["bump"])), pair)
+    true = select_cameras(from_camera_rig(factory.retract(names["bump"])), pair)
     ros = in_millimetres(read_foreign_rig("ros"), "ros")
     assert worst_difference(true, ros)[0] < 5
-    assert worst_difference(selected(from_camera_rig(factory), pair), ros)[0] > 50
+    assert worst_difference(select_cameras(from_camera_rig(factory), pair), ros)[0] > 50
     # COLMAP's new model has its pixels, and the unit of its old one is the ruler's.
     models = (("colmap", "1m"), ("colmap-new", "m"))
     before, after = (in_millimetres(read_foreign_rig(name), name, unit) for name, unit in models)

@@ -1,22 +1,22 @@
-from .alone import is_few_and_flat, labels_by_shape
-from .ambiguities import lattice_shifts, near_turns
+from .ambiguities import lattice_shifts, near_symmetries
 from .assignment import distances_to_nearest, mutual_nearest
-from .blobs import pattern_prior, undistorted
+from .blobs import pattern_prior, undistort
 from .identification import identify, relocalize, track
 from .lights import Lights, align_camera, align_rig, associate_lights, background_rows, image_error, predicted_misses
 from .merging import drop_merged, find_merged, merging_distance
 from .options import PipelineOptions
-from .orientation import oriented
-from .proposals import Proposal, Proposer, Sight, Snapshot, judge, rows_of
+from .orientation import orient
+from .proposals import Proposal, Proposer, Sight, Snapshot, judge, proposal_rows
 from .result import Identity, IdentityOptions, Status
 from .series import (
     Associations,
     Progress,
+    accepted_observations,
     associate,
-    matched_to_rig,
-    observations_of,
-    without_snapshots,
+    drop_snapshots,
+    match_to_rig,
 )
+from .single_image_labels import is_small_planar, label_by_shape
 from .tracker import SnapshotIdentity, Tracker, to_observations
 
 __all__ = [
@@ -33,6 +33,7 @@ __all__ = [
     "SnapshotIdentity",
     "Status",
     "Tracker",
+    "accepted_observations",
     "align_camera",
     "align_rig",
     "associate",
@@ -40,25 +41,24 @@ __all__ = [
     "background_rows",
     "distances_to_nearest",
     "drop_merged",
+    "drop_snapshots",
     "find_merged",
     "identify",
     "image_error",
-    "is_few_and_flat",
+    "is_small_planar",
     "judge",
-    "labels_by_shape",
+    "label_by_shape",
     "lattice_shifts",
-    "matched_to_rig",
+    "match_to_rig",
     "merging_distance",
     "mutual_nearest",
-    "near_turns",
-    "observations_of",
-    "oriented",
+    "near_symmetries",
+    "orient",
     "pattern_prior",
     "predicted_misses",
+    "proposal_rows",
     "relocalize",
-    "rows_of",
     "to_observations",
     "track",
-    "undistorted",
-    "without_snapshots",
+    "undistort",
 ]

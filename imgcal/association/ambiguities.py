@@ -49,10 +49,10 @@ def _lattice_shifts(coordinates: bytes, tolerance: float) -> tuple[Ambiguity, ..
     sums = np.stack([np.bincount(place.ravel(), weights=differences[:, i]) for i in range(3)], axis=1)
     shifts = sums[often] / counts[often, None]
     shifts = shifts[np.argsort(np.linalg.norm(shifts, axis=1), kind="stable")[:MOST_SHIFTS]]
-    return tuple(Ambiguity(np.eye(3), shift, _onto(points, points + shift, 2 * tolerance)) for shift in shifts)
+    return tuple(Ambiguity(np.eye(3), shift, _map_onto(points, points + shift, 2 * tolerance)) for shift in shifts)
 
 
-def near_turns(obj: CalibrationObject, tolerance: float) -> list[Ambiguity]:
+def near_symmetries(obj: CalibrationObject, tolerance: float) -> list[Ambiguity]:
     """Find the turns that take every fiducial to within `tolerance` (mm) of another, but are no symmetries.
 
     Sizes of fiducials do not count here: that they break a symmetry must be seen in the blobs.
@@ -66,7 +66,7 @@ def near_turns(obj: CalibrationObject, tolerance: float) -> list[Ambiguity]:
     ]
 
 
-def relabelled(
+def relabel(
     pose: RigidTransform, labels: NDArray[np.int64], motions: list[Ambiguity]
 ) -> tuple[Poses, NDArray[np.int64]]:
     """Label the blobs as if the object had made each motion backwards.
@@ -101,7 +101,7 @@ def conflicts(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[
     Labellings without a common blob conflict entirely.
     """
     common = max(int(common_blobs(first, second).sum()), 1)
-    return min(1 - int(agreed.sum()) / common for agreed in _agreed(obj, first, second))
+    return min(1 - int(agreed.sum()) / common for agreed in _count_agreements(obj, first, second))
 
 
 def differ(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]) -> bool:
@@ -114,16 +114,18 @@ def differ(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.
         return True
     return all(
         3 * (common - agreed).sum() > common.sum() or bool(((common - agreed) >= np.maximum(3, common / 3)).any())
-        for agreed in _agreed(obj, first, second)
+        for agreed in _count_agreements(obj, first, second)
     )
 
 
-def _agreed(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def _count_agreements(
+    obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]
+) -> list[NDArray[np.int64]]:
     """Number of blobs that two labellings call the same, for each camera (C,) and symmetry."""
     return [((first >= 0) & (first == second[:, motion.permutation])).sum(1) for motion in obj.symmetries]
 
 
-def _onto(points: NDArray[np.float64], images: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
+def _map_onto(points: NDArray[np.float64], images: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
     distance, index = cKDTree(points).query(images)
     return np.where(distance <= tolerance, index, -1)
 

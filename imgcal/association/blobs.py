@@ -40,7 +40,7 @@ class PaddedBlobs:
         variance, valid = self.sigma**2, self.row >= 0
         return variance, float(np.median(variance[valid])) if valid.any() else 0.0
 
-    def only(self, camera: int) -> PaddedBlobs:
+    def select_camera(self, camera: int) -> PaddedBlobs:
         """Keep one camera; labels keep their numbers."""
         one = [camera]
         kept = (self.uv[one], self.ideal[one], self.sigma[one], self.radius[one], self.row[one], self.count[one])
@@ -73,7 +73,7 @@ def gather(detections: Detections, rig: CameraRig) -> PaddedBlobs:
     rows = np.flatnonzero(detections.usable)
     places = np.column_stack((detections.camera[rows], detections.uv[rows]))
     rows = rows[np.sort(np.unique(places, axis=0, return_index=True)[1])]
-    ideal = undistorted(detections.uv[rows], detections.camera[rows], rig)
+    ideal = undistort(detections.uv[rows], detections.camera[rows], rig)
     finite = np.isfinite(ideal).all(-1)  # a lens that was fitted to next to nothing may show no such place
     rows, ideal = rows[finite], ideal[finite]
     order = np.argsort(detections.camera[rows], kind="stable")
@@ -91,7 +91,7 @@ def gather(detections: Detections, rig: CameraRig) -> PaddedBlobs:
     return padded
 
 
-def undistorted(uv: NDArray[np.float64], camera: NDArray[np.int64], rig: CameraRig) -> NDArray[np.float32]:
+def undistort(uv: NDArray[np.float64], camera: NDArray[np.int64], rig: CameraRig) -> NDArray[np.float32]:
     """Pixels (R, 2) from the principal point, without distortion; not finite where a lens can show no such place."""
     ideal = np.empty((len(uv), 2), dtype=np.float32)
     lens = (rig.focal_length.numpy(), rig.principal_point.numpy(), rig.distortion.numpy())

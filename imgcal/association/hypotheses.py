@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
 from imgcal.association.blobs import PaddedBlobs
-from imgcal.association.p3p import FAST, three_point_pose, towards
+from imgcal.association.p3p import FAST, rotation_towards, three_point_pose
 from imgcal.types import CalibrationObject, CameraRig
 from renderers.compiling import njit
 
@@ -63,12 +63,12 @@ def fiducial_triples(obj: CalibrationObject, generator: np.random.Generator) -> 
     points = obj.points.double().cpu().numpy()
     count = len(points)
     symmetries = tuple(motion.permutation.astype(np.int64).tobytes() for motion in obj.symmetries)
-    outer = many(obj) and not obj.planar
+    outer = has_many_triples(obj) and not obj.planar
     found = _every_triple(points.tobytes(), symmetries, outer)
     if found is None:
         among = _outer(points, outer)
         triples = among[generator.integers(0, len(among), (MOST_FIDUCIAL_TRIPLES, 3))]
-        found = _told_apart(points, triples[(triples != np.roll(triples, 1, axis=1)).all(1)], symmetries)
+        found = _drop_symmetric(points, triples[(triples != np.roll(triples, 1, axis=1)).all(1)], symmetries)
     return FiducialTriples(*found, points, generator.permutation(count))
 
 
@@ -83,7 +83,7 @@ def _every_triple(coordinates: bytes, symmetries: tuple[bytes, ...], outer: bool
     among = _outer(points, outer)
     if _orders(len(among)) > MOST_FIDUCIAL_TRIPLES:
         return None
-    return _told_apart(points, among[list(permutations(range(len(among)), 3))], symmetries)
+    return _drop_symmetric(points, among[list(permutations(range(len(among)), 3))], symmetries)
 
 
 def _outer(points: NDArray[np.float64], outer: bool) -> NDArray[np.int64]:
@@ -91,7 +91,7 @@ def _outer(points: NDArray[np.float64], outer: bool) -> NDArray[np.int64]:
     return ConvexHull(points).vertices if outer else np.arange(len(points))
 
 
-def _told_apart(points: NDArray[np.float64], triples: NDArray[np.int64], symmetries: tuple[bytes, ...]) -> Triples:
+def _drop_symmetric(points: NDArray[np.float64], triples: NDArray[np.int64], symmetries: tuple[bytes, ...]) -> Triples:
     """Triples (T, 3) that are not in line, one of each set that symmetries cannot tell apart, and their shape."""
     count = len(points)
     if len(symmetries) > 1:
@@ -108,7 +108,7 @@ def _told_apart(points: NDArray[np.float64], triples: NDArray[np.int64], symmetr
     return triples, sides, frames
 
 
-def many(obj: CalibrationObject) -> bool:
+def has_many_triples(obj: CalibrationObject) -> bool:
     """Tell whether the object has more triples than can be tried.
 
     Then only outer blobs are compared with outer fiducials: what is outermost in an image is so in space.
@@ -127,7 +127,7 @@ def likely_blobs(blobs: PaddedBlobs, camera: int, outer: bool) -> NDArray[np.int
     Args:
         blobs: the snapshot.
         camera: index of the camera, which has four blobs at least.
-        outer: take the outermost blobs only, see `many`.
+        outer: take the outermost blobs only, see `has_many_triples`.
     """
     uv = blobs.ideal[camera, : blobs.count[camera]].astype(np.float64)
     gaps = cKDTree(uv).query(uv, k=4)[0][:, -1]
@@ -190,7 +190,7 @@ def single_camera_poses(
     score = np.zeros((len(triples), keep))
     rotation, translation = np.zeros((len(triples), keep, 3, 3)), np.zeros((len(triples), keep, 3))
     _search(
-        (*towards(rays), cameras),
+        (*rotation_towards(rays), cameras),
         (fiducials.triples, fiducials.sides, fiducials.frames, fiducials.points, fiducials.order),
         (focal, raster, origin, 1 / cell),
         (score, rotation, translation),
@@ -207,7 +207,7 @@ def _search(blobs, fiducials, images, poses):
     """Fill the best poses (in the camera's frame) of each triple of blobs.
 
     Args:
-        blobs: of each triple the rays as `towards` turns them, its rotations, and the camera.
+        blobs: of each triple the rays as `rotation_towards` turns them, its rotations, and the camera.
         fiducials: triples, sides, frames, points and order of `FiducialTriples`.
         images: of each camera focal length, raster of the blobs and its origin; cells a pixel.
         poses: score, rotation and translation of the best, the best first.
@@ -235,7 +235,7 @@ def _search(blobs, fiducials, images, poses):
                 y = directions[q, 0, 1] * depths[0] - turn[1, 0] * p[0] - turn[1, 1] * p[1] - turn[1, 2] * p[2]
                 z = directions[q, 0, 2] * depths[0] - turn[2, 0] * p[0] - turn[2, 1] * p[1] - turn[2, 2] * p[2]
                 image = (focal[camera], raster[camera], origin[camera], per_pixel)
-                value = _explained(turn, (x, y, z), points, order, image, score[q, -1])
+                value = _score_pose(turn, (x, y, z), points, order, image, score[q, -1])
                 if value > score[q, -1]:
                     place = len(score[q]) - 1
                     while place > 0 and score[q, place - 1] < value:
@@ -253,7 +253,7 @@ def _search(blobs, fiducials, images, poses):
 
 
 @njit(cache=True, fastmath=FAST)
-def _explained(turn, shift, points, order, image, least):
+def _score_pose(turn, shift, points, order, image, least):
     """Sum over fiducials of their nearness to a blob; give up early where it cannot or will hardly reach `least`."""
     x, y, z = shift
     focal, raster, origin, per_pixel = image

@@ -15,33 +15,33 @@ from imgcal.association.ambiguities import (
     differ,
     displacement,
     lattice_shifts,
-    near_turns,
-    relabelled,
+    near_symmetries,
+    relabel,
 )
 from imgcal.association.assignment import spacing
 from imgcal.association.blobs import PatternPrior, gather, pattern_prior
-from imgcal.association.few import compare_all, few
 from imgcal.association.hypotheses import (
     Poses,
     fiducial_triples,
+    has_many_triples,
     likely_blobs,
-    many,
 )
+from imgcal.association.minimal_labels import compare_labellings, has_minimal_blobs
 from imgcal.association.points import identify_points
 from imgcal.association.result import Identity, IdentityOptions, Status
 from imgcal.association.search import VERIFIED, Search
 from imgcal.association.stick_poses import fit_sticks
-from imgcal.association.verify import (
+from imgcal.association.verification import (
     STAGES,
     Fits,
     Scene,
     certain,
     evidence,
     join,
-    pose_of,
     predictions,
     refine,
     rig_and_pose,
+    select_pose,
     settle_labels,
     start,
 )
@@ -117,7 +117,7 @@ def track(
         return relocalize(detections, rig, obj, std, options)
     scene = Scene(gather(detections, rig), obj, rig, std)
     if scene.blobs.uv[..., 0].size * obj.num_fiducials > MOST_PAIRS:
-        return _refused(scene, _too_many(scene))
+        return _refuse(scene, _too_many(scene))
     poses = Poses(rig_from_object.rotation.numpy()[None], rig_from_object.translation.numpy()[None])
     predicted = predict_ideal(rig, scene.obj.points.numpy(), poses)
     distance = float(np.median(_distances(rig, poses, obj)))
@@ -147,28 +147,28 @@ def relocalize(
     if obj.pose_rank == 5:
         sticks = fit_sticks(scene, options.seed)
         if sticks is None:
-            return _refused(scene, "no markers at the object's distances from each other, on which cameras agree")
+            return _refuse(scene, "no markers at the object's distances from each other, on which cameras agree")
         return replace(_decide(scene, sticks, options, known_pose=False), hypotheses=1)
     cameras = np.flatnonzero(scene.blobs.count >= 4)
     if len(cameras) == 0:
-        return _refused(
+        return _refuse(
             scene, f"too few blobs: at most {scene.blobs.count.max()} in a camera, expected at least 4 in one"
         )
-    compared = compare_all(scene, options) if few(scene) else None
+    compared = compare_labellings(scene, options) if has_minimal_blobs(scene) else None
     if compared is not None and compared.accepted:
         return compared
-    likely = {camera: likely_blobs(scene.blobs, camera, many(obj)) for camera in cameras.tolist()}
+    likely = {camera: likely_blobs(scene.blobs, camera, has_many_triples(obj)) for camera in cameras.tolist()}
     hopeful = {camera: rows for camera, rows in likely.items() if len(rows) <= MOST_FALSE * obj.num_fiducials}
     if not hopeful or scene.blobs.uv[..., 0].size * obj.num_fiducials > MOST_PAIRS:
-        return _refused(scene, _too_many(scene))
+        return _refuse(scene, _too_many(scene))
     bounds = _bounds(scene, rig.working_distance or _guess_distance(scene), pose_known=False)
     generator = np.random.default_rng(options.seed)
     search = Search(scene, hopeful, fiducial_triples(obj, generator), bounds)
     fits: Fits | None = None
-    result = _refused(scene, "no pose of the object explains the blobs")
+    result = _refuse(scene, "no pose of the object explains the blobs")
     undecided = 0
     for number in range(options.rounds):
-        fresh = search.round(min(FIRST_HYPOTHESES << number, MOST_HYPOTHESES), generator)
+        fresh = search.run_round(min(FIRST_HYPOTHESES << number, MOST_HYPOTHESES), generator)
         if fresh is not None:
             fits = fresh if fits is None else _best(scene, join((fits, fresh)), 2 * VERIFIED)
             result = _decide(scene, fits, options, known_pose=False)
@@ -220,7 +220,7 @@ def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool
     rig, pose = rig_and_pose(scene, chosen, 0)
     if refusal is not None:
         undecided = share >= least_share
-        undecided_at = replace(_refused(scene, refusal), rig_from_object=pose, rig=rig, margin=margin)
+        undecided_at = replace(_refuse(scene, refusal), rig_from_object=pose, rig=rig, margin=margin)
         return replace(undecided_at, undecided=undecided)
     order = 1 if known_pose else len(scene.obj.symmetries)
     status: Status = "by_tracking" if known_pose else "ambiguous" if order > 1 else "unique"
@@ -292,24 +292,24 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
         The best labelling found, and its margin over the best of its neighbours.
     """
     shifts = lattice_shifts(scene.obj)
-    pose = pose_of(scene, best, 0)
-    distance = scene.rig.working_distance or float(np.median(_distances(scene.rig, _one(pose), scene.obj)))
+    pose = select_pose(scene, best, 0)
+    distance = scene.rig.working_distance or float(np.median(_distances(scene.rig, _one_snapshot(pose), scene.obj)))
     pattern = pattern_prior(scene.std, scene.rig, distance)
-    turns = [] if known_pose else near_turns(scene.obj, 2 * pattern.shape * scene.obj.size)
+    turns = [] if known_pose else near_symmetries(scene.obj, 2 * pattern.shape * scene.obj.size)
     if not shifts and not turns:
         return best, np.inf
     for _ in range(MOST_STEPS):
-        pose = pose_of(scene, best, 0)
+        pose = select_pose(scene, best, 0)
         labels = best.labels[0]
-        alone = _shifted_alone(scene, best, shifts, 6 * pattern.shift)
-        together = _preferred(labels, alone)
+        alone = _compare_with_shifts(scene, best, shifts, 6 * pattern.shift)
+        together = _prefer_shifts(labels, alone)
         if together is not None:
-            fit = refine(scene, start(scene, _one(pose), together[None]), stages=STAGES[:1])
+            fit = refine(scene, start(scene, _one_snapshot(pose), together[None]), stages=STAGES[:1])
             if _margin(scene, best, fit) < 0:
                 best = settle_labels(scene, fit)
                 continue
-        rivals = [relabelled(pose, labels, [motion]) for motion in shifts + turns]
-        rivals += [(_one(pose), rival[None]) for margin, _, rival in alone if margin < EXCLUDED]
+        rivals = [relabel(pose, labels, [motion]) for motion in shifts + turns]
+        rivals += [(_one_snapshot(pose), rival[None]) for margin, _, rival in alone if margin < EXCLUDED]
         fits = [refine(scene, start(scene, *rival), stages=STAGES[:1]) for rival in rivals]
         margins = [_margin(scene, best, rival) for rival in fits]
         if not margins or min(margins) >= 0:
@@ -319,7 +319,7 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
     return best, 0.0
 
 
-def _shifted_alone(
+def _compare_with_shifts(
     scene: Scene, best: Fits, shifts: list[Ambiguity], reach: NDArray[np.float64]
 ) -> list[tuple[float, int, NDArray[np.int64]]]:
     """Compare a labelling with those in which the object is shifted for one camera alone, as that camera sees it.
@@ -336,15 +336,19 @@ def _shifted_alone(
     Returns:
         Margin against the labelling in that camera, camera, labels (C, N) of all cameras; margin 0 = it cannot tell.
     """
-    pose = pose_of(scene, best, 0)
+    pose = select_pose(scene, best, 0)
     labels, uv, found = best.labels[0], predictions(best), []
     for camera in range(scene.rig.num_cameras):
         near = [motion for motion in shifts if displacement(uv, motion)[camera] < reach[camera]]
         seen = (labels[camera] >= 0).sum() >= LEAST_ALONE
-        part = scene.only(camera)
-        mine = refine(part, start(part, _one(pose), labels[None, [camera]]), STAGES[:1]) if near and seen else None
+        part = scene.select_camera(camera)
+        mine = (
+            refine(part, start(part, _one_snapshot(pose), labels[None, [camera]]), STAGES[:1])
+            if near and seen
+            else None
+        )
         for motion in near:
-            where, shifted = relabelled(pose, labels, [motion])
+            where, shifted = relabel(pose, labels, [motion])
             margin = 0.0
             if mine is not None:
                 rival = refine(part, start(part, where, shifted[:, [camera]]), STAGES[:1])
@@ -355,7 +359,7 @@ def _shifted_alone(
     return found
 
 
-def _preferred(
+def _prefer_shifts(
     labels: NDArray[np.int64], alone: list[tuple[float, int, NDArray[np.int64]]]
 ) -> NDArray[np.int64] | None:
     """Labels (C, N) in which every camera has the shift that it likes better; None = they all like theirs best."""
@@ -366,7 +370,7 @@ def _preferred(
     return together if (least < 0).any() else None
 
 
-def _one(pose: RigidTransform) -> Poses:
+def _one_snapshot(pose: RigidTransform) -> Poses:
     return Poses(pose.rotation.numpy()[None], pose.translation.numpy()[None])
 
 
@@ -378,7 +382,7 @@ def _too_many(scene: Scene) -> str:
     )
 
 
-def _refused(scene: Scene, reason: str) -> Identity:
+def _refuse(scene: Scene, reason: str) -> Identity:
     labels = np.full(scene.blobs.rows, -1, dtype=np.int64)
     return Identity(labels, None, None, "refused", 0, 0.0, reason)
 

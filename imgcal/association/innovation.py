@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.association.blobs import PaddedBlobs
-from imgcal.estimation import Problem, Solution, lm_cpu
+from imgcal.estimation import Problem, Solution, levenberg_marquardt_cpu
 from imgcal.geometry import NEAREST_DEPTH, kernels, lens_codes, lens_kernels
 from renderers.compiling import njit
 
@@ -71,7 +71,7 @@ def innovations(
         for tensor in (
             factory.cam_from_rig.rotation,
             step[..., :3],
-            lm_cpu.positions_of(factory) + step[..., 3:6],
+            levenberg_marquardt_cpu.camera_positions(factory) + step[..., 3:6],
             factory.focal_length + step[..., 6:8],
             factory.principal_point + step[..., 8:10],
             factory.distortion + step[..., 10:],
@@ -101,7 +101,7 @@ def innovations(
     return Innovations(squared, log_det, own, residual, freedom, uv, complexity)
 
 
-def contested(labels: NDArray[np.int64], found: Innovations, undecided: float) -> NDArray[np.bool_]:
+def find_contested(labels: NDArray[np.int64], found: Innovations, undecided: float) -> NDArray[np.bool_]:
     """Mark labels (K, C, N) whose blob may as well belong to another fiducial, alone or in exchange for its blob.
 
     Args:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from imgcal.association.blobs import undistorted
+from imgcal.association.blobs import undistort
 from imgcal.association.light_alignment import FREE, epipolar_equations, image_equations
 from imgcal.association.light_search import find_all_lights
 from imgcal.types import CameraRig, Detections
@@ -129,7 +129,7 @@ def sort_blobs(detections: Detections, rig: CameraRig) -> SortedBlobs:
     """Arrange the usable blobs for compiled loops."""
     rows = np.flatnonzero(detections.usable)
     camera, snapshot = detections.camera[rows], detections.snapshot[rows]
-    ideal = undistorted(detections.uv[rows], camera, rig).astype(np.float64)
+    ideal = undistort(detections.uv[rows], camera, rig).astype(np.float64)
     xy = ideal / rig.focal_length.double().mean(1).numpy()[camera, None]
     good = np.isfinite(xy).all(1)
     rows, camera, snapshot, xy = rows[good], camera[good], snapshot[good], xy[good]

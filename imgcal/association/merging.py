@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from imgcal.association.series import Associations, without_snapshots
+from imgcal.association.series import Associations, drop_snapshots
 from imgcal.geometry import RigidTransform
 from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections
 
@@ -56,7 +56,7 @@ def drop_merged(labelled: Associations, poses: RigidTransform, rig: CameraRig, o
     fiducial[merged], flags[merged] = -1, flags[merged] | np.uint8(BlobFlag.MERGED)
     left = replace(labelled, detections=replace(detections, fiducial=fiducial, flags=flags))
     bare = np.flatnonzero(~np.isin(used, detections.snapshot[np.setdiff1d(rows, merged)]))
-    return without_snapshots(left, bare.tolist()) if len(bare) else left
+    return drop_snapshots(left, bare.tolist()) if len(bare) else left
 
 
 def find_merged(

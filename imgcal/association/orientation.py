@@ -15,7 +15,7 @@ CLEAR = 0.5
 """Part of the second nearest turn's angle that the nearest one must not exceed for a given pose to decide."""
 
 
-def oriented(identity: Identity, obj: CalibrationObject, given: RigidTransform) -> Identity:
+def orient(identity: Identity, obj: CalibrationObject, given: RigidTransform) -> Identity:
     """Choose, of the labellings that the object's symmetry allows, the one whose turn is nearest to a given pose.
 
     Args:

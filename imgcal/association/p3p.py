@@ -14,7 +14,7 @@ from renderers.compiling import njit
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
-def towards(rays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def rotation_towards(rays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Turn cameras towards what they see, as scaled orthography wants them.
 
     Args:
@@ -41,7 +41,7 @@ def three_point_pose(rays, directions, sides, mirror, rotation_frame, depths):
     Scaled orthography has exactly two solutions, mirror images of each other, in closed form; the image is then
     corrected for the depths found, once. Where perspective P3P has no real solution because the camera is not quite
     what it is thought to be, this still gives the nearest sensible one. The correction leaves a quarter of a degree
-    where the object's depth is a fifth of its distance, if the camera looks at it: see `towards`.
+    where the object's depth is a fifth of its distance, if the camera looks at it: see `rotation_towards`.
 
     Args:
         rays: (3, 2) coordinates on the z = 1 plane of a camera that looks at the triangle.

@@ -35,7 +35,7 @@ def planar_poses(blobs: PaddedBlobs, rig: CameraRig, camera: int, obj: Calibrati
     focal = float(rig.focal_length[camera].mean())
     count = blobs.count[camera]
     ordinary = _ordinary(blobs.radius[camera, :count])
-    seen = _without_strays(blobs.ideal[camera, :count][ordinary].astype(np.float64) / focal)
+    seen = _drop_strays(blobs.ideal[camera, :count][ordinary].astype(np.float64) / focal)
     points = obj.points.double().cpu().numpy()
     centroid = points.mean(0)
     axes = np.linalg.svd(points - centroid)[2]
@@ -63,7 +63,7 @@ def _ordinary(radius: Floats) -> NDArray[np.bool_]:
     return np.isnan(radius) | ((ratio > 0.6) & (ratio < 1.7))
 
 
-def _without_strays(points: Floats) -> Floats:
+def _drop_strays(points: Floats) -> Floats:
     """Leave out points far from the bulk, again and again: a whitened square reaches to the square root of 6."""
     for _ in range(5):
         white = _whiten(points)[0]

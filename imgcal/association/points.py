@@ -138,14 +138,14 @@ def _places(views: _Views) -> _Places:
     )
     good = (along1 > 0) & (along2 > 0) & (sine > 1e-3) & (gap < reach)
     at = 0.5 * (p1 + along1[:, None] * d1 + p2 + along2[:, None] * d2)[good]
-    chosen, odds = _seen_at(views, at)
+    chosen, odds = _find_nearest(views, at)
     for _ in range(ROUNDS):
-        at = _placed(views, rays, at, chosen)
-        chosen, odds = _seen_at(views, at)
+        at = _triangulate(views, rays, at, chosen)
+        chosen, odds = _find_nearest(views, at)
     return _Places(at, chosen, odds)
 
 
-def _seen_at(views: _Views, at: Array) -> tuple[NDArray[np.int64], Array]:
+def _find_nearest(views: _Views, at: Array) -> tuple[NDArray[np.int64], Array]:
     """Nearest blobs (P, C) to the images of places, -1 = none within reach, and the places' log odds (P,)."""
     uv, inside = views.project(at)
     squared = np.square(uv[:, :, None] - views.blobs.ideal).sum(-1)  # (P, C, M)
@@ -157,7 +157,7 @@ def _seen_at(views: _Views, at: Array) -> tuple[NDArray[np.int64], Array]:
     return np.where(hit, nearest, -1), np.asarray(odds)
 
 
-def _placed(views: _Views, rays: Array, at: Array, chosen: NDArray[np.int64]) -> Array:
+def _triangulate(views: _Views, rays: Array, at: Array, chosen: NDArray[np.int64]) -> Array:
     """Places (P, 3) nearest to the rays of their blobs."""
     cameras = np.arange(len(rays))
     ray = rays[cameras, np.maximum(chosen, 0)]  # (P, C, 3)

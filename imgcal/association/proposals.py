@@ -60,7 +60,7 @@ class Proposal:
     reason: str = ""  # why it declines; empty = it does not
 
     @classmethod
-    def declined(cls, snapshot: Snapshot, reason: str, margin: float = 0.0) -> Proposal:
+    def decline(cls, snapshot: Snapshot, reason: str, margin: float = 0.0) -> Proposal:
         """Say that nothing can be proposed."""
         return cls(snapshot.blobs.select(np.zeros(len(snapshot.blobs), dtype=bool)), None, margin, reason)
 
@@ -107,7 +107,7 @@ def judge(
     Returns:
         The decision, and the blobs that its labels are of: the detector's, and those that were proposed.
     """
-    blobs, proposed = together(proposal.detections, snapshot.blobs)
+    blobs, proposed = merge_proposal(proposal.detections, snapshot.blobs)
     nothing = np.full(len(blobs), -1, dtype=np.int64)
     refused = Identity(nothing, None, None, "refused", 0, proposal.margin, proposal.reason)
     if proposal.reason or proposal.rig_from_object is None:
@@ -132,7 +132,7 @@ def judge(
     return replace(found, labels=labels, margin=min(found.margin, proposal.margin)), blobs
 
 
-def together(proposed: Detections, blobs: Detections) -> tuple[Detections, NDArray[np.int64]]:
+def merge_proposal(proposed: Detections, blobs: Detections) -> tuple[Detections, NDArray[np.int64]]:
     """Put proposed fiducials among the detector's blobs; where both are at one place, the better measured one stays.
 
     Returns:
@@ -166,7 +166,7 @@ def together(proposed: Detections, blobs: Detections) -> tuple[Detections, NDArr
     return replace(blobs, **values, fiducial=np.full(len(labels), -1, dtype=np.int64)), labels
 
 
-def rows_of(
+def proposal_rows(
     uv: NDArray[np.float64],
     sigma: NDArray[np.float64],
     seen: NDArray[np.bool_],

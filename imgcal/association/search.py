@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from imgcal.association.ambiguities import conflicts
 from imgcal.association.hypotheses import FiducialTriples, blob_triples, single_camera_poses
 from imgcal.association.planar import planar_poses
-from imgcal.association.verify import Fits, Scene, refine, start
+from imgcal.association.verification import Fits, Scene, refine, start
 from imgcal.association.voting import match, predict_ideal, vote
 from imgcal.types import CalibrationObject
 
@@ -35,7 +35,7 @@ class Search:
     bounds: tuple[float, float]  # see `_bounds`
     hypotheses: int = 0  # so far; of planar objects, as many as would have taken their time
 
-    def round(self, hypotheses: int, generator: np.random.Generator) -> Fits | None:
+    def run_round(self, hypotheses: int, generator: np.random.Generator) -> Fits | None:
         """Make so many hypotheses, let the rig vote within the bounds, fit the best; None = there is none."""
         scene, (tolerance, gate) = self.scene, self.bounds
         cameras = np.array(list(self.likely))

@@ -16,7 +16,7 @@ from imgcal.association.tracker import SnapshotIdentity, Tracker, to_observation
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import ON_A_LINE
 from imgcal.geometry import RigidTransform
-from imgcal.messages import listed
+from imgcal.messages import list_names
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 
 NOT_TRIED = "not tried: nothing could be decided in many snapshots before"
@@ -164,14 +164,14 @@ def associate(
         sight = None  # it looks for patterns, and these objects have none
     series = _Series(detections, Tracker(rig, obj, options), sight)
     order: Iterable[int] = range(count)
-    series.first(progress(order, count) if progress else order)
+    series.decide_each(progress(order, count) if progress else order)
     accepted = series.accepted
     if len(accepted):
-        series.again(accepted)
+        series.retry_incomplete(accepted)
     if sight is not None and sight.where_blobs_fail:
         series.where_blobs_fail(sight, accepted)
     snapshots = tuple(series.results[s][0] for s in range(count))
-    labelled = Associations(_labelled(detections, series.rows, series.results, series.looked), snapshots)
+    labelled = Associations(_label_blobs(detections, series.rows, series.results, series.looked), snapshots)
     if not labelled.used:
         raise RefusedError(f"identity: {_why(snapshots)}")
     return labelled
@@ -193,7 +193,7 @@ class _Series:
         """Numbers of the snapshots that are not refused, ascending."""
         return np.array([s for s in range(self.count) if self.results[s][0].status != "refused"], dtype=np.int64)
 
-    def first(self, order: Iterable[int]) -> None:
+    def decide_each(self, order: Iterable[int]) -> None:
         """Decide about each snapshot, as long as there is hope."""
         patience = Patience(self.count)
         for number, s in enumerate(order):
@@ -202,7 +202,7 @@ class _Series:
             else:
                 self._not_tried(s)
 
-    def again(self, accepted: NDArray[np.int64]) -> None:
+    def retry_incomplete(self, accepted: NDArray[np.int64]) -> None:
         """Try what is incomplete once more, with the rig that the accepted ones gave."""
         incomplete = [s for s in range(self.count) if not self.coded[s] and self._incomplete(s)]
         patience, tracker = Patience(len(incomplete)), self.tracker
@@ -269,7 +269,7 @@ def _why(snapshots: Sequence[SnapshotIdentity]) -> str:
     return f"{reason} ({times} of {tried})"
 
 
-def without_snapshots(labelled: Associations, rows: Sequence[int]) -> Associations:
+def drop_snapshots(labelled: Associations, rows: Sequence[int]) -> Associations:
     """Refuse snapshots (numbers among the used ones) whose labels lie on one line.
 
     Raises:
@@ -311,7 +311,7 @@ class Patience:
         return (number - self.first_left_out) % self.stride == self.stride - 1
 
 
-def matched_to_rig(detections: Detections, rig: CameraRig) -> Detections:
+def match_to_rig(detections: Detections, rig: CameraRig) -> Detections:
     """Renumber the cameras of detections in the order of the rig.
 
     Raises:
@@ -320,15 +320,15 @@ def matched_to_rig(detections: Detections, rig: CameraRig) -> Detections:
     unknown = [name for name in detections.camera_names if name not in rig.camera_names]
     if unknown:
         raise InputError(
-            f"detections: found camera {listed(unknown)}, expected cameras of rig {rig.name}: "
-            f"{listed(rig.camera_names)}"
+            f"detections: found camera {list_names(unknown)}, expected cameras of rig {rig.name}: "
+            f"{list_names(rig.camera_names)}"
         )
     index = np.array([rig.camera_names.index(name) for name in detections.camera_names], dtype=np.int64)
     camera = index[detections.camera] if len(detections) else detections.camera
     return replace(detections, camera=camera, camera_names=rig.camera_names)
 
 
-def observations_of(
+def accepted_observations(
     labelled: Associations, rig: CameraRig, obj: CalibrationObject
 ) -> tuple[Observations, RigidTransform | None]:
     """Observations of the accepted snapshots, and their poses where identity found all of them."""
@@ -343,7 +343,7 @@ def observations_of(
     return observations, RigidTransform.stack(known) if len(known) == len(used) else None
 
 
-def _labelled(
+def _label_blobs(
     detections: Detections,
     rows: list[NDArray[np.int64]],
     results: dict[int, tuple[SnapshotIdentity, NDArray[np.int64]]],

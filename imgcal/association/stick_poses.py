@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from imgcal.association.blobs import pattern_prior
 from imgcal.association.hypotheses import Poses
 from imgcal.association.search import distinct
-from imgcal.association.verify import Fits, Scene, refine, start
+from imgcal.association.verification import Fits, Scene, refine, start
 from imgcal.association.voting import match, predict_ideal, vote
 
 Array = NDArray[np.float64]

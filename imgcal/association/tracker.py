@@ -11,7 +11,7 @@ from torch import Tensor
 
 from imgcal.association.identification import identify
 from imgcal.association.options import PipelineOptions
-from imgcal.association.orientation import oriented
+from imgcal.association.orientation import orient
 from imgcal.association.proposals import Sight, Snapshot, judge
 from imgcal.association.result import Identity, Status
 from imgcal.errors import InputError
@@ -101,7 +101,7 @@ class Tracker:
         check_object(obj)
         self.obj, self.options, self.first = obj, options, first
         self.learnt = learnt or LearntRig(rig, obj, options, remembered)
-        self.pose = None if options.start_pose is None else _checked_pose(options.start_pose, rig)
+        self.pose = None if options.start_pose is None else _check_pose(options.start_pose, rig)
         self.alternatives = 0  # that the accepted snapshots leave open, 0 = none was accepted yet
         self.in_vain = 0  # hypotheses that were tried since something was accepted
         self.looks_in_vain = 0  # snapshots in which a proposer found nothing, less those in which it did
@@ -131,7 +131,7 @@ class Tracker:
 
     def decide(self, blobs: Detections, name: str) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
         """Label the blobs of one snapshot."""
-        return self._concluded(self._identify(blobs), blobs, name)
+        return self._conclude(self._identify(blobs), blobs, name)
 
     def look(
         self, sight: Sight, number: int, blobs: Detections, name: str
@@ -144,21 +144,21 @@ class Tracker:
         snapshot = Snapshot(
             sight.frames(number), blobs, self.rig, self.obj, self.prior_std, known, sight.detection, sight.masks
         )
-        identity, found = self._judged(sight, snapshot)
-        identity, found_by = self._taken_over(identity), sight.proposer.name
+        identity, found = self._judge(sight, snapshot)
+        identity, found_by = self._adopt(identity), sight.proposer.name
         if not identity.accepted and not sight.where_blobs_fail:
             told = self._identify(blobs)
             if told.accepted and told.rig_from_object is not None:
-                there, at = self._judged(sight, replace(snapshot, candidates=(told.rig_from_object,)))
+                there, at = self._judge(sight, replace(snapshot, candidates=(told.rig_from_object,)))
                 if there.accepted:
                     identity, found = replace(there, status=told.status, alternatives=told.alternatives), at
                 else:
                     identity, found, found_by = told, blobs, "classical"
         self.looks_in_vain = max(0, self.looks_in_vain + (-1 if identity.accepted else 1))
-        concluded, labels = self._concluded(identity, found, name)
+        concluded, labels = self._conclude(identity, found, name)
         return replace(concluded, found_by=found_by), labels, found
 
-    def _judged(self, sight: Sight, snapshot: Snapshot) -> tuple[Identity, Detections]:
+    def _judge(self, sight: Sight, snapshot: Snapshot) -> tuple[Identity, Detections]:
         """Let a proposer look, and decide about what it says."""
         proposal, near = sight.proposer.propose(snapshot), False
         if snapshot.candidates and proposal.rig_from_object is not None:
@@ -167,9 +167,7 @@ class Tracker:
         error = float(np.hypot(self.options.identity_error, self._tolerance_px(snapshot.blobs)))
         return judge(proposal, snapshot, self.options.identity, error=error, pose_known=near)
 
-    def _concluded(
-        self, identity: Identity, blobs: Detections, name: str
-    ) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
+    def _conclude(self, identity: Identity, blobs: Detections, name: str) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
         labels, pose = identity.labels, identity.rig_from_object
         if not identity.accepted:
             return SnapshotIdentity(name, "refused", identity.reason, identity.alternatives, None), labels
@@ -199,7 +197,7 @@ class Tracker:
         return ("ambiguous" if self.alternatives > 1 else "by_tracking"), max(self.alternatives, 1)
 
     def _identify(self, blobs: Detections) -> Identity:
-        return self._taken_over(self.propose(blobs))
+        return self._adopt(self.propose(blobs))
 
     def propose(self, blobs: Detections) -> Identity:
         """Label the blobs of one snapshot, without drawing conclusions from it."""
@@ -212,16 +210,16 @@ class Tracker:
 
     def conclude(self, proposed: Identity, blobs: Detections, name: str) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
         """Draw the conclusions from what `propose` found in these blobs."""
-        return self._concluded(self._taken_over(proposed), blobs, name)
+        return self._conclude(self._adopt(proposed), blobs, name)
 
-    def _taken_over(self, found: Identity) -> Identity:
+    def _adopt(self, found: Identity) -> Identity:
         """See a decision in the light of those before."""
         pose = found.rig_from_object
         if not found.accepted or pose is None:
             self.in_vain += found.hypotheses
             return found
         if self.alternatives == 0 and self.pose is not None and found.status != "unique":
-            found = oriented(found, self.obj, self.pose)
+            found = orient(found, self.obj, self.pose)
         elif found.status == "by_tracking":
             status, alternatives = self.follow(pose)
             found = replace(found, status=status, alternatives=alternatives)
@@ -252,7 +250,7 @@ class Tracker:
         self.learnt.remember(name if self.first == 0 else f"{name} {self.first}", blobs, labels, pose)
 
 
-def _checked_pose(pose: RigidTransform, rig: CameraRig) -> RigidTransform:
+def _check_pose(pose: RigidTransform, rig: CameraRig) -> RigidTransform:
     """Return a pose that a user gave, in the rig's precision.
 
     Raises:

@@ -15,13 +15,13 @@ from imgcal.association import PipelineOptions
 from imgcal.cli import arguments
 from imgcal.cli.common import (
     check_folder,
-    only_cameras,
+    drop_cameras,
     open_rig,
     parse_range,
     progress,
     read_detections,
+    select_cameras,
     start_pose,
-    without_cameras,
 )
 from imgcal.cli.counts import doubtful_cameras
 from imgcal.cli.describe import describe, describe_refusal
@@ -45,15 +45,15 @@ from imgcal.io import (
     save_rig,
     write_text,
 )
-from imgcal.messages import listed, shortened
+from imgcal.messages import list_names, shorten
 from imgcal.pipeline import (
     Calibration,
     Detector,
     LearnedMeasurer,
     calibrate,
     calibrate_from_scratch,
+    capture_sight,
     load_initializer,
-    sight_of_capture,
     unit_doubt,
 )
 from imgcal.types import CalibrationObject, CameraRig, Detections, limits
@@ -75,7 +75,7 @@ class Calibrate(arguments.Calibrate):
         lacking = missing("jinja2") if self.report else None
         draws = self.report and lacking is None
         complete, obj = self._rig(), self._object()
-        rig = without_cameras(complete, self.without)
+        rig = drop_cameras(complete, self.without)
         reference = self._reference(rig)
         options = PipelineOptions(
             blind_cameras=self.blind_cameras,
@@ -87,12 +87,12 @@ class Calibrate(arguments.Calibrate):
         measurer = None if self.measurer is None else LearnedMeasurer.load(self.measurer)
         detector = self._detector(source, measurer)
         if self.trust and self.first_guess == "none":
-            raise InputError(f"--trust: found {shortened(self.trust[0])} without --first-guess, which it is for")
+            raise InputError(f"--trust: found {shorten(self.trust[0])} without --first-guess, which it is for")
         named, trusted = self.first_guess, self.trust
         initializer = None if named == "none" else load_initializer(named, rig, obj, trusted=trusted)
         loaded = time.perf_counter()
         detections, frames = read_detections(source, self.snapshots, self.detection, measurer, obj.board)
-        detections = only_cameras(detections, rig)
+        detections = select_cameras(detections, rig)
         seconds = {"loading": loaded - started, "reading and detection": time.perf_counter() - loaded}
 
         def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
@@ -175,7 +175,7 @@ class Calibrate(arguments.Calibrate):
             raise InputError(f"{folder}: found a link or file, expected nothing or the folder of an earlier run")
         foreign = sorted(path.name for path in folder.glob("*") if path.name not in WRITTEN)
         if foreign:
-            raise InputError(f"{folder}: found {listed(foreign)}, expected the files of an earlier run only")
+            raise InputError(f"{folder}: found {list_names(foreign)}, expected the files of an earlier run only")
         return [f"{PREVIOUS}/{name}" for name in WRITTEN]
 
     def _inputs(self) -> list[tuple[str, Path]]:
@@ -227,7 +227,8 @@ class Calibrate(arguments.Calibrate):
         without = [name for name in rig.camera_names if not source.files[name]]
         if without:
             raise InputError(
-                f"{source.folder / 'frames'}: found no frames of {listed(without)}, expected some of each camera of "
+                f"{source.folder / 'frames'}: found no frames of {list_names(without)}, expected some of each "
+                "camera of "
                 f"rig {rig.name}; --without {without[0]} leaves a camera out, --blind-cameras keeps its factory values"
             )
 
@@ -239,7 +240,7 @@ class Calibrate(arguments.Calibrate):
             raise InputError(f"--detector {self.detector}: found blobs in {self.input}, expected a capture with frames")
         keep_memory()
         first = parse_range(self.snapshots)[0]
-        return sight_of_capture(source, self.detector, self.detection, first, measurer)
+        return capture_sight(source, self.detector, self.detection, first, measurer)
 
     def _reference(self, rig: CameraRig) -> int:
         if self.reference is None:
@@ -252,8 +253,8 @@ class Calibrate(arguments.Calibrate):
         """Say which cameras the report takes to have stood still."""
         rig = calibration.rig
         if self.reference is not None or rig.num_cameras == 1:
-            return Gauge.of_camera(self._reference(rig), rig.num_cameras)
-        return Gauge.of_most(rig, calibration.factory)
+            return Gauge.from_camera(self._reference(rig), rig.num_cameras)
+        return Gauge.from_majority(rig, calibration.factory)
 
 
 def trusted_covariance(calibration: Calibration, reference: int) -> RigCovariance:

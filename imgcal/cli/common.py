@@ -21,10 +21,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from imgcal.cli.arguments import StartPose
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError
-from imgcal.formats import format_named, is_foreign, load_rig, read_foreign_rig
+from imgcal.formats import find_format, is_foreign, load_rig, read_foreign_rig
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import Capture, Frame
-from imgcal.messages import listed, shortened
+from imgcal.messages import list_names, shorten
 from imgcal.pipeline import LearnedMeasurer, detect_capture
 from imgcal.types import Board, CameraRig, Detections
 
@@ -39,7 +39,7 @@ def open_rig(given: str) -> CameraRig:
     """
     rig, path = load_rig(given), Path(given)
     if rig.num_cameras == 1 and path.exists() and is_foreign(path):
-        title = format_named(read_foreign_rig(path).format).title
+        title = find_format(read_foreign_rig(path).format).title
         raise InputError(
             f"{given}: this is a {title} of one camera, without its place in the rig; give the folder "
             f"of all files, or make a rig of this one camera: imgcal convert {given} --out rig.yaml"
@@ -54,7 +54,7 @@ def parse_range(text: str | None) -> tuple[int, int | None]:
     match = re.fullmatch(r"(\d{0,18}):(\d{0,18})", text)
     if not match:
         raise InputError(
-            f"--snapshots: found {shortened(text)!r}, expected A:B, numbers in file order from 0, B excluded"
+            f"--snapshots: found {shorten(text)!r}, expected A:B, numbers in file order from 0, B excluded"
         )
     first, last = int(match[1] or 0), int(match[2]) if match[2] else None
     if last is not None and last <= first:
@@ -117,17 +117,19 @@ def start_pose(values: StartPose | None) -> RigidTransform | None:
     return RigidTransform(rotation_from_vector(numbers[:3]), numbers[3:])
 
 
-def without_cameras(rig: CameraRig, names: tuple[str, ...]) -> CameraRig:
+def drop_cameras(rig: CameraRig, names: tuple[str, ...]) -> CameraRig:
     """Leave cameras out of a rig."""
     unknown = [name for name in names if name not in rig.camera_names]
     if unknown:
-        raise InputError(f"--without: found {listed(unknown)}, expected cameras of the rig: {listed(rig.camera_names)}")
+        raise InputError(
+            f"--without: found {list_names(unknown)}, expected cameras of the rig: {list_names(rig.camera_names)}"
+        )
     if set(rig.camera_names) <= set(names):
         raise InputError(f"--without: found all {rig.num_cameras} cameras of the rig, expected at least one to be left")
     return rig.select([i for i, name in enumerate(rig.camera_names) if name not in names])
 
 
-def only_cameras(detections: Detections, rig: CameraRig) -> Detections:
+def select_cameras(detections: Detections, rig: CameraRig) -> Detections:
     """Leave out the blobs of cameras that a reduced rig does not have."""
     kept = [name in rig.camera_names for name in detections.camera_names]
     number = np.cumsum(kept) - 1
@@ -149,7 +151,7 @@ def check_folder(path: Path) -> None:
 
 
 @contextmanager
-def counted(what: str, total: int) -> Iterator[Callable[[int], None]]:
+def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
     """Show a progress bar on standard error, if that is a terminal; yields what is to be told of each advance."""
     console = Console(file=sys.stderr)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())

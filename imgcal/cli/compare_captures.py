@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from imgcal.cli import arguments
-from imgcal.cli.common import check_folder, counted, open_rig
+from imgcal.cli.common import check_folder, open_rig, progress_bar
 from imgcal.errors import InputError
-from imgcal.fleet import Kept
+from imgcal.fleet import StoredResults
 from imgcal.io import load_object, nearest, object_text, publishing, rig_text, write_text
 
 if TYPE_CHECKING:
     from imgcal.evaluation import Contender, Scene
-    from imgcal.fleet import Mapped
+    from imgcal.fleet import Mapper
 
 RESULT, TABLES = "captures.json", "captures.md"
 WORK = ".work"
@@ -39,7 +39,7 @@ def compare_captures(
     obj: str,
     seed: int,
     out: Path | None,
-    workers: Callable[[int, Kept | None], AbstractContextManager[Mapped]],
+    workers: Callable[[int, StoredResults | None], AbstractContextManager[Mapper]],
 ) -> None:
     """Calibrate simulated captures with each detector; print tables, and write them where `out` says.
 
@@ -56,7 +56,7 @@ def compare_captures(
         InputError: a detector or a difficulty that there is not.
     """
     from imgcal.evaluation import Scene, compare_detectors, detector_tables, detector_values
-    from imgcal.pipeline import proposer_of
+    from imgcal.pipeline import choose_proposer
     from imgcal.synthesis import DIFFICULTIES, FrameModel
 
     _check(chosen)
@@ -68,10 +68,10 @@ def compare_captures(
     contenders = [contender(path) for path in detectors]
     for one in contenders:
         if one.detector != "classical":
-            proposer_of(one.detector)  # found out now, not when captures are made
+            choose_proposer(one.detector)  # found out now, not when captures are made
     total = len(models) * chosen.captures
-    kept = None if out is None else Kept(out / WORK, _scope(contenders, scene))
-    with workers(total, kept) as mapped, counted("calibrating captures", total) as advance:
+    kept = None if out is None else StoredResults(out / WORK, _scope(contenders, scene))
+    with workers(total, kept) as mapped, progress_bar("calibrating captures", total) as advance:
         outcomes = compare_detectors(contenders, scene, chosen.captures, seed, advance, mapped)
     tables = detector_tables(outcomes)
     text = f"{describe(scene, chosen.captures, seed)}\n\n" + "\n".join(table.markdown() for table in tables)

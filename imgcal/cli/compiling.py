@@ -14,11 +14,11 @@ from imgcal.machine import usable_cores
 
 HINT = "compiling for this machine: 10 to 60 s, once; `imgcal warmup` compiles everything ahead of time"
 HELP = "from imgcal.online import warm_up_fits; warm_up_fits()"
-NEEDED_LAST = "lm_cpu.*"  # files of the cache that show that there is nothing to help with
+NEEDED_LAST = "levenberg_marquardt_cpu.*"  # files of the cache that show that there is nothing to help with
 
 
 @contextlib.contextmanager
-def tells_of_compiling(hint: str = HINT, helped: bool = False) -> Iterator[list[object]]:
+def announce_compilation(hint: str = HINT, helped: bool = False) -> Iterator[list[object]]:
     """Print a notice on standard error when the first function is compiled.
 
     Args:
@@ -40,7 +40,7 @@ def tells_of_compiling(hint: str = HINT, helped: bool = False) -> Iterator[list[
         def on_start(self, happening: event.Event) -> None:
             if not compiled:
                 print(f"imgcal: {hint}", file=sys.stderr, flush=True)
-                if helped and is_of_use():
+                if helped and is_useful():
                     with contextlib.suppress(OSError):  # alone, then
                         helpers.append(start_helper())
             compiled.append(happening.data)
@@ -59,7 +59,7 @@ def tells_of_compiling(hint: str = HINT, helped: bool = False) -> Iterator[list[
             helper.wait()
 
 
-def is_of_use() -> bool:
+def is_useful() -> bool:
     """Tell whether a second process can compile beside this one, and leave it where this one finds it."""
     from renderers.compiling import cache_folder, is_shared
 

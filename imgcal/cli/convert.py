@@ -14,18 +14,18 @@ from imgcal.formats import (
     OURS,
     Files,
     ForeignRig,
-    converted,
-    format_named,
+    convert_rig,
+    fill_image_sizes,
+    find_format,
     from_camera_rig,
     in_millimetres,
     is_foreign,
     read_foreign_rig,
-    selected,
-    with_image_sizes,
-    written_back,
+    select_cameras,
+    write_into,
 )
 from imgcal.io import load_rig, load_rig_covariance, publishing, write_bytes
-from imgcal.messages import listed, shortened
+from imgcal.messages import list_names, shorten
 
 
 class Convert(arguments.Convert):
@@ -41,13 +41,13 @@ class Convert(arguments.Convert):
         print(f"{title}: {len(rig.cameras)} camera{'s' if len(rig.cameras) > 1 else ''}; frame: {rig.frame}")
         for note in rig.notes:
             print(f"note: {note}")
-        made = converted(rig, to, self.out.stem, self.fit_limit, self.out_unit, hold_distortion=self.hold_distortion)
+        made = convert_rig(rig, to, self.out.stem, self.fit_limit, self.out_unit, hold_distortion=self.hold_distortion)
         for note in made.notes:
             print(f"note: {note}")
         written = self._write(made.files)
         models = f"{made.between_models:.2g} px" if made.between_models > 1e-6 else "the same"
         print(
-            f"wrote {listed(map(str, written))} ({to}); re-read: worst difference {made.round_trip:.1e} px on "
+            f"wrote {list_names(map(str, written))} ({to}); re-read: worst difference {made.round_trip:.1e} px on "
             f"{made.points} points, lens models {models}"
         )
 
@@ -58,7 +58,7 @@ class Convert(arguments.Convert):
         if self.to == OURS:
             raise InputError("--to: found imgcal, expected the format of the file that --into names")
         rig, _ = self._read()
-        made = written_back(
+        made = write_into(
             rig,
             self.into,
             datetime.now(),
@@ -72,9 +72,10 @@ class Convert(arguments.Convert):
         alone = len(made.files) == 1 and not (len(self.into) == 1 and self.into[0].is_dir())
         files = {"": next(iter(made.files.values()))} if alone else made.files
         written = self._write(files)
-        where = listed(map(str, written))
+        where = list_names(map(str, written))
         print(
-            f"{made.title}: {_counted(made.changed)} replaced" + (f", {_counted(made.kept)} kept" if made.kept else "")
+            f"{made.title}: {_count_cameras(made.changed)} replaced"
+            + (f", {_count_cameras(made.kept)} kept" if made.kept else "")
         )
         if made.loss is not None:
             print(
@@ -96,7 +97,7 @@ class Convert(arguments.Convert):
             able = ", ".join(one.name for one in FORMATS if one.write is not None)
             raise InputError(f"--to: cannot tell the format from {self.out.name}; expected one of imgcal, {able}")
         if to != OURS:
-            format_named(to)
+            find_format(to)
             self._check_held()
         self._check_limit()
         return to
@@ -116,12 +117,15 @@ class Convert(arguments.Convert):
             title = "imgcal rig"
         else:
             found = read_foreign_rig(self.source, self.source_format, self.source_rig)
-            title = format_named(found.format).title
+            title = find_format(found.format).title
             rig = in_millimetres(found, where, self.unit, self.distance)
         if self.cameras:
             left_out = {*rig.names} - {*self.cameras}
-            rig, sizes = selected(rig, self.cameras), {name: sizes[name] for name in sizes if name not in left_out}
-        return with_image_sizes(rig, where, sizes), title
+            rig, sizes = (
+                select_cameras(rig, self.cameras),
+                {name: sizes[name] for name in sizes if name not in left_out},
+            )
+        return fill_image_sizes(rig, where, sizes), title
 
     def _written(self, files: Files) -> list[Path]:
         return [self.out / name if name else self.out for name in files]
@@ -145,7 +149,7 @@ class Convert(arguments.Convert):
         return written
 
 
-def _counted(names: Sequence[str]) -> str:
+def _count_cameras(names: Sequence[str]) -> str:
     return f"{len(names)} camera{'s' if len(names) != 1 else ''}"
 
 
@@ -154,5 +158,5 @@ def _size(text: str) -> tuple[str, tuple[int, int]]:
     name, _, size = text.rpartition("=")
     match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})", size)
     if match is None or not int(match[1]) or not int(match[2]):
-        raise InputError(f"--image-size: found {shortened(text)!r}, expected WIDTHxHEIGHT or NAME=WIDTHxHEIGHT")
+        raise InputError(f"--image-size: found {shorten(text)!r}, expected WIDTHxHEIGHT or NAME=WIDTHxHEIGHT")
     return name, (int(match[1]), int(match[2]))

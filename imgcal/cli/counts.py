@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from imgcal.pipeline import DOUBTFUL, Calibration, Tally
+from imgcal.pipeline import DOUBTFUL, Calibration, LabelCounts
 from imgcal.types import CameraRig, Detections
 
 
@@ -49,5 +49,5 @@ def doubtful_cameras(calibration: Calibration) -> list[str]:
     ]
 
 
-def _counts(counts: Tally, part: Any) -> dict[str, int]:
+def _counts(counts: LabelCounts, part: Any) -> dict[str, int]:
     return {name: int(getattr(counts, name)[part].sum()) for name in ("labelled", "outliers")}

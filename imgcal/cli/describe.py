@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import imgcal
-from imgcal.association import matched_to_rig
+from imgcal.association import match_to_rig
 from imgcal.cli.findings import Findings
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
@@ -41,7 +41,7 @@ def describe_refusal(
         rejected = [EARLIER] * (count - refusal.since) + [""] * refusal.since
         if refusal.labelled is not None:
             detections = refusal.labelled
-    detections = matched_to_rig(detections, rig)
+    detections = match_to_rig(detections, rig)
     found = np.bincount(detections.snapshot, minlength=len(detections.snapshot_names))
     return ReportContent(
         title=f"Recalibration of {rig.name}",
@@ -74,8 +74,8 @@ def describe(
     """Lay a calibration out blob by blob, compared with the factory rig as the gauge of its motion says."""
     gauge = found.motion.gauge
     labelled, detections = calibration.labelled, calibration.labelled.detections
-    before, sigma = _by_blob(calibration, calibration.before.residual)
-    after, _ = _by_blob(calibration, calibration.residual)
+    before, sigma = _blob_residuals(calibration, calibration.before.residual)
+    after, _ = _blob_residuals(calibration, calibration.residual)
     used = np.isfinite(after).all(1)
     blobs = np.bincount(detections.snapshot, minlength=len(labelled.snapshots))
     taken = np.bincount(detections.snapshot[used], minlength=len(labelled.snapshots))
@@ -140,7 +140,7 @@ def _about_object(calibration: Calibration) -> str:
     return " ".join(words)
 
 
-def _by_blob(calibration: Calibration, residual: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _blob_residuals(calibration: Calibration, residual: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Residual (M, 2) and sigma (M,) of each blob, nan where it was not used; residual is (S, C, N, 2)."""
     detections, used = calibration.labelled.detections, calibration.labelled.used
     row = np.full(len(calibration.labelled.snapshots), -1)

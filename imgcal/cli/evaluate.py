@@ -15,16 +15,16 @@ from rich.console import Console
 
 from imgcal.cli import arguments
 from imgcal.cli.arguments import Setting
-from imgcal.cli.common import check_folder, counted, open_rig
+from imgcal.cli.common import check_folder, open_rig, progress_bar
 from imgcal.cli.compare_captures import WORK, compare_captures
 from imgcal.errors import InputError
 from imgcal.extras import advice, missing
-from imgcal.fleet import Kept, workers
+from imgcal.fleet import StoredResults, workers
 from imgcal.io import load_object, publishing
 
 if TYPE_CHECKING:
     from imgcal.evaluation import Conditions, Facts, Method, Model, Protocol, Summary
-    from imgcal.fleet import Mapped
+    from imgcal.fleet import Mapper
     from imgcal.types import CameraRig
 
 CHECKED_RIGS = 32
@@ -98,12 +98,12 @@ def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path |
     models = _load(paths, setting)
     conditions = _conditions(models, setting)
     methods = {model.name: model.method for model in models}
-    methods |= _suited(BASELINES if baselines else QUICK_BASELINES, conditions.rig)
-    kept = None if out is None else Kept(out / WORK, _scope(models))
+    methods |= _select_suited(BASELINES if baselines else QUICK_BASELINES, conditions.rig)
+    kept = None if out is None else StoredResults(out / WORK, _scope(models))
     with _workers(setting, protocol.batches, kept, models) as mapped:
         summary = _measure(methods, conditions, protocol, setting, mapped)
-    summary = replace(summary, facts={model.name: _checked(model, conditions, setting) for model in models})
-    _print(summary)
+    summary = replace(summary, facts={model.name: _check_model(model, conditions, setting) for model in models})
+    _print_tables(summary)
     if out is not None:
         with publishing(out, (*PLOTS, TABLES, RESULT), mark=RESULT) as folder:
             written = write(summary, folder)
@@ -113,7 +113,7 @@ def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path |
         kept.clear()
 
 
-def _suited(methods: Mapping[str, Method], rig: CameraRig) -> dict[str, Method]:
+def _select_suited(methods: Mapping[str, Method], rig: CameraRig) -> dict[str, Method]:
     """Leave out networks that do not know the rig's lenses, and say so."""
     suited = {name: method for name, method in methods.items() if method.knows(rig)}
     if left := [name for name in methods if name not in suited]:
@@ -128,7 +128,9 @@ def _scope(models: list[Model]) -> str:
 
 
 @contextmanager
-def _workers(setting: Setting, batches: int, kept: Kept | None, models: Sequence[Model] = ()) -> Iterator[Mapped]:
+def _workers(
+    setting: Setting, batches: int, kept: StoredResults | None, models: Sequence[Model] = ()
+) -> Iterator[Mapper]:
     """Worker processes, if the job is long enough to be worth starting them; on a GPU only this process."""
     cores = setting.cores
     if any(parameter.is_cuda for model in models for parameter in model.checkpoint.network.parameters()):
@@ -187,7 +189,7 @@ def _conditions(models: list[Model], setting: Setting) -> Conditions:
 
 
 def _measure(
-    methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol, setting: Setting, mapped: Mapped
+    methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol, setting: Setting, mapped: Mapper
 ) -> Summary:
     from imgcal.evaluation import AXES, Summary, evaluate, latency, sweep
 
@@ -196,7 +198,7 @@ def _measure(
     points = sum(len(AXES[axis].values) for axis in setting.sweep)
     shares = [min(method.most or protocol.count, protocol.count) for method in methods.values()]
     total = protocol.trials * (protocol.count + sum(shares)) + points * along.count * (1 + len(fast))
-    with counted("evaluating", total) as advance:
+    with progress_bar("evaluating", total) as advance:
         evaluation = evaluate(methods, conditions, protocol, advance, mapped)
         sweeps = tuple(sweep(fast, conditions, axis, along, progress=advance, mapped=mapped) for axis in setting.sweep)
     repeats = {name: 50 if method.most is None else 10 for name, method in methods.items()}
@@ -204,7 +206,7 @@ def _measure(
     return Summary(evaluation, took, {}, sweeps)
 
 
-def _checked(model: Model, conditions: Conditions, setting: Setting) -> Facts:
+def _check_model(model: Model, conditions: Conditions, setting: Setting) -> Facts:
     """What is known of a network, with a check of its encoder on views without corruption."""
     from imgcal.evaluation import check_encoder
     from imgcal.synthesis import Corruption, Degradation
@@ -214,7 +216,7 @@ def _checked(model: Model, conditions: Conditions, setting: Setting) -> Facts:
     return replace(model.facts, encoder=check)
 
 
-def _print(summary: Summary) -> None:
+def _print_tables(summary: Summary) -> None:
     """Tables on standard output: for people on a terminal, as Markdown elsewhere."""
     from imgcal.evaluation import as_tables, describe, markdown
 

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Iterable
 
 from imgcal.cli import arguments
-from imgcal.io import Key, keys_of
+from imgcal.io import Key, list_keys
 
 WIDTH = 120
 
@@ -19,17 +19,17 @@ class Describe(arguments.Describe):
         from imgcal.networks import PRESETS
         from imgcal.training import KINDS, Experiment
 
-        common = list(keys_of(Experiment))
+        common = list(list_keys(Experiment))
         print(table("All experiments: `--set KEY=VALUE`, or in the file", common))
         for task, kind in KINDS.items():
-            own = [key for key in keys_of(kind) if key.path not in {shared.path for shared in common}]
+            own = [key for key in list_keys(kind) if key.path not in {shared.path for shared in common}]
             print(table(f"task: {task} ({(kind.__doc__ or '').splitlines()[0].rstrip('.')})", own))
         variants: dict[type, list[str]] = {}
         for name, variant in PRESETS.items():
             variants.setdefault(type(variant), []).append(name)
         for variant_type, names in variants.items():
             head = f"network.preset: {', '.join(names)}; defaults are those of {names[0]}"
-            print(table(head, keys_of(variant_type, "network.change.")))
+            print(table(head, list_keys(variant_type, "network.change.")))
 
 
 def table(head: str, keys: Iterable[Key]) -> str:

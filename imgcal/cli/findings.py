@@ -7,8 +7,8 @@ from typing import Any
 
 from imgcal.estimation import Gauge
 from imgcal.io import RigCovariance
-from imgcal.messages import listed
-from imgcal.pipeline import Calibration, Knowledge, Motion, knowledge_of, motion_since_factory
+from imgcal.messages import list_names
+from imgcal.pipeline import Calibration, Coverage, Motion, measure_coverage, motion_since_factory
 from imgcal.types import MovedCamera
 
 
@@ -17,7 +17,7 @@ class Findings:
     """The same for the printed lines, for result.json and for the report."""
 
     motion: Motion
-    knowledge: Knowledge
+    knowledge: Coverage
     from_scratch: bool = False  # there was no factory calibration since which a camera could have moved
     moved: tuple[MovedCamera, ...] = ()  # during the capture
     untimed: tuple[str, ...] = ()  # cameras of which nothing tells whether their frames are of the same moments
@@ -55,7 +55,7 @@ class Findings:
         if self.knowledge.sentences:
             lines.append("not known: " + " ".join(self.knowledge.sentences))
         if self.untimed:
-            which = "all cameras" if len(self.untimed) == len(self.knowledge.camera_names) else listed(self.untimed)
+            which = "all cameras" if len(self.untimed) == len(self.knowledge.camera_names) else list_names(self.untimed)
             lines.append(
                 f"timing of {which} not tested: the object moved too little, or too evenly, between snapshots to show "
                 "a camera that is late"
@@ -71,5 +71,5 @@ UNKNOWN: dict[str, Any] = {"motion": None, "timing_untested": None, "knowledge":
 
 def findings(calibration: Calibration, gauge: Gauge, covariance: RigCovariance) -> Findings:
     """Look at what was found."""
-    motion, knowledge = motion_since_factory(calibration, gauge), knowledge_of(calibration, covariance.std)
+    motion, knowledge = motion_since_factory(calibration, gauge), measure_coverage(calibration, covariance.std)
     return Findings(motion, knowledge, calibration.from_scratch, calibration.moved, calibration.untimed)

@@ -17,7 +17,7 @@ from imgcal.cli import arguments
 from imgcal.cli.common import check_folder, open_rig
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice, missing
-from imgcal.fleet import Dataset, Engine, FleetCount, KindOfRig, LearntPrior, Manifest, Settings, kinds_of_rigs
+from imgcal.fleet import Dataset, Engine, FleetCount, KindOfRig, LearntPrior, Manifest, Settings, rig_kinds
 from imgcal.fleet import recalibrate_fleet as recalibrate
 from imgcal.io import load_object, write_text, yaml_text
 from imgcal.types import RigPrior
@@ -48,9 +48,9 @@ class Fleet(arguments.Fleet):
             pass  # it can be, and nobody else is at it
         settings = Settings(self.blind_cameras, self.detector, self.seconds, self.memory_mb, self.keep_rigs)
         started = time.perf_counter()
-        with Engine(self.address, self.cores) as engine, _told() as tell:
+        with Engine(self.address, self.cores) as engine, _show_progress() as tell:
             count = recalibrate(manifest, dataset, engine, settings, again=self.again, tell=tell, batch=self.batch)
-        print(f"{_said(count)}, {time.perf_counter() - started:.0f} s: {dataset.folder}")
+        print(f"{_print_line(count)}, {time.perf_counter() - started:.0f} s: {dataset.folder}")
         if self.keep_rigs:
             dataset.write_rigs(self.out / "rigs")
         self._learn(dataset, before)
@@ -58,14 +58,14 @@ class Fleet(arguments.Fleet):
     def _learn(self, dataset: Dataset, before: RigPrior) -> None:
         """Write the prior and the page."""
         taught: list[tuple[KindOfRig, LearntPrior | None, str]] = []
-        for kind in kinds_of_rigs(dataset):
+        for kind in rig_kinds(dataset):
             try:
                 taught.append((kind, kind.learn(self.covariates, by_camera=self.by_camera), ""))
             except RefusedError as error:
                 taught.append((kind, None, str(error)))
         if taught and (learnt := taught[0][1]) is not None:
-            write_text(self.out / "prior.yaml", yaml_text({"prior": _rounded(asdict(learnt.prior()))}))
-            write_text(self.out / "lessons.json", json.dumps(_lessons(taught[0][0], learnt), indent=2) + "\n")
+            write_text(self.out / "prior.yaml", yaml_text({"prior": _round(asdict(learnt.prior()))}))
+            write_text(self.out / "lessons.json", json.dumps(_summary(taught[0][0], learnt), indent=2) + "\n")
             for spread in learnt.spreads:
                 camera = "" if spread.camera is None else f" of {spread.camera}"
                 print(f"{spread.kind}{camera}: spread {spread.value:.4g} +- {spread.sigma:.1g}")
@@ -82,11 +82,11 @@ class Fleet(arguments.Fleet):
         print(f"report {self.out / 'report.html'}")
 
 
-def _rounded(values: dict[str, float]) -> dict[str, float]:
+def _round(values: dict[str, float]) -> dict[str, float]:
     return {name: float(f"{value:.6g}") for name, value in values.items()}
 
 
-def _lessons(kind: KindOfRig, learnt: LearntPrior) -> dict[str, Any]:
+def _summary(kind: KindOfRig, learnt: LearntPrior) -> dict[str, Any]:
     """What scripts read: every spread, outlier and slope."""
     outliers = [asdict(one) | {"device": kind.devices[one.device]} for one in learnt.outliers]
     return {
@@ -95,18 +95,20 @@ def _lessons(kind: KindOfRig, learnt: LearntPrior) -> dict[str, Any]:
         "devices": len(kind.devices),
         "spreads": [asdict(spread) for spread in learnt.spreads],
         "outliers": outliers,
-        "trends": [asdict(trend) | {"name": name} for trend in learnt.trends if (name := kind.name_of(trend)) != "-"],
+        "trends": [
+            asdict(trend) | {"name": name} for trend in learnt.trends if (name := kind.parameter_name(trend)) != "-"
+        ],
     }
 
 
-def _said(count: FleetCount) -> str:
+def _print_line(count: FleetCount) -> str:
     parts = [f"{number} {status.replace('_', ' ')}" for status, number in count.status.most_common()]
     known = f"{count.known} done before" if count.known else ""
     return ", ".join([f"{count.read} captures", *parts, *([known] if known else [])])
 
 
 @contextmanager
-def _told() -> Iterator[Callable[[FleetCount], None]]:
+def _show_progress() -> Iterator[Callable[[FleetCount], None]]:
     """Show the progress: a bar on a terminal, a line a minute elsewhere."""
     console = Console(file=sys.stderr)
     started = last = time.monotonic()
@@ -116,7 +118,7 @@ def _told() -> Iterator[Callable[[FleetCount], None]]:
             nonlocal last
             if time.monotonic() - last > EVERY:
                 last = time.monotonic()
-                print(f"{_said(count)}, {count.read / (last - started):.1f}/s", file=sys.stderr, flush=True)
+                print(f"{_print_line(count)}, {count.read / (last - started):.1f}/s", file=sys.stderr, flush=True)
 
         yield line
         return
@@ -126,6 +128,6 @@ def _told() -> Iterator[Callable[[FleetCount], None]]:
 
         def show(count: FleetCount) -> None:
             rate = count.read / max(time.monotonic() - started, 1e-9)
-            bar.update(task, description=f"{_said(count)}, {rate:.1f}/s", completed=count.read, total=count.total)
+            bar.update(task, description=f"{_print_line(count)}, {rate:.1f}/s", completed=count.read, total=count.total)
 
         yield show

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from imgcal.cli import arguments
 from imgcal.cli.common import check_folder, open_rig, parse_range, progress, read_detections
 from imgcal.io import load_object, open_capture, publishing, write_text
-from imgcal.pipeline import sight_of_capture
+from imgcal.pipeline import capture_sight
 from imgcal.training import CARD, HELD_OUT, TRAIN, FrameDataset, harvest
 from imgcal.types import CalibrationObject, CameraRig
 
@@ -46,7 +46,7 @@ class Harvest(arguments.Harvest):
         first, _ = parse_range(self.snapshots)
         sight = None
         if self.detector != "classical" and obj.board is None:
-            sight = sight_of_capture(capture, self.detector, self.detection, first)
+            sight = capture_sight(capture, self.detector, self.detection, first)
 
         def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
             return progress(snapshots, total, "harvesting")
@@ -60,7 +60,7 @@ class Harvest(arguments.Harvest):
             for name, part in zip((TRAIN, HELD_OUT), splits, strict=True):
                 part.save(out / name, about)
             write_text(out / CARD, self._card(rig, obj, len(detections.snapshot_names), *splits))
-        said = [f"{len(part)} crops with {_seen(part)} markers" for part in splits]
+        said = [f"{len(part)} crops with {_count_markers(part)} markers" for part in splits]
         print(f"{self.out}: {said[0]} for training, {said[1]} held out", file=sys.stderr)
 
     def _card(
@@ -69,12 +69,13 @@ class Harvest(arguments.Harvest):
         """Say what is in the dataset."""
         return CARD_TEXT.format(
             capture=self.capture, snapshots=snapshots, cameras=rig.num_cameras, rig=rig.name, object=obj.name,
-            train=len(train), train_seen=_seen(train), train_snapshots=len(train.snapshot.unique()),
-            held_out=len(held_out), held_out_seen=_seen(held_out), held_out_snapshots=len(held_out.snapshot.unique()),
+            train=len(train), train_seen=_count_markers(train), train_snapshots=len(train.snapshot.unique()),
+            held_out=len(held_out), held_out_seen=_count_markers(held_out),
+            held_out_snapshots=len(held_out.snapshot.unique()),
             folder=self.out,
         )  # fmt: skip
 
 
-def _seen(part: FrameDataset) -> int:
+def _count_markers(part: FrameDataset) -> int:
     """Count the markers that crops show."""
     return int(part.seen.sum())

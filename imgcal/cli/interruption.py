@@ -9,7 +9,7 @@ from types import FrameType
 
 
 @contextlib.contextmanager
-def ends_at_once() -> Iterator[None]:
+def end_at_once() -> Iterator[None]:
     """End the process with one line at Ctrl-C: within an import, KeyboardInterrupt can surface as anything."""
     # In the background of a shell, Ctrl-C is not for us; and other programs may have handlers of their own.
     ours = threading.current_thread() is threading.main_thread()

@@ -17,11 +17,11 @@ from typing import Annotated, Any, Protocol, Union, get_type_hints
 import tyro
 
 import imgcal
-from imgcal.cli.compiling import tells_of_compiling
-from imgcal.cli.interruption import ends_at_once
+from imgcal.cli.compiling import announce_compilation
+from imgcal.cli.interruption import end_at_once
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice
-from imgcal.messages import one_line, quoted, shortened
+from imgcal.messages import one_line, quote, shorten
 
 SEVERAL_OBJECTS = ("simulate", "calibrate", "score")
 """Commands whose `--object` may be several."""
@@ -115,7 +115,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         command = parse([argument for argument in given if argument != DEBUG])
         helped = "calibrate" in given[:2]
-        with tells_of_compiling(helped=helped) if "warmup" not in given[:2] else contextlib.nullcontext():
+        with announce_compilation(helped=helped) if "warmup" not in given[:2] else contextlib.nullcontext():
             command.run()
     except SystemExit as stop:  # help was asked for
         return DONE if stop.code is None else int(stop.code)
@@ -143,14 +143,14 @@ def parse(arguments: list[str]) -> Runnable:
     drawn = io.StringIO()
     try:
         with contextlib.redirect_stderr(drawn):
-            return _understood(arguments)
+            return _parse(arguments)
     except SystemExit as stop:
         if stop.code in (None, DONE):
             raise
-        raise InputError(_undrawn(drawn.getvalue(), arguments[0] if arguments else "")) from None
+        raise InputError(_strip_boxes(drawn.getvalue(), arguments[0] if arguments else "")) from None
 
 
-def _understood(arguments: list[str]) -> Runnable:
+def _parse(arguments: list[str]) -> Runnable:
     first = arguments[0] if arguments else ""
     if first == VERSION:
         print(f"imgcal {imgcal.__version__}")
@@ -159,7 +159,7 @@ def _understood(arguments: list[str]) -> Runnable:
         options = _objects_last(first, arguments[1:])
         given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=options)
         _check_values(given, options)
-        with ends_at_once():  # imports take a while
+        with end_at_once():  # imports take a while
             command = getattr(import_module(COMMANDS[first][0]), first.capitalize())
         return command(**vars(given))
     # The shell's completion knows the options of every command; all else ends here, and names and summaries will do.
@@ -167,7 +167,7 @@ def _understood(arguments: list[str]) -> Runnable:
     if first and not first.startswith("-"):
         near = difflib.get_close_matches(first, COMMANDS, 1)
         hint = f"did you mean `{near[0]}`?" if near else "see imgcal --help"
-        raise InputError(f"unknown command `{shortened(first)}`; {hint}")
+        raise InputError(f"unknown command `{shorten(first)}`; {hint}")
     commands: Any = Union[tuple(Annotated[load(name), tyro.conf.subcommand(name)] for name in COMMANDS)]  # noqa: UP007
     return tyro.cli(commands, prog="imgcal", description=DESCRIPTION, args=arguments)
 
@@ -206,7 +206,7 @@ def _check_values(given: Any, arguments: list[str]) -> None:
 
 
 def _arguments(name: str) -> Any:
-    with ends_at_once():
+    with end_at_once():
         return getattr(import_module("imgcal.cli.arguments"), name.capitalize())
 
 
@@ -214,17 +214,17 @@ def _summary(name: str) -> Any:
     return make_dataclass(name.capitalize(), (), namespace={"__doc__": COMMANDS[name][1]})
 
 
-def _undrawn(box: str, first: str = "") -> str:
+def _strip_boxes(box: str, first: str = "") -> str:
     """Strip the box that tyro draws around a message."""
     rows = (line.strip("│╭╮╰╯─| ") for line in box.splitlines()[1:])
     text = " ".join(row for row in rows if row.strip("-+"))
     problem, _, hint = text.partition("For full helptext, ")
     problem = problem.partition("Argument helptext:")[0].replace("__tyro-dummy-inner__.", "")
     command = re.search(r"imgcal[a-z ]* --help", hint)
-    return f"{_in_brief(problem.strip(), first)}; see {command[0] if command else 'imgcal --help'}"
+    return f"{_shorten(problem.strip(), first)}; see {command[0] if command else 'imgcal --help'}"
 
 
-def options_of(command: str) -> list[str]:
+def list_options(command: str) -> list[str]:
     """List the options of a command, without importing the command itself."""
     if command not in COMMANDS:
         return []
@@ -237,16 +237,16 @@ def options_of(command: str) -> list[str]:
     return names(_arguments(command))
 
 
-def _in_brief(problem: str, command: str = "") -> str:
+def _shorten(problem: str, command: str = "") -> str:
     """Describe the first problem of a command line in a few words."""
     if unknown := re.search(r"Unrecognized options: (.*?)(?: Perhaps you meant:? (.*))?$", problem):
         words, near = unknown[1].split(", "), re.search(r"--[\w.-]+", unknown[2] or "")
         options = [word for word in words if word.startswith("-")]
         if not options:
-            return f"found {quoted(' '.join(words))!r}, expected no more than was given before it"
+            return f"found {quote(' '.join(words))!r}, expected no more than was given before it"
         option = options[0].split()[0]
-        close = [near[0]] if near else difflib.get_close_matches(option.partition("=")[0], options_of(command), 1)
-        return f"unknown option `{shortened(option)}`" + (f"; did you mean `{close[0]}`?" if close else "")
+        close = [near[0]] if near else difflib.get_close_matches(option.partition("=")[0], list_options(command), 1)
+        return f"unknown option `{shorten(option)}`" + (f"; did you mean `{close[0]}`?" if close else "")
     if problem.startswith("Missing from"):
         entries = problem.partition(": ")[2].split("(required)")[:-1]
         parts = [entry.split() for entry in entries]
@@ -258,11 +258,11 @@ def _in_brief(problem: str, command: str = "") -> str:
         return f"{count[1]}: found {count[2]} values, expected {count[3]}"
     if number := re.search(r"Error parsing (\S+): .*(?:base 10|to float): '(.*?)'", problem):
         kind = "an integer" if "base 10" in problem else "a number"
-        return f"{number[1]}: found {shortened(number[2])}, expected {kind}"
+        return f"{number[1]}: found {shorten(number[2])}, expected {kind}"
     if union := re.search(r"Error parsing (\S+): no type matching .* from \[(.*?)\]\. Got errors", problem):
         numbers = re.search(r"tuple\[((?:(?:float|int)(?:, )?)+)\]", problem)
         expected = f"{len(numbers[1].split(', '))} numbers" if numbers else "another value"
-        return f"{union[1]}: found {shortened(union[2].replace(chr(39), '').replace(',', ''))}, expected {expected}"
+        return f"{union[1]}: found {shorten(union[2].replace(chr(39), '').replace(',', ''))}, expected {expected}"
     return re.sub(r"\[/?[a-z ]+\]", "", problem)
 
 
@@ -272,8 +272,8 @@ def _verdict(error: BaseException, given: list[str]) -> tuple[int, str]:
         case InputError():
             return UNUSABLE, str(error)
         case OSError():
-            place = f"{quoted(str(error.filename))}: " if error.filename else ""
-            return UNUSABLE, place + (error.strerror or quoted(str(error)))
+            place = f"{quote(str(error.filename))}: " if error.filename else ""
+            return UNUSABLE, place + (error.strerror or quote(str(error)))
         case RefusedError():
             return REFUSED, error.for_command
         case KeyboardInterrupt():
@@ -284,7 +284,7 @@ def _verdict(error: BaseException, given: list[str]) -> tuple[int, str]:
             return UNUSABLE, f"not enough memory for this input ({str(error) or 'MemoryError'}); {DEBUG} shows where"
     ours = [frame for frame in traceback.extract_tb(error.__traceback__) if "imgcal" in Path(frame.filename).parts]
     place = f" ({Path(ours[-1].filename).name}:{ours[-1].lineno})" if ours else ""
-    what = quoted(f"{type(error).__name__}: {error}")
+    what = quote(f"{type(error).__name__}: {error}")
     return UNUSABLE, f"internal error{place}: {what}; this input found a fault of imgcal, {DEBUG} shows where"
 
 

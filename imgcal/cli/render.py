@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 import torch
 
-from imgcal.association import associate, matched_to_rig, to_observations
+from imgcal.association import associate, match_to_rig, to_observations
 from imgcal.cli import arguments
 from imgcal.cli.common import check_folder, open_rig, progress, read_detections
 from imgcal.errors import InputError
@@ -32,7 +32,7 @@ class Render(arguments.Render):
         def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
             return progress(snapshots, total, "identifying")
 
-        labelled = associate(matched_to_rig(detections, rig), rig, obj, progress=bar)
+        labelled = associate(match_to_rig(detections, rig), rig, obj, progress=bar)
         kept = labelled.detections.select(np.isin(labelled.detections.snapshot, labelled.used))
         observations = to_observations(kept, rig, obj)
         with publishing(self.out, rig.camera_names, mark=rig.camera_names[-1]) as out:

@@ -8,8 +8,8 @@ from pathlib import Path
 from imgcal.cli import arguments
 from imgcal.errors import InputError
 from imgcal.io import open_capture, save_cameras, save_rig
-from imgcal.messages import listed
-from imgcal.synthesis import arranged_rig
+from imgcal.messages import list_names
+from imgcal.synthesis import arrange_rig
 from imgcal.types import Volume
 
 
@@ -27,7 +27,7 @@ class Rig(arguments.Rig):
 
 def _look_at(given: arguments.LookAt) -> None:
     volume = None if given.volume is None else Volume.box(given.volume[:3], given.volume[3:])
-    rig = arranged_rig(
+    rig = arrange_rig(
         given.shape,
         given.cameras,
         given.radius,
@@ -50,7 +50,9 @@ def _cameras(given: arguments.Cameras) -> None:
         if len(sizes) == len(capture.camera_names):
             break
     if without := [name for name in capture.camera_names if name not in sizes]:
-        raise InputError(f"{given.capture}: found no readable frame of {listed(without)}, expected some of each camera")
+        raise InputError(
+            f"{given.capture}: found no readable frame of {list_names(without)}, expected some of each camera"
+        )
     save_cameras({name: sizes[name] for name in capture.camera_names}, given.field_of_view_deg, given.out)
     print(f"{len(sizes)} cameras written to {given.out}", file=sys.stderr)
 

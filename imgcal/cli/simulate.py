@@ -22,7 +22,7 @@ from imgcal.io import (
     write_frame,
     write_text,
 )
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 from imgcal.synthesis import (
     DIFFICULTIES,
     Drift,
@@ -54,7 +54,7 @@ class Simulate(arguments.Simulate):
         bounds = (("snapshots", 1, MOST_SNAPSHOTS), ("seed", 0, 2**63 - 1), ("lights", 1, limits.MOST_FIDUCIALS))
         for name, least, most in bounds:
             if not least <= getattr(self, name) <= most:
-                found = shortened(str(getattr(self, name)))
+                found = shorten(str(getattr(self, name)))
                 raise InputError(f"--{name}: found {found}, expected at least {least} and at most {most}")
         if not FIDUCIAL_RADIUS.low <= self.marker_radius <= FIDUCIAL_RADIUS.high:
             raise InputError(f"--marker-radius: found {self.marker_radius}, expected {FIDUCIAL_RADIUS}")

@@ -25,7 +25,7 @@ class Train(arguments.Train):
         import torch
 
         from imgcal.cli.training_folder import RESULT, STATE, train_in
-        from imgcal.training import adaptation, finished, load_experiment
+        from imgcal.training import adaptation, is_finished, load_experiment
 
         changes = [] if self.dataset is None else adaptation(self.experiment, self.dataset)
         changes += [change for changes in self.set for change in changes]
@@ -41,10 +41,10 @@ class Train(arguments.Train):
             torch.set_num_threads(experiment.training.threads)
         if experiment.training.tf32:
             torch.set_float32_matmul_precision("high")
-        with _asked_to_stop() as stop:
+        with _stop_on_signal() as stop:
             run = train_in(self.out, experiment, self.resume, stop)
         run.accelerator.end_training()
-        if not finished(run, run.seconds):
+        if not is_finished(run, run.seconds):
             raise KeyboardInterrupt(
                 f"interrupted and saved at step {run.step}; to go on, repeat the command with --resume"
             )
@@ -53,7 +53,7 @@ class Train(arguments.Train):
 
 
 @contextmanager
-def _asked_to_stop() -> Iterator[Callable[[], bool]]:
+def _stop_on_signal() -> Iterator[Callable[[], bool]]:
     """Turn Ctrl-C or SIGTERM into a stop request; repeated after a while, it interrupts at once.
 
     After a while, because a launcher of several processes passes on the Ctrl-C that they have had already.

@@ -22,7 +22,7 @@ from imgcal.training import (
     Result,
     Run,
     TrainingState,
-    finished,
+    is_finished,
     load_state,
     progress,
     save_experiment,
@@ -114,7 +114,7 @@ class TrainingFolder(Callbacks):
         """Move the bar; without a terminal, print a line every minute."""
         done = progress(run, seconds)
         self.bar.update(self.shown, completed=done, description=_summary(run))
-        if not self.console.is_terminal and seconds - self.said >= EVERY and not finished(run, seconds):
+        if not self.console.is_terminal and seconds - self.said >= EVERY and not is_finished(run, seconds):
             self.said = seconds
             left = seconds * (1 - done) / max(done, 1e-9) / 60
             self._say(f"{_summary(run)}  {100 * done:.0f} %, {left:.0f} min left")

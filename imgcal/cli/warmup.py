@@ -6,7 +6,7 @@ import sys
 import time
 
 from imgcal.cli import arguments
-from imgcal.cli.compiling import tells_of_compiling
+from imgcal.cli.compiling import announce_compilation
 from imgcal.online import warm_up
 from renderers.compiling import cache_folder
 
@@ -17,7 +17,7 @@ class Warmup(arguments.Warmup):
     def run(self) -> None:
         """Compile, and say where it is kept."""
         started = time.perf_counter()
-        with tells_of_compiling("compiling, which takes a while") as compiled:
+        with announce_compilation("compiling, which takes a while") as compiled:
             warm_up(self.all_lenses)
         what = f"{len(compiled)} functions compiled" if compiled else "all was compiled already"
         where = cache_folder() or "where Python keeps the compiled files of imgcal"

@@ -23,7 +23,7 @@ from imgcal.cli.watch_display import Display
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice, missing
 from imgcal.io import holding, load_object, open_input
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 from imgcal.online import Event, RigKeeper
 from imgcal.types import CalibrationObject, CameraRig, Detections, object_difference, rig_difference
 from imgcal.watch import (
@@ -34,7 +34,6 @@ from imgcal.watch import (
     BlobTable,
     Folder,
     Hook,
-    Intake,
     JsonLines,
     Known,
     LabStreaming,
@@ -48,6 +47,7 @@ from imgcal.watch import (
     Progress,
     Qualisys,
     Source,
+    SourceReader,
     Tally,
     Timing,
     Videos,
@@ -92,13 +92,13 @@ class Watch(arguments.Watch):
         goes_on = source.live and not self.keep_all  # what came since the last state is gone
         knows = goes_on or isinstance(source, Folder)  # a folder knows which files have been read
         known = None if progress is None or knows else self._known(folder, progress, source)
-        intake = Intake(source, rig, Timing(self.tolerance, self.patience), self.keep_all, known=known)
+        intake = SourceReader(source, rig, Timing(self.tolerance, self.patience), self.keep_all, known=known)
         hook = None if self.hook is None else Hook(self.hook)
         display = Display(Console(file=sys.stdout, soft_wrap=True), intake, hook)
         with contextlib.ExitStack() as stack:
             keeper, restored = self._keeper(folder, rig, obj)
             stack.enter_context(keeper)
-            stack.enter_context(intake).opened()  # before anything is written
+            stack.enter_context(intake).wait_until_open()  # before anything is written
             poses = [
                 stack.enter_context(Poses(name, _pose_sink(name, rig, obj)))
                 for name in sorted(self.poses, key=_is_table)
@@ -110,7 +110,8 @@ class Watch(arguments.Watch):
                 page = stack.enter_context(LivePage(rig, obj, parse_address(self.serve), problem=display.warn))
                 print(page.notice)
             loop = Loop(
-                keeper, folder, hook, page, display.tell, display.warn, _removing(source), source=origin, rate=rate,
+                keeper, folder, hook, page, display.show_event, display.warn, _removing(source), source=origin,
+                rate=rate,
                 poses=poses,
             )  # fmt: skip
             if self.metrics is not None:
@@ -123,10 +124,10 @@ class Watch(arguments.Watch):
             anew = self.fresh and put_aside(folder)
             stack.enter_context(loop)
             stopped = stack.enter_context(_stopping())
-            stack.enter_context(display.of(loop.tally))
+            stack.enter_context(display.show_tally(loop.tally))
             if restored or anew:
                 how = "started again from what was known" if restored else "begun anew with the factory calibration"
-                loop.tell(Event(time.time(), 0, "restart", message=how))
+                loop.publish_event(Event(time.time(), 0, "restart", message=how))
             loop.run(intake, stopped, display.draw)
         tally = loop.tally
         said = display.result(self.out / CURRENT)
@@ -210,7 +211,7 @@ class Watch(arguments.Watch):
         for option, meant in ONLY_FOR.items():
             given = getattr(self, option.replace("-", "_"))
             if meant != kind and not (given is None or given is False or given == ()):
-                raise InputError(f"--{option}: found it with {kind} ({shortened(self.input)}), expected {meant}")
+                raise InputError(f"--{option}: found it with {kind} ({shorten(self.input)}), expected {meant}")
 
     def _keeper(self, folder: Path, rig: CameraRig, obj: CalibrationObject) -> tuple[RigKeeper, bool]:
         """Begin, or go on with what an earlier run knew; says whether it did."""
@@ -230,7 +231,7 @@ class Watch(arguments.Watch):
 
     def _require(self, library: str, what: str) -> None:
         if missing(library):
-            raise InputError(f"{shortened(self.input)}: {what} {advice(library)}")
+            raise InputError(f"{shorten(self.input)}: {what} {advice(library)}")
 
 
 def _rig_difference(rig: CameraRig, known: CameraRig) -> str | None:
@@ -250,7 +251,7 @@ def _object_difference(obj: CalibrationObject, known: CalibrationObject) -> str 
     return difference
 
 
-def _nothing(tally: Tally, intake: Intake) -> str:
+def _nothing(tally: Tally, intake: SourceReader) -> str:
     """Say why nothing was learnt."""
     if tally.latest is not None:
         return f"watch: no snapshot taught anything: {tally.latest.refused}"
@@ -263,7 +264,7 @@ def _removing(source: Source) -> Callable[[Progress], None]:
     """What deletes frames that have been learnt from."""
     if not isinstance(source, Folder):
         return lambda progress: None
-    return lambda progress: None if progress.name is None else source.saved(progress.name)
+    return lambda progress: None if progress.name is None else source.delete_read(progress.name)
 
 
 @contextlib.contextmanager
@@ -308,7 +309,7 @@ def metrics_address(text: str) -> tuple[str, int]:
     """Read [HOST:]PORT; the host is this machine alone if it is not given."""
     host, _, port = text.rpartition(":")
     if not re.fullmatch(r"\d{1,5}", port) or int(port) >= 2**16:
-        raise InputError(f"found {shortened(text)!r}, expected [HOST:]PORT")
+        raise InputError(f"found {shorten(text)!r}, expected [HOST:]PORT")
     return host.strip("[]") or "127.0.0.1", int(port)
 
 
@@ -322,20 +323,20 @@ def _check_poses(names: tuple[str, ...], obj: CalibrationObject, out: Path) -> N
         path, (scheme, separator, _) = Path(name), name.partition("://")
         is_file, suffix = not separator, path.suffix.lower()
         if name in names[:number]:
-            raise InputError(f"--poses: found {shortened(name)} twice, expected each output once")
+            raise InputError(f"--poses: found {shorten(name)} twice, expected each output once")
         if not is_file and scheme not in ("tcp", "ipc", "igtl"):
-            raise InputError(f"--poses: found {shortened(name)!r}, expected {POSE_OUTPUTS}")
+            raise InputError(f"--poses: found {shorten(name)!r}, expected {POSE_OUTPUTS}")
         if is_file and suffix not in (*MARKER_SUFFIXES, *TABLE_SUFFIXES):
-            raise InputError(f"--poses: found {shortened(name)!r}, expected {POSE_OUTPUTS}")
+            raise InputError(f"--poses: found {shorten(name)!r}, expected {POSE_OUTPUTS}")
         if obj.pose_rank == 3 and not (is_file and suffix in MARKER_SUFFIXES):
-            found = f"found {shortened(name)!r} with {shortened(obj.name or 'a light')}, which has no pose"
+            found = f"found {shorten(name)!r} with {shorten(obj.name or 'a light')}, which has no pose"
             raise InputError(f"--poses: {found}, expected FILE.c3d or FILE.trc: points")
         if is_file and path.is_dir():
-            raise InputError(f"--poses: {shortened(name)}: found a folder, expected a file")
+            raise InputError(f"--poses: {shorten(name)}: found a folder, expected a file")
         if is_file and not (path.parent.is_dir() or out.resolve().is_relative_to(path.parent.resolve())):
-            raise InputError(f"--poses: {shortened(name)}: found no folder {path.parent}, expected one")
+            raise InputError(f"--poses: {shorten(name)}: found no folder {path.parent}, expected one")
         if is_file and path.parent.is_dir() and not os.access(path.parent, os.W_OK):
-            raise InputError(f"--poses: {shortened(name)}: no permission to write to {path.parent}")
+            raise InputError(f"--poses: {shorten(name)}: no permission to write to {path.parent}")
 
 
 def _is_table(name: str) -> bool:
@@ -357,7 +358,7 @@ def _pose_sink(name: str, rig: CameraRig, obj: CalibrationObject) -> PoseSink:
     if scheme == "igtl":
         return OpenIGTLink(*listening_address(name))
     if missing("zmq"):
-        raise InputError(f"--poses: {shortened(name)} {advice('zmq')}")
+        raise InputError(f"--poses: {shorten(name)} {advice('zmq')}")
     return PosePublisher(name)
 
 
@@ -365,9 +366,9 @@ def _topics(given: tuple[str, ...]) -> dict[str, str]:
     pairs = [text.partition("=") for text in given]
     wrong = [camera for camera, _, topic in pairs if not camera or not topic]
     if wrong:
-        raise InputError(f"--topic: found {shortened(wrong[0])!r}, expected CAMERA=TOPIC")
+        raise InputError(f"--topic: found {shorten(wrong[0])!r}, expected CAMERA=TOPIC")
     cameras = [camera for camera, _, _ in pairs]
     twice = [camera for camera in dict.fromkeys(cameras) if cameras.count(camera) > 1]
     if twice:
-        raise InputError(f"--topic: found camera {shortened(twice[0])} twice, expected one topic of each")
+        raise InputError(f"--topic: found camera {shorten(twice[0])} twice, expected one topic of each")
     return {camera: topic for camera, _, topic in pairs}

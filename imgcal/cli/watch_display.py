@@ -12,9 +12,9 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from imgcal.messages import listed, one_line
+from imgcal.messages import list_names, one_line
 from imgcal.online import Event
-from imgcal.watch import EVENTS, Hook, Intake, Tally
+from imgcal.watch import EVENTS, Hook, SourceReader, Tally
 
 SAID_EVERY = 10.0  # s between two lines where nobody looks at a terminal
 DRAWN_EVERY = 0.25  # s
@@ -27,7 +27,7 @@ LEAST_OFFSET = 5e-4  # s: smaller ones are the exposure's length
 class Display:
     """Shows the progress; with `rich` in a terminal."""
 
-    def __init__(self, console: Console, intake: Intake, hook: Hook | None = None) -> None:
+    def __init__(self, console: Console, intake: SourceReader, hook: Hook | None = None) -> None:
         """Prepare; nothing is shown before `of`."""
         self._console, self._intake, self._hook, self._tally = console, intake, hook, Tally()
         self._live: Live | None = None
@@ -36,7 +36,7 @@ class Display:
         self._rate = 0.0
 
     @contextlib.contextmanager
-    def of(self, tally: Tally) -> Iterator[None]:
+    def show_tally(self, tally: Tally) -> Iterator[None]:
         """Show what this tally says while the block runs."""
         self._tally = tally
         self._drawn = self._said = time.monotonic()
@@ -48,7 +48,7 @@ class Display:
             self._live.update(Text(self.line()), refresh=True)
         self._live = None
 
-    def tell(self, event: Event) -> None:
+    def show_event(self, event: Event) -> None:
         """Show an event."""
         at = datetime.fromtimestamp(event.time).strftime("%H:%M:%S")
         self._print(f"{at} {event.kind.replace('_', ' ')}: {event.message}")
@@ -77,7 +77,7 @@ class Display:
         if state is not None and state.refused is not None:
             parts.append("nothing learnt now")
         parts.append(f"{tally.snapshots:,} snapshots, {self._rate:.3g}/s")
-        return " | ".join([*parts, *self._counts(), *self._clocks(), *self._trembling(), *self._alone()])
+        return " | ".join([*parts, *self._counts(), *self._clocks(), *self._trembling(), *self._unsynchronized()])
 
     def result(self, rig: Path) -> str:
         """Say in one line what came of it, and what did not: `rig` is the file."""
@@ -102,11 +102,11 @@ class Display:
         reasons = self._intake.reasons
         return "waiting for the first snapshot" + (f": {reasons[-1]}" if reasons else "")
 
-    def _alone(self) -> list[str]:
+    def _unsynchronized(self) -> list[str]:
         """Name the cameras whose time stamps go with no other's."""
         names, tolerance = self._intake.synchronizer.alone, self._intake.synchronizer.timing.tolerance
         said = f"time stamps more than {1e3 * tolerance:g} ms (--tolerance) beside the other cameras': set their clocks"
-        return [f"{listed(names)}: {said}"] if names else []
+        return [f"{list_names(names)}: {said}"] if names else []
 
     def _clocks(self) -> list[str]:
         """Name the cameras whose time stamps do not say when they expose."""

@@ -3,7 +3,7 @@ from .centroids import Blobs, to_detections
 from .checks import Frame
 from .detector import detect, detect_frame, detect_snapshot
 from .options import DetectionOptions
-from .populations import without_dim
+from .populations import drop_dim
 
 __all__ = [
     "Blobs",
@@ -12,7 +12,7 @@ __all__ = [
     "detect",
     "detect_frame",
     "detect_snapshot",
+    "drop_dim",
     "require_board",
     "to_detections",
-    "without_dim",
 ]

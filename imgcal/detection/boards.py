@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from imgcal.detection.centroids import Blobs
 from imgcal.detection.checks import Frame
 from imgcal.errors import InputError
-from imgcal.messages import listed
+from imgcal.messages import list_names
 from imgcal.types import BlobFlag, Board
 
 Floats = NDArray[np.float64]
@@ -127,7 +127,7 @@ def _eight_bits(frame: Frame, board: Board) -> NDArray[np.uint8]:
 def _dictionary(name: str) -> Any:
     number = getattr(cv2.aruco, name, None)
     if not name.startswith("DICT_") or number is None:
-        raise InputError(f"board: dictionary: found {name!r}, expected one of OpenCV's: {listed(dictionaries())}")
+        raise InputError(f"board: dictionary: found {name!r}, expected one of OpenCV's: {list_names(dictionaries())}")
     return cv2.aruco.getPredefinedDictionary(number)
 
 
@@ -146,7 +146,7 @@ def _parameters(board: Board) -> Any:
 
 
 @lru_cache(maxsize=8)
-def _charuco_of(board: Board) -> Any:
+def _make_charuco(board: Board) -> Any:
     """OpenCV's own description of a ChArUco board."""
     count = board.columns * board.rows // 2 if not board.legacy else (board.columns * board.rows + 1) // 2
     count = max(count, board.columns * board.rows // 2)
@@ -163,18 +163,18 @@ def _charuco_of(board: Board) -> Any:
 
 
 def _charuco(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
-    made = _charuco_of(board)
+    made = _make_charuco(board)
     detector = cv2.aruco.CharucoDetector(made, cv2.aruco.CharucoParameters(), _parameters(board))
     corners, ids, marker_corners, marker_ids = detector.detectBoard(grey)
     if ids is None or marker_ids is None:
         return None
     layout = {int(k): np.asarray(p)[:, :2] for k, p in zip(made.getIds().ravel(), made.getObjPoints(), strict=True)}
-    if not _as_laid_out(marker_corners, marker_ids, layout, board.marker):
+    if not _matches_layout(marker_corners, marker_ids, layout, board.marker):
         return None
     return _Seen(np.asarray(corners, dtype=np.float64).reshape(-1, 2), np.asarray(ids).ravel().astype(np.int64))
 
 
-def _as_laid_out(corners: Any, ids: Any, layout: dict[int, Any], size: float) -> bool:
+def _matches_layout(corners: Any, ids: Any, layout: dict[int, Any], size: float) -> bool:
     """Tell whether markers lie on a plane as a layout has them: id -> (4, 2) mm."""
     known = [k for k, marker in enumerate(np.ravel(ids)) if int(marker) in layout]
     if len(known) < LEAST_ON_LAYOUT * len(np.ravel(ids)):
@@ -205,7 +205,7 @@ def _april_grid(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
     # Printed tags may all be turned in their places: OpenCV and AprilTag's own images differ by half a turn.
     for turn in range(4):
         turned = np.roll(corners, turn, axis=1)
-        if len(number) > 1 and _as_laid_out(turned, number, layout, board.marker):
+        if len(number) > 1 and _matches_layout(turned, number, layout, board.marker):
             fiducial = (4 * number[:, None] + np.arange(4)).ravel()
             return _Seen(turned.reshape(-1, 2), fiducial)
     return None
@@ -232,14 +232,14 @@ def _checkerboard(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
     if not found:
         return None
     grid = np.asarray(corners, dtype=np.float64).reshape(down, across, 2)
-    grid = _seen_from_front(grid)
+    grid = _flip_mirrored(grid)
     if _goes_on(grey, grid):
         return None
     # The first square, at the top left, is black; so is the first between four inner corners.
     if _colour(grey, grid, 0, 0) > _colour(grey, grid, 0, 1):
         turned = grid[::-1, ::-1]
         if _colour(grey, turned, 0, 0) > _colour(grey, turned, 0, 1) and across == down:
-            turned = _seen_from_front(grid.transpose(1, 0, 2))
+            turned = _flip_mirrored(grid.transpose(1, 0, 2))
         grid = turned
     return _Seen(grid.reshape(-1, 2), np.arange(across * down))
 
@@ -251,7 +251,7 @@ def _circles(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
     if not found:
         return None
     grid = np.asarray(centres, dtype=np.float64).reshape(down, across, 2)
-    return _Seen((grid if board.asymmetric else _seen_from_front(grid)).reshape(-1, 2), np.arange(across * down))
+    return _Seen((grid if board.asymmetric else _flip_mirrored(grid)).reshape(-1, 2), np.arange(across * down))
 
 
 @lru_cache(maxsize=1)
@@ -263,7 +263,7 @@ def _blob_detector() -> Any:
     return library.SimpleBlobDetector_create(parameters)
 
 
-def _seen_from_front(grid: Floats) -> Floats:
+def _flip_mirrored(grid: Floats) -> Floats:
     """Reverse the rows of a grid (R, C, 2) that is numbered as a mirror would show it."""
     right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     return grid if right[0] * down[1] - right[1] * down[0] > 0 else grid[:, ::-1]

@@ -11,7 +11,7 @@ from imgcal.io import grey_frame
 Frame = NDArray[np.uint8] | NDArray[np.uint16]  # (H, W) grey values
 
 
-def checked_frame(frame: object, camera: str) -> Frame:
+def check_frame(frame: object, camera: str) -> Frame:
     """Return `frame` as a grey (H, W) image of 8 or 16 bit if it is one, also in equal channels; explain otherwise."""
     if not isinstance(frame, np.ndarray):
         raise InputError(f"camera {camera}: found a {type(frame).__name__}, expected a NumPy array (H, W)")
@@ -25,7 +25,7 @@ def checked_frame(frame: object, camera: str) -> Frame:
     return frame
 
 
-def checked_mask(mask: object, frame: Frame, camera: str) -> NDArray[np.bool_]:
+def check_mask(mask: object, frame: Frame, camera: str) -> NDArray[np.bool_]:
     """Return `mask` as bool (H, W), true inside known reflections."""
     if not isinstance(mask, np.ndarray) or mask.shape != frame.shape:
         found = mask.shape if isinstance(mask, np.ndarray) else type(mask).__name__

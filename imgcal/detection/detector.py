@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from imgcal.detection.boards import find_board, require_board
 from imgcal.detection.candidates import block_means, outline, screen
 from imgcal.detection.centroids import Blobs, measure, to_detections
-from imgcal.detection.checks import Frame, checked_frame, checked_mask, full_scale
+from imgcal.detection.checks import Frame, check_frame, check_mask, full_scale
 from imgcal.detection.options import DetectionOptions
-from imgcal.detection.populations import DIMMER, usable, usual_size, without_dim
+from imgcal.detection.populations import DIMMER, drop_dim, usable, usual_size
 from imgcal.errors import InputError
 from imgcal.types import BlobFlag, Board, Detections
 
@@ -70,7 +70,7 @@ def detect(
         require_board(blobs, (frame for shot in snapshots for frame in shot.values() if frame is not None), board)
     digits = len(str(max(len(blobs) - 1, 0)))
     numbers = tuple(f"{index:0{digits}d}" for index in range(len(blobs)))
-    return to_detections(without_dim(blobs, options), names, numbers)
+    return to_detections(drop_dim(blobs, options), names, numbers)
 
 
 def detect_snapshot(
@@ -89,7 +89,7 @@ def detect_snapshot(
         options: what counts as a blob.
         masks: camera name -> (H, W).
         pool: threads that live on between snapshots; None = a pool for this call.
-        whole_capture: the blobs of all snapshots will go through `without_dim` together; nothing is left out here.
+        whole_capture: the blobs of all snapshots will go through `drop_dim` together; nothing is left out here.
         board: as in `detect`; a snapshot without it is no error.
     """
     if pool is None:
@@ -98,9 +98,9 @@ def detect_snapshot(
                 frames, options, masks=masks, pool=own_pool, whole_capture=whole_capture, board=board
             )
     present = [(camera, name) for camera, name in enumerate(frames) if frames[name] is not None]
-    images = [checked_frame(frames[name], name) for _, name in present]
+    images = [check_frame(frames[name], name) for _, name in present]
     covered = [
-        None if masks is None or name not in masks else checked_mask(masks[name], image, name)
+        None if masks is None or name not in masks else check_mask(masks[name], image, name)
         for image, (_, name) in zip(images, present, strict=True)
     ]
     names = [name for _, name in present]
@@ -116,7 +116,7 @@ def detect_snapshot(
         np.concatenate([np.zeros(0), *(blobs.contrast for blobs in found)]),
         np.concatenate([np.zeros(0, np.int64), *(blobs.fiducial for blobs in found)]),
     )
-    return blobs if whole_capture or board is not None else without_dim([blobs], options)[0]
+    return blobs if whole_capture or board is not None else drop_dim([blobs], options)[0]
 
 
 def detect_frame(frame: Frame, options: DetectionOptions, mask: Mask | None = None) -> Blobs:
@@ -134,7 +134,7 @@ def _detect_one(
     scale = full_scale(frame, options.bit_depth, name)
     contiguous = frame if frame.flags.c_contiguous else frame.copy()
     if options.max_radius is None:
-        blobs = _of_any_size(contiguous, options, scale)
+        blobs = _find_all_sizes(contiguous, options, scale)
     else:
         blobs = _find(contiguous, block_means(contiguous, options, scale), options, scale)
     if mask is not None:
@@ -142,7 +142,7 @@ def _detect_one(
     return blobs
 
 
-def _of_any_size(frame: Frame, options: DetectionOptions, scale: int) -> Blobs:
+def _find_all_sizes(frame: Frame, options: DetectionOptions, scale: int) -> Blobs:
     """Find blobs of the usual sizes, and larger ones where there are several of one size.
 
     What is found first shows most of the larger ones, too. A frame without any blob, or with something large and as

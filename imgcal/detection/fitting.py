@@ -75,7 +75,7 @@ def fit_centre(rows, pixels, start, clipped, noise):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def start_of(peak, radius, clipped, moments, centre):
+def start_ellipse(peak, radius, clipped, moments, centre):
     """Begin with the ellipse of equal area and moments, (xx, xy, yy) of the blob cut at half of its peak.
 
     The half axes of the cut blob are longer than those of the disc by its blur.

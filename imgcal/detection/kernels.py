@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from imgcal.detection.fitting import BAND, FARTHEST, MOST, PARAMETERS, ROWS, fit_centre, start_of
+from imgcal.detection.fitting import BAND, FARTHEST, MOST, PARAMETERS, ROWS, fit_centre, start_ellipse
 from imgcal.detection.moments import find_centroid, find_ramp, find_shape
 from imgcal.detection.territory import MARGIN, SKIRT, claim, spread_labels
 from imgcal.geometry import kernels
@@ -95,7 +95,7 @@ def measure_all(frame, candidates, levels, limits, blobs):
         flags[k] = clipped * _SATURATED + merged * _MERGED + _is_at_border(boxes[k], frame) * _BORDER
         known = x0 = y0 = residual = 0.0
         if not flags[k] & _MERGED:
-            start = start_of(peak, radius[k], clipped, moments, middle)
+            start = start_ellipse(peak, radius[k], clipped, moments, middle)
             count = _gather(grey, x, y, own, other, spare, plane, saturation if clipped else 1e9, start, fit)
             if count > PARAMETERS:
                 x0, y0, known, residual = fit_centre(fit, count, start, clipped, noise)
@@ -178,8 +178,8 @@ def _background(frame, u, v, half, invert, ring):
                 ring[3, count] = ring[0, count]
                 count += 1
     value, x, y = ring[0, :count], ring[1, :count], ring[2, :count]
-    middle = kernels.ranked(ring[3], count, count // 2)
-    quarter = kernels.ranked(ring[3], count // 2 + 1, count // 4)
+    middle = kernels.select_rank(ring[3], count, count // 2)
+    quarter = kernels.select_rank(ring[3], count // 2 + 1, count // 4)
     # The lower half tells the spread: clutter in the ring is bright. One grey level is the estimate's quantization.
     reach = 4 * (np.float32(1.4826) * (middle - quarter) + 1)
     n = sx = sy = sxx = sxy = syy = g = gx = gy = 0.0

@@ -63,7 +63,7 @@ def usual_size(blobs: Blobs, limit: float) -> NDArray[np.bool_]:
     return small
 
 
-def without_dim(shots: Sequence[Blobs], options: DetectionOptions) -> list[Blobs]:
+def drop_dim(shots: Sequence[Blobs], options: DetectionOptions) -> list[Blobs]:
     """Leave out the dim population of each frame of some snapshots.
 
     A frame that shows too few markers to tell takes over the usual limit of its camera.

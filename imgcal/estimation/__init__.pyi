@@ -1,4 +1,4 @@
-from . import lm_cpu
+from . import levenberg_marquardt_cpu
 from .accuracy import MAP_DEPTHS, MAP_SIZE, PredictedError, WorkingVolume, predicted_error
 from .blocks import BlockScatter, block_scatter
 from .change_points import CLIP, LEAST_SNAPSHOTS
@@ -16,8 +16,8 @@ from .covariance import (
     scale_response,
     whitened_covariance,
 )
-from .gauge import aligned
-from .held_rig import HeldRigFit, fit_pose
+from .fixed_rig import FixedRigFit, fit_pose
+from .gauge import align
 from .implicit import attach_gradient, map_cost
 from .levenberg_marquardt import Solution
 from .light_linearization_cpu import linearize_lights
@@ -32,7 +32,7 @@ from .linearization import (
     retract,
     rig_at,
 )
-from .linearization_cpu import blocks_of, linearize_rig
+from .linearization_cpu import linearize_rig, select_blocks
 from .map_estimate import (
     Estimate,
     EstimationOptions,
@@ -45,17 +45,17 @@ from .map_estimate import (
     minimize,
     object_prior_std,
 )
-from .map_operator import encoded, map_state, with_lenses, without_lenses
+from .map_operator import encode_options, map_state, prepend_lenses, split_lenses
 from .moves import find_moves
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ScaleEvidence, ShapeEvidence, offsets
 from .pose_initialization import initial_pose
 from .pose_support import ON_A_LINE, UndeterminedPosesError, has_poses, require_poses
-from .rig_error import displaced, error_between, step_by_error
-from .rig_from_points import PointStart, cold_start_from_points, in_frame_of_pair, prior_of_pair
-from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens, poses_alone
+from .reference_cameras import Gauge
+from .rig_error import displace, error_between, step_by_error
+from .rig_from_points import PointStart, cold_start_from_points, move_to_pair_frame, prior_of_pair
+from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens, single_camera_poses
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion, uncertainty_over
 from .robust_losses import squared
-from .steady_cameras import Gauge
 from .variance_components import BENT, ObjectQuestion, Start, estimate_variance_components
 
 __all__ = [
@@ -73,8 +73,8 @@ __all__ = [
     "Estimate",
     "EstimationOptions",
     "FiducialOffset",
+    "FixedRigFit",
     "Gauge",
-    "HeldRigFit",
     "NormalEquations",
     "ObjectQuestion",
     "PointStart",
@@ -88,19 +88,18 @@ __all__ = [
     "State",
     "UndeterminedPosesError",
     "WorkingVolume",
-    "aligned",
+    "align",
     "attach_gradient",
     "autocorrelation",
     "block_scatter",
-    "blocks_of",
     "camera_covariance",
     "camera_std",
     "cold_start",
     "cold_start_from_points",
     "correlation_time",
-    "displaced",
+    "displace",
     "effective_size",
-    "encoded",
+    "encode_options",
     "equations_at",
     "error_between",
     "estimate",
@@ -109,21 +108,21 @@ __all__ = [
     "fit_pose",
     "flat_std",
     "has_poses",
-    "in_frame_of_pair",
     "initial_pose",
     "initial_state",
     "inverse_or_zero",
     "joint_information",
+    "levenberg_marquardt_cpu",
     "linearize",
     "linearize_lights",
     "linearize_rig",
-    "lm_cpu",
     "make_estimate",
     "make_loss",
     "make_problem",
     "map_cost",
     "map_state",
     "minimize",
+    "move_to_pair_frame",
     "object_covariance",
     "object_prior_std",
     "offsets",
@@ -132,8 +131,8 @@ __all__ = [
     "points_at",
     "pose_at",
     "pose_covariance",
-    "poses_alone",
     "predicted_error",
+    "prepend_lenses",
     "prior_of_pair",
     "relative_covariance",
     "relative_difference",
@@ -143,10 +142,11 @@ __all__ = [
     "rig_at",
     "rigid_motion",
     "scale_response",
+    "select_blocks",
+    "single_camera_poses",
+    "split_lenses",
     "squared",
     "step_by_error",
     "uncertainty_over",
     "whitened_covariance",
-    "with_lenses",
-    "without_lenses",
 ]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.estimation import Estimate, camera_covariance
-from imgcal.estimation.rig_uncertainty import RigUncertainty, uncertainty_over, without_gradient
+from imgcal.estimation.rig_uncertainty import RigUncertainty, detach_double, uncertainty_over
 from imgcal.geometry import rotate, undistort
 from imgcal.types import CameraRig
 
@@ -139,7 +139,7 @@ class PredictedError:
     @cached_property
     def mm_without_exceptions(self) -> Tensor:
         """`mm` when the exceptions take no part in triangulation: (X, Y, Z)."""
-        others = self.uncertainty.without(self.exceptions)
+        others = self.uncertainty.drop_cameras(self.exceptions)
         points = self.volume.grid().flatten(0, -2)
         return others.point_error(points, others.rig.project(points).visible).view(self.mm.shape)
 
@@ -158,17 +158,17 @@ class PredictedError:
         """Plain values for `result.json`; what is not known is None."""
         worst = self.worst_camera
         return {
-            "median_px": _known(self.median_px),
-            "p95_px": _known(self.p95_px),
-            "median_mm": _known(self.median_mm),
-            "p95_mm": _known(self.p95_mm),
+            "median_px": _is_known(self.median_px),
+            "p95_px": _is_known(self.p95_px),
+            "median_mm": _is_known(self.median_mm),
+            "p95_mm": _is_known(self.p95_mm),
             "noise_px": self.noise,
-            "median_mm_with_noise": _known(self.median_mm_with_noise),
+            "median_mm_with_noise": _is_known(self.median_mm_with_noise),
             "worst_camera": self.camera_names[worst],
-            "worst_camera_px": _known(self.camera_px[worst]),
+            "worst_camera_px": _is_known(self.camera_px[worst]),
             "exceptions": [self.camera_names[i] for i in self.exceptions],
-            "median_mm_without_exceptions": _known(_quantile(self.mm_without_exceptions, 0.5)),
-            "per_camera_px": {n: _known(px) for n, px in zip(self.camera_names, self.camera_px, strict=True)},
+            "median_mm_without_exceptions": _is_known(_quantile(self.mm_without_exceptions, 0.5)),
+            "per_camera_px": {n: _is_known(px) for n, px in zip(self.camera_names, self.camera_px, strict=True)},
             "volume_mm": {"low": self.volume.low.tolist(), "high": self.volume.high.tolist()},
             "seen_by_two_cameras": self.seen_share,
         }
@@ -216,7 +216,7 @@ def predicted_error(
             f"predicted error: found a batch of {tuple(found.rig.batch_shape)} rigs, expected one rig without "
             "batch axes"
         )
-    rig = without_gradient(found.rig)
+    rig = detach_double(found.rig)
     volume = working_volume(found) if volume is None else volume
     volume = replace(volume, low=volume.low.to(rig.focal_length), high=volume.high.to(rig.focal_length))
     covariance = joint_covariance(found) if covariance is None else covariance
@@ -255,7 +255,7 @@ def working_volume(calibration: Estimate) -> WorkingVolume:
         The box that holds the object, turned in any way, about every place where it was seen, and at the rig's working
         distance, where the rig has one: a single snapshot then says where it belongs, too.
     """
-    problem, rig = calibration.problem, without_gradient(calibration.rig)
+    problem, rig = calibration.problem, detach_double(calibration.rig)
     pose = calibration.rig_from_object.to(torch.float64)
     centres = rotate(pose.rotation.detach(), problem.centroid.detach().to(pose.rotation)) + pose.translation.detach()
     if rig.working_distance is not None:
@@ -303,5 +303,5 @@ def _quantile(values: Tensor, share: float) -> float:
     return float(known.quantile(share)) if len(known) else float("nan")
 
 
-def _known(value: float) -> float | None:
+def _is_known(value: float) -> float | None:
     return value if value == value else None

@@ -80,7 +80,7 @@ def block_scatter(problem: Problem, solution: Solution, loss: NamedLoss) -> Bloc
     if snapshots % size:
         rest = _evidence(problem, solution.state, snapshots % size, loss, snapshots - snapshots % size)
         information, pull = torch.cat((information, rest[0])), torch.cat((pull, rest[1]))
-    cameras, lengths = problem.prior_std[0], _doubled(snapshots // size // LEAST_BLOCKS)
+    cameras, lengths = problem.prior_std[0], _powers_of_two(snapshots // size // LEAST_BLOCKS)
     if not _is_worth_measuring(information, pull, lengths, cameras.numel()):
         return BlockScatter()
     largest, most, length, sure = torch.ones_like(cameras[:, 0]), 1.0, 0, False
@@ -99,7 +99,7 @@ def block_scatter(problem: Problem, solution: Solution, loss: NamedLoss) -> Bloc
     return BlockScatter(largest.sqrt(), length) if length else BlockScatter()
 
 
-def _doubled(most: int) -> list[int]:
+def _powers_of_two(most: int) -> list[int]:
     """Powers of two up to `most`."""
     return [2**power for power in range(most.bit_length())]
 

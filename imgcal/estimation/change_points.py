@@ -105,7 +105,7 @@ class Blocks:
         number = np.arange(len(chosen))
         blocks[:, number, :, chosen] += np.add.reduceat(self.camera[:, chosen, :STEP], rows).swapaxes(0, 1)
         score = self.gradient[:, chosen, :STEP].reshape(len(mine), -1) - (self.pull[:, None] @ mine)[:, 0]
-        cross, score = (_from(part) for part in (cross, np.add.reduceat(score, rows)))
+        cross, score = (_reverse_cumsum(part) for part in (cross, np.add.reduceat(score, rows)))
         blocks = cross.reshape(blocks.shape)
         inner = blocks[:, number, :, chosen, :STEP].swapaxes(0, 1)  # (R, K, 8, 8)
         gradient = (score - cross @ self.downhill).reshape(*inner.shape[:3], 1)
@@ -116,13 +116,13 @@ class Blocks:
         return (gradient * np.linalg.solve(information, gradient)).sum((-2, -1))
 
 
-def _from(parts: Array) -> Array:
+def _reverse_cumsum(parts: Array) -> Array:
     """Replace parts (R, ...) by their sum from each of them on."""
     np.cumsum(parts[::-1], axis=0, out=parts[::-1])
     return parts
 
 
-def blocks_of(problem: Problem, state: State) -> Blocks:
+def linearize_snapshots(problem: Problem, state: State) -> Blocks:
     """Linearize snapshot by snapshot, at a state of one rig."""
     full = clipped = equations_by_snapshot(problem, state, NamedLoss("squared"))
     whitened = full.residual[:, 0] * problem.root_weight[0].unsqueeze(-2)
@@ -151,7 +151,7 @@ def likeliest_step(blocks: Blocks, seen: NDArray[np.bool_], least: float = 0.0) 
         None where nothing could be seen to step, or no step is so likely.
     """
     places = {camera: rows for camera in range(seen.shape[1]) if len(rows := _places(seen[:, camera]))}
-    first = [c for c, most in _screened(blocks, places).items() if most >= NEARBY * least] if least else list(places)
+    first = [c for c, most in _screen(blocks, places).items() if most >= NEARBY * least] if least else list(places)
     found = {camera: _search(blocks, camera, places[camera]) for camera in first}
     if not found or max(statistic for statistic, _ in found.values()) < least:
         return None
@@ -169,7 +169,7 @@ def _places(seen: NDArray[np.bool_]) -> NDArray[np.int64]:
     return shown[LEAST_SNAPSHOTS : len(shown) - LEAST_SNAPSHOTS + 1]
 
 
-def _screened(blocks: Blocks, places: Mapping[int, NDArray[np.int64]]) -> dict[int, float]:
+def _screen(blocks: Blocks, places: Mapping[int, NDArray[np.int64]]) -> dict[int, float]:
     """Largest statistic of each camera over a few of its places, in one go: a step nearby shows there, too."""
     few = {camera: rows[_prior_std(len(rows))] for camera, rows in places.items()}
     if not few:

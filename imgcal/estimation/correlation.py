@@ -45,7 +45,7 @@ def autocorrelation(series: NDArray[np.floating], lags: int) -> tuple[NDArray[np
         ([1.0, -1.0], [4.0, 3.0])
     """
     count, sources = series.shape[:2]
-    x = _centred(np.asarray(series, dtype=np.float64).reshape(count, sources, -1))
+    x = _centre(np.asarray(series, dtype=np.float64).reshape(count, sources, -1))
     known = np.isfinite(x)
     x = np.where(known, x, 0.0)
     products, pairs = np.empty((lags + 1, sources)), np.empty((lags + 1, sources))
@@ -84,7 +84,7 @@ def correlation_time(series: NDArray[np.floating]) -> NDArray[np.float64]:
         rho, pairs = autocorrelation(series, lags)
         last = [_last_lag(rho[:, source], pairs[:, source]) for source in range(sources)]
         if lags == most or 2 * max(last, default=0) + QUIET <= lags:
-            return np.array([_integrated(rho[:, c], pairs[:, c], last[c]) for c in range(sources)]).reshape(sources)
+            return np.array([_integrate(rho[:, c], pairs[:, c], last[c]) for c in range(sources)]).reshape(sources)
         lags = min(4 * lags, most)
     return tau
 
@@ -99,7 +99,7 @@ def effective_size(series: NDArray[np.floating]) -> NDArray[np.float64]:
     return known.sum(0) / correlation_time(series)
 
 
-def _centred(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def _centre(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Series (S, C, D) without their medians, which are no correlation, and without the tails of outliers."""
     known = np.isfinite(x)
     if not known.any():
@@ -128,7 +128,7 @@ def _last_lag(rho: NDArray[np.float64], pairs: NDArray[np.float64]) -> int:
     return last
 
 
-def _integrated(rho: NDArray[np.float64], pairs: NDArray[np.float64], last: int) -> float:
+def _integrate(rho: NDArray[np.float64], pairs: NDArray[np.float64], last: int) -> float:
     """Sum of an autocorrelation (L + 1,) over both signs of the lag by the flat-top window; at least one.
 
     The window is one up to the last lag that counts, and falls to zero at twice that lag. It ends earlier where the

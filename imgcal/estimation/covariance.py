@@ -132,7 +132,7 @@ def joint_information(estimate: Estimate) -> Tensor:
         precise = torch.linalg.inv(torch.from_numpy(estimate.modes.covariance) * estimate.mean_inflation**2)
         across = follow @ information
         information = information - across.mT @ torch.linalg.solve(precise + across @ follow.mT, across)
-    by_step = torch.linalg.inv(_unwhitening(_with_least_std(estimate, LEAST_STD))[0])  # whitened offsets by parameters
+    by_step = torch.linalg.inv(_unwhitening(_floor_prior_std(estimate, LEAST_STD))[0])  # whitened offsets by parameters
     cameras, wide = len(by_step), problem.prior_std[0].numel()
     whole = prior.clone()
     whole[:wide, :wide] = torch.block_diag(*by_step) if cameras else prior
@@ -153,7 +153,7 @@ def _weakened_equations(estimate: Estimate, inflation: Tensor) -> NormalEquation
     return equations_at(weaker, solution.state, NamedLoss("squared"))
 
 
-def _with_least_std(estimate: Estimate, least: float) -> Estimate:
+def _floor_prior_std(estimate: Estimate, least: float) -> Estimate:
     """The same estimate, its prior's standard deviations at least so large that they can be divided by."""
     problem = estimate.problem
     return replace(estimate, problem=replace(problem, prior_std=problem.prior_std.clamp_min(least)))

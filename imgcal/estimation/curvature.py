@@ -29,13 +29,13 @@ from imgcal.estimation.linearization import (
     Problem,
     State,
     Step,
+    append_scale,
     jacobian_at,
     object_columns,
     points_at,
     pose_at,
     retract,
     rig_at,
-    with_scale,
 )
 from imgcal.estimation.map_estimate import Estimate
 from imgcal.types import CameraRig
@@ -64,7 +64,7 @@ def curvature_covariance(estimate: Estimate, quantity: Callable[[CameraRig, Tens
     pairs = max(LEAST_PAIRS, MOST_PAIRS // problem.uv.shape[1])
     x = _draw(factorization, solution.state, pairs)
     follow = _follow(problem, solution.state, factorization, x)
-    there, back = quantity(*_moved_rigs(problem, solution.state, _both_ways(x), follow)).chunk(2, dim=1)
+    there, back = quantity(*_step_rigs(problem, solution.state, _both_ways(x), follow)).chunk(2, dim=1)
     even = 0.5 * (there + back)
     result = even.mT @ even / pairs
     return result.reshape(*estimate.chi2.shape, *result.shape[1:])
@@ -75,16 +75,16 @@ def _both_ways(x: Step) -> Step:
     return x.map(lambda part: torch.cat((part, -part), dim=1))
 
 
-def _many(problem: Problem) -> Problem:
+def _add_rig_axis(problem: Problem) -> Problem:
     """The problem for many rigs each: its cameras have an axis behind the batch, (B, 1)."""
     factory = problem.factory.map_tensors(lambda tensor, _: tensor.unsqueeze(1))
     return replace(problem, factory=factory, prior_std=problem.prior_std.unsqueeze(1))
 
 
-def _moved_rigs(problem: Problem, state: State, x: Step, follow: Step) -> tuple[CameraRig, Tensor]:
+def _step_rigs(problem: Problem, state: State, x: Step, follow: Step) -> tuple[CameraRig, Tensor]:
     """Rigs (B, 2 K) and fiducials (B, 2 K, N, 3) mm after steps both ways, and what follows them either way."""
     camera = (state.offset.unsqueeze(1) + x.camera).unflatten(1, (2, -1)) + follow.camera.unsqueeze(1)
-    rigs = rig_at(_many(problem), camera.flatten(1, 2))
+    rigs = rig_at(_add_rig_axis(problem), camera.flatten(1, 2))
     points = points_at(problem, state).unsqueeze(1).expand(-1, x.camera.shape[1], -1, -1)
     if x.object is not None and follow.object is not None and problem.object_prior_std is not None:
         moved = (x.object.unflatten(1, (2, -1)) + follow.object.unsqueeze(1)).flatten(1, 2)
@@ -134,7 +134,7 @@ def _follow(problem: Problem, state: State, factorization: Factorization, x: Ste
     at = jacobian_at(problem, state)
     squared = problem.root_weight.square()[..., None, None, :]
     by_rig = at.by_rig[..., :-1, :, :] * squared
-    by_object = None if at.by_fiducial is None else with_scale(problem, at.by_fiducial) * squared
+    by_object = None if at.by_fiducial is None else append_scale(problem, at.by_fiducial) * squared
     steps = []
     together = max(AT_ONCE, POINTS_AT_ONCE // at.residual[..., 0, :].numel())
     for first in range(0, x.camera.shape[1], together):
@@ -154,7 +154,7 @@ def _follow(problem: Problem, state: State, factorization: Factorization, x: Ste
 
 def _residual(problem: Problem, state: State, step: Step) -> Tensor:
     """Residuals (B, K, S, C, 2, N) px after steps (B, K, ...)."""
-    many = _many(problem)
+    many = _add_rig_axis(problem)
     one = State(state.offset.unsqueeze(1), state.rotation.unsqueeze(1), state.centre.unsqueeze(1))
     there = retract(many, one, step.camera, step.pose)
     own = points_at(problem, state).unsqueeze(1)

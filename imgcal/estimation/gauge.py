@@ -16,7 +16,7 @@ FINE = 0.1
 """Pixels: differences between two estimates that are forgiven before a camera counts as moved."""
 
 
-def aligned(rig: CameraRig, reference: CameraRig, points_reference: Tensor, cameras: Sequence[int]) -> CameraRig:
+def align(rig: CameraRig, reference: CameraRig, points_reference: Tensor, cameras: Sequence[int]) -> CameraRig:
     """Move a whole rig so that some of its cameras see given points where those of a reference see them.
 
     What is matched are images near the object, not positions and rotations: an estimate knows those well, and these

@@ -29,7 +29,7 @@ def attach_gradient(problem: Problem, solution: Solution, loss: RobustKernel) ->
     if not (torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in inputs)):
         return solution.state
     gradient = _gradient(problem, solution.state, loss, create_graph=True)
-    step = _NewtonStep.apply(_inverse_hessian(_detached(problem), solution, loss), *gradient)
+    step = _NewtonStep.apply(_inverse_hessian(_detach(problem), solution, loss), *gradient)
     return retract(problem, solution.state, *step)
 
 
@@ -153,7 +153,7 @@ class _Solve(torch.autograd.Function):
         return (None, *_Solve.apply(ctx.inverse_hessian, *gradients))
 
 
-def _detached(problem: Problem) -> Problem:
+def _detach(problem: Problem) -> Problem:
     constant = {
         field.name: value.detach()
         for field in fields(problem)

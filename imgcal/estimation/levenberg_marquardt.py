@@ -159,13 +159,13 @@ def factorize(
     """
     camera, pose, own = equations.camera, equations.pose, equations.object
     if damping is not None:
-        camera, pose = _damped(camera, damping), _damped(pose, damping)
+        camera, pose = _damp(camera, damping), _damp(pose, damping)
     coupling = equations.coupling  # (B, S, C, K, 6)
     if cameras_first is None:
         cameras_first = POSE_PARAMETERS * pose.shape[1] <= camera.shape[-1] * camera.shape[1]
     border = None
     if own is not None:
-        square = own.own if damping is None else _damped(own.own.unsqueeze(1), damping).squeeze(1)
+        square = own.own if damping is None else _damp(own.own.unsqueeze(1), damping).squeeze(1)
         pair = (own.camera, own.pose) if cameras_first else (own.pose, own.camera)
         border = schur.Border(*pair, square)
     if cameras_first:
@@ -173,7 +173,7 @@ def factorize(
     return Factorization(schur.reduce(pose, coupling.mT, camera, border), False)
 
 
-def _damped(blocks: Tensor, damping: Tensor) -> Tensor:
+def _damp(blocks: Tensor, damping: Tensor) -> Tensor:
     """Enlarge the diagonals of blocks (B, P, p, p) by a relative addition (B,)."""
     blocks = blocks.clone()
     blocks.diagonal(dim1=-2, dim2=-1).mul_(1 + damping[:, None, None])
@@ -191,24 +191,24 @@ def better(first: Solution, second: Solution) -> Solution:
     )
 
 
-def replaced(solution: Solution, rows: Tensor, by: Solution, iterations: int) -> Solution:
+def replace_rows(solution: Solution, rows: Tensor, by: Solution, iterations: int) -> Solution:
     """Put other solutions (R,) in the place of some rows (R,) of a batch."""
     index = torch.zeros(len(solution.converged), dtype=torch.long, device=rows.device)
     chosen = torch.ones_like(index, dtype=torch.bool)
     index[rows], chosen[rows] = torch.arange(len(rows), device=rows.device), False
     return Solution(
-        _where(chosen, solution.state, taken(by.state, index)),
-        _where(chosen, solution.equations, taken(by.equations, index)),
+        _where(chosen, solution.state, select_rows(by.state, index)),
+        _where(chosen, solution.equations, select_rows(by.equations, index)),
         torch.where(chosen, solution.converged, by.converged[index]),
         iterations,
     )
 
 
-def taken(record: Record, index: Tensor) -> Record:
+def select_rows(record: Record, index: Tensor) -> Record:
     """Index axis B of a record of tensors; what is None, such as the part of an exact object, stays so."""
     values = {field.name: getattr(record, field.name) for field in fields(record)}
     chosen: dict[str, object] = {
-        name: taken(value, index) if isinstance(value, ObjectEquations) else value[index]
+        name: select_rows(value, index) if isinstance(value, ObjectEquations) else value[index]
         for name, value in values.items()
         if value is not None
     }

@@ -211,7 +211,7 @@ def linearize(problem: Problem, state: State, loss: Callable[[Tensor], tuple[Ten
     )
 
 
-def with_scale(problem: Problem, by_fiducial: Tensor) -> Tensor:
+def append_scale(problem: Problem, by_fiducial: Tensor) -> Tensor:
     """Append the derivative by the object's scale: (B, S, C, 3, 2, N) -> (B, S, C, 4, 2, N)."""
     by_scale = (by_fiducial * problem.points.mT[:, None]).sum(-3, keepdim=True)
     return torch.cat((by_fiducial, by_scale), dim=-3)
@@ -232,7 +232,7 @@ def _object_equations(problem: Problem, offset: Tensor, rows: Tensor, by_fiducia
         by_fiducial: (B, S, C, 3, 2, N) weighted derivative of each pixel by its own fiducial's coordinates (mm).
     """
     fiducials = rows.shape[-1]
-    each = with_scale(problem, by_fiducial)
+    each = append_scale(problem, by_fiducial)
     to_rest = torch.einsum("bscirn,bscjrn->bscijn", rows, each)  # (B, S, C, K + 7, 4, N)
     prior_std = problem.object_prior_std
     assert prior_std is not None

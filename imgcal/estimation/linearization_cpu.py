@@ -2,7 +2,7 @@
 
 Three tuples of arrays go in and out: what is `given` (points of the object and their squared radii, the lenses' models,
 observations and the roots of their weights, the factory rig, the prior, that of the object), the `state`, and the
-`blocks` of the normal equations. Layouts: `lm_cpu._Blocks`; what fits each camera and what each snapshot is summed up
+`blocks` of the normal equations. Layouts: `levenberg_marquardt_cpu._Blocks`; what fits each camera and what each snapshot is summed up
 before it is written. The object's own parameters stand behind the coupled ones, and have a border of their own.
 Where several objects were in view, the points have a fourth column: the number of the object; each row shows one.
 
@@ -31,12 +31,18 @@ def linearize_all(given, state, blocks, cost, cameras_first, loss, threshold):
     steady = np.empty((0, 0))
     for b in range(len(cost)):
         cost[b] = linearize_rig(
-            given_of(given, b), state_of(state, b), blocks_of(blocks, b), cameras_first, loss, threshold, steady
+            given_values(given, b),
+            select_state(state, b),
+            select_blocks(blocks, b),
+            cameras_first,
+            loss,
+            threshold,
+            steady,
         )
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def given_of(given, b):
+def given_values(given, b):
     """What is given of one rig; the points and their radii are those of all."""
     (
         points, radius_squared, lenses, uv, root_weight,
@@ -49,14 +55,14 @@ def given_of(given, b):
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def state_of(state, b):
+def select_state(state, b):
     """One row of a state."""
     offset, rotation, centre, own_offset = state
     return offset[b], rotation[b], centre[b], own_offset[b]
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def blocks_of(blocks, b):
+def select_blocks(blocks, b):
     """One row of normal equations."""
     camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual = blocks
     return (

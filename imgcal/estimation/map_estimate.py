@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.estimation import implicit, levenberg_marquardt, lm_cpu
+from imgcal.estimation import implicit, levenberg_marquardt, levenberg_marquardt_cpu
 from imgcal.estimation.linearization import (
     NormalEquations,
     Problem,
@@ -19,9 +19,9 @@ from imgcal.estimation.linearization import (
     pose_at,
     rig_at,
 )
-from imgcal.estimation.modes import ModeEvidence
 from imgcal.estimation.pose_initialization import initial_pose
 from imgcal.estimation.robust_losses import NamedLoss
+from imgcal.estimation.shape_modes import ModeEvidence
 from imgcal.geometry import RigidTransform
 from imgcal.messages import brief
 from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior, check_observations
@@ -184,24 +184,26 @@ def minimize(problem: Problem, start: State, options: EstimationOptions) -> leve
         return first
     slow = problem.select(rows)
     coarse = replace(options, tolerance=COARSE_TOLERANCE, max_iterations=min(options.max_iterations, 2 * PATIENCE))
-    state, spent = levenberg_marquardt.taken(start, rows), first.iterations
+    state, spent = levenberg_marquardt.select_rows(start, rows), first.iterations
     for factor in COARSER:
         stage = _solve(replace(slow, root_weight=slow.root_weight / factor), state, coarse)
         state, spent = stage.state, spent + stage.iterations
     second = _solve(slow, state, options)
     spent += second.iterations
     if not bool((second.converged & (second.equations.cost <= first.equations.cost[rows])).all()):
-        further = _solve(slow, levenberg_marquardt.taken(first.state, rows), replace(options, max_iterations=left))
+        further = _solve(
+            slow, levenberg_marquardt.select_rows(first.state, rows), replace(options, max_iterations=left)
+        )
         spent += further.iterations
         second = levenberg_marquardt.better(second, further)
-    return levenberg_marquardt.replaced(first, rows, second, spent)
+    return levenberg_marquardt.replace_rows(first, rows, second, spent)
 
 
 def _solve(problem: Problem, start: State, options: EstimationOptions) -> levenberg_marquardt.Solution:
     with torch.no_grad():
         if problem.uv.device.type == "cpu":
             limits = (options.loss, options.threshold, options.max_iterations, options.tolerance)
-            return lm_cpu.minimize(problem, start, *limits)
+            return levenberg_marquardt_cpu.minimize(problem, start, *limits)
         return levenberg_marquardt.minimize(
             problem, start, make_loss(options), options.max_iterations, options.tolerance
         )
@@ -211,7 +213,7 @@ def equations_at(problem: Problem, state: State, loss: NamedLoss) -> NormalEquat
     """Normal equations at a state, by the compiled loops where they can; no gradient flows through them."""
     with torch.no_grad():
         if problem.uv.device.type == "cpu":
-            return lm_cpu.linearize(problem, state, loss.name, loss.threshold)
+            return levenberg_marquardt_cpu.linearize(problem, state, loss.name, loss.threshold)
         return linearize(problem, state, loss)
 
 
@@ -244,7 +246,7 @@ def make_estimate(
     """Say what a solution means; `state` is the solution's, possibly with a gradient."""
     seen = problem.root_weight > 0
     plain = state is solution.state and state.offset.device.type == "cpu"  # no gradient to carry
-    rigs, poses = (lm_cpu.rig_at if plain else rig_at)(problem, state.offset), pose_at(problem, state)
+    rigs, poses = (levenberg_marquardt_cpu.rig_at if plain else rig_at)(problem, state.offset), pose_at(problem, state)
     residual = torch.where(seen.unsqueeze(-2), solution.equations.residual, 0.0).mT
     dof = 2 * seen.flatten(1).sum(1) - problem.pose_freedom
     return Estimate(

@@ -13,7 +13,7 @@ from imgcal.estimation.levenberg_marquardt import Solution
 from imgcal.estimation.linearization import Problem, State, rig_at
 from imgcal.estimation.map_estimate import EstimationOptions, equations_at, initial_state, make_loss, minimize
 from imgcal.estimation.pose_initialization import initial_pose
-from imgcal.geometry import ModelNames, RigidTransform, named_lenses
+from imgcal.geometry import ModelNames, RigidTransform, lens_label
 from imgcal.operators import Operator, Tensors
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
@@ -27,7 +27,7 @@ def map_state(problem: Problem, start: State, options: str) -> tuple[State, Tens
     Args:
         problem: what is given, (B,).
         start: where to start; with (B, 0) poses, they are found by `initial_pose`.
-        options: how to minimize, as `encoded` returns it.
+        options: how to minimize, as `encode_options` returns it.
 
     Returns:
         The state, and (B,) bool: converged.
@@ -51,29 +51,29 @@ def map_state(problem: Problem, start: State, options: str) -> tuple[State, Tens
         start.rotation,
         start.centre,
         empty if start.object_offset is None else start.object_offset,
-        options=with_lenses(rig, options),
+        options=prepend_lenses(rig, options),
     )
     return _state(*state), converged
 
 
-def encoded(options: EstimationOptions) -> str:
+def encode_options(options: EstimationOptions) -> str:
     """Write options as `map_state` takes them."""
     return json.dumps(asdict(options))
 
 
-def with_lenses(rig: CameraRig, options: str) -> str:
+def prepend_lenses(rig: CameraRig, options: str) -> str:
     """Put the lens models of a rig, which no tensor says, before what else an operator is told."""
     return f"{','.join(rig.lens_models)}|{options}"
 
 
-def without_lenses(options: str) -> tuple[ModelNames, str]:
-    """Invert `with_lenses`."""
+def split_lenses(options: str) -> tuple[ModelNames, str]:
+    """Invert `prepend_lenses`."""
     names, _, rest = options.partition("|")
-    return named_lenses(names.split(",")), rest
+    return lens_label(names.split(",")), rest
 
 
 def _compute(inputs: Tensors, options: str) -> Tensors:
-    lenses, options = without_lenses(options)
+    lenses, options = split_lenses(options)
     problem, start = _problem(lenses, *inputs[:-4]), _state(*inputs[-4:])
     how = EstimationOptions(**json.loads(options))
     if not start.rotation.shape[1]:
@@ -91,7 +91,7 @@ def _compute(inputs: Tensors, options: str) -> Tensors:
 
 def _attach(inputs: Tensors, outputs: Tensors, options: str) -> Tensors:
     *state, converged = outputs
-    lenses, options = without_lenses(options)
+    lenses, options = split_lenses(options)
     problem, found = _problem(lenses, *inputs[:-4]), _state(*state)
     loss = make_loss(EstimationOptions(**json.loads(options)))
     constant = _problem(lenses, *(tensor.detach() for tensor in inputs[:-4]))

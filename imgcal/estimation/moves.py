@@ -22,11 +22,11 @@ from imgcal.estimation.change_points import (
     LEAST_SNAPSHOTS,
     Blocks,
     Step,
-    blocks_of,
     dispersion,
     is_significant,
     least_significant,
     likeliest_step,
+    linearize_snapshots,
 )
 from imgcal.estimation.correlation import correlation_time
 from imgcal.estimation.linearization import Problem, State, points_at, pose_at, rig_at
@@ -84,9 +84,9 @@ class Places:
     @cached_property
     def blocks(self) -> Blocks:
         """Normal equations, snapshot by snapshot."""
-        return blocks_of(self.problem, self.state)
+        return linearize_snapshots(self.problem, self.state)
 
-    def divided(self, step: Step, options: EstimationOptions) -> Places:
+    def divide(self, step: Step, options: EstimationOptions) -> Places:
         """Give a camera another place from a step on, and estimate again."""
         problem, state, last = self.problem, self.state, len(self.camera)
         copies = [*range(last), step.camera]
@@ -105,7 +105,7 @@ class Places:
         camera, first = (*self.camera, self.camera[step.camera]), (*self.first, step.row)
         return Places(parted, solution.state, camera, first)
 
-    def places_of(self, camera: int) -> list[int]:
+    def camera_places(self, camera: int) -> list[int]:
         """Numbers of a camera's places, in the order of time."""
         return sorted((v for v, c in enumerate(self.camera) if c == camera), key=lambda v: self.first[v])
 
@@ -120,13 +120,13 @@ class Places:
 
     def costs(self, place: int) -> Array:
         """What each snapshot's labels would cost if their camera stood at one of its places: (S,) half chi-squared."""
-        loss, _ = huber(self._squared(place, self.places_of(self.camera[place])), CLIP)
+        loss, _ = huber(self._squared_residuals(place, self.camera_places(self.camera[place])), CLIP)
         return 0.5 * loss.sum(-1).numpy()
 
     def misfit(self, camera: int) -> float:
         """Chi-squared of a camera's labels, each clipped, beyond what noise makes it."""
-        own = [self._squared(place, [place]) for place in self.places_of(camera)]
-        labels = [(self.problem.root_weight[0][:, place] > 0).sum() for place in self.places_of(camera)]
+        own = [self._squared_residuals(place, [place]) for place in self.camera_places(camera)]
+        labels = [(self.problem.root_weight[0][:, place] > 0).sum() for place in self.camera_places(camera)]
         return float(sum(part.clamp_max(CLIP**2).sum() for part in own) - 2 * sum(labels))
 
     def without(self, place: int, rows: NDArray[np.int64]) -> Places:
@@ -160,7 +160,7 @@ class Places:
             shifts[known, camera] = mean[known, place]
         return shifts
 
-    def _squared(self, place: int, labels: list[int]) -> Tensor:
+    def _squared_residuals(self, place: int, labels: list[int]) -> Tensor:
         """Squared whitened residuals (S, N) of the labels of some places of a camera, if it stood at one of them."""
         rig, poses = rig_at(self.problem, self.state.offset)[0], pose_at(self.problem, self.state)[0]
         points = poses.apply(points_at(self.problem, self.state)[0] + self.problem.centroid)
@@ -246,7 +246,7 @@ def find_moves(
         step = likeliest_step(places.blocks, seen, least_significant(candidates, ERROR))
         if step is None:
             break
-        divided = _located(places, step, options)
+        divided = _locate(places, step, options)
         if divided is not None:
             # What is left when the step has been explained says how much of it correlated errors may feign.
             left = dispersion(divided.blocks, divided.seen)
@@ -265,12 +265,12 @@ def find_moves(
     moving = {places.camera[v] for v in doubts}
     # Labels that are wrong in many snapshots pull hither and thither, and no few places explain them.
     steady = {c for c in moving if places.misfit(c) > MOST_UNEXPLAINED * still.misfit(c)}
-    return _told(places, doubts, moving - steady, noise, camera_names, snapshot_names)
+    return _describe(places, doubts, moving - steady, noise, camera_names, snapshot_names)
 
 
-def _located(places: Places, step: Step, options: EstimationOptions) -> Places | None:
+def _locate(places: Places, step: Step, options: EstimationOptions) -> Places | None:
     """Divide a camera's time where its two places explain most; None = too near to an end to be told from a slip."""
-    divided = places.divided(step, options)
+    divided = places.divide(step, options)
     new = len(divided.camera) - 1
     for _ in range(4):
         shown = np.flatnonzero(places.seen[:, step.camera])
@@ -282,7 +282,7 @@ def _located(places: Places, step: Step, options: EstimationOptions) -> Places |
         if row == step.row:
             break
         step = replace(step, row=row)
-        divided = places.divided(step, options)
+        divided = places.divide(step, options)
     return divided
 
 
@@ -320,13 +320,13 @@ def _doubts(places: Places, step: Step) -> set[int]:
     return {places.camera[v] for v in near} - {places.camera[step.camera]}
 
 
-def _told(
+def _describe(
     places: Places, doubts: dict[int, set[int]], moving: set[int], noise: float,
     camera_names: tuple[str, ...], snapshot_names: tuple[str, ...],
 ) -> tuple[MovedCamera, ...]:  # fmt: skip
     moves = []
     for camera in sorted(moving):
-        numbers = places.places_of(camera)
+        numbers = places.camera_places(camera)
         for before, after in pairwise(numbers):
             kind, size, sigma = places.change(before, after, noise).size()
             others = sorted(doubts.get(after, set()) - moving)

@@ -27,8 +27,8 @@ from imgcal.estimation.linearization import (
     robust_weight,
 )
 from imgcal.estimation.map_estimate import Estimate, equations_at
-from imgcal.estimation.modes import direction_evidence
 from imgcal.estimation.robust_losses import NamedLoss, RobustKernel
+from imgcal.estimation.shape_modes import direction_evidence
 from imgcal.geometry import pose_rank
 
 Array = NDArray[np.float64]
@@ -83,7 +83,7 @@ class ShapeEvidence:
         return (vectors.T * np.repeat(tolerance**2, 3)) @ vectors + np.diag(variance)
 
     @cached_property
-    def _determined(self) -> tuple[Floats, Floats, Floats]:
+    def _determined_directions(self) -> tuple[Floats, Floats, Floats]:
         """Directions (3 N, D), displacements along them (D,), and the inverse of their covariance (D, D)."""
         vectors, variance, displacement = self.directions
         if not self.tolerance.any():
@@ -105,7 +105,7 @@ class ShapeEvidence:
         if weight <= UNSURE * float(np.abs(self.information).max()) * float(scale @ scale):
             return 0.0, np.inf
         if self.tolerance.any():
-            vectors, displacement, precision = self._determined
+            vectors, displacement, precision = self._determined_directions
             pull = vectors.T @ scale @ precision
             weight, found = float(pull @ (vectors.T @ scale)), float(pull @ displacement)
         return found / weight, weight**-0.5
@@ -132,7 +132,7 @@ class ShapeEvidence:
         """F statistic of `bent_sigma` where snapshots agree, and its degrees of freedom."""
         if len(self.places) > MOST_FIDUCIALS:
             return 0.0, 0.0, 0.0
-        _, displacement, precision = self._determined
+        _, displacement, precision = self._determined_directions
         error, deviation = self.scale_error
         explained = float(displacement @ precision @ displacement) - (error / deviation) ** 2
         mine, rest = len(displacement) - int(np.isfinite(deviation)), self.freedom - len(displacement)

@@ -28,7 +28,7 @@ from imgcal.geometry import (
 from imgcal.types import CameraRig
 
 
-def displaced(rig: CameraRig, error: Tensor) -> CameraRig:
+def displace(rig: CameraRig, error: Tensor) -> CameraRig:
     """Apply an error.
 
     Args:
@@ -52,7 +52,7 @@ def displaced(rig: CameraRig, error: Tensor) -> CameraRig:
 
 
 def error_between(rig: CameraRig, reference: CameraRig) -> Tensor:
-    """Invert `displaced`: the error (*B, C, K) that takes `reference` to `rig`."""
+    """Invert `displace`: the error (*B, C, K) that takes `reference` to `rig`."""
     turn = rig.cam_from_rig.rotation.mT @ reference.cam_from_rig.rotation
     parts = (
         vector_from_rotation(turn),

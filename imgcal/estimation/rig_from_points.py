@@ -46,7 +46,7 @@ APART = 1000.0
 class PointStart:
     """A rig made from points alone, up to scale."""
 
-    rig: CameraRig  # in the frame that `in_frame_of_pair` says
+    rig: CameraRig  # in the frame that `move_to_pair_frame` says
     pair: tuple[int, int]  # cameras that are 1000 mm apart
     spread: float  # px, robust spread of the residuals
 
@@ -87,11 +87,11 @@ def cold_start_from_points(
     best: PointStart | None = None
     for factor in FOCALS:
         rays = _rays(uv, seen, cameras, factor)
-        placed = _chained(rays, seen, cameras.focal_length.mean(1).numpy() * factor)
+        placed = _chain_cameras(rays, seen, cameras.focal_length.mean(1).numpy() * factor)
         if placed is None:
             continue
         rig = replace(cameras, focal_length=factor * cameras.focal_length, cam_from_rig=placed)
-        found = _joint(observations, in_frame_of_pair(rig, pair), cameras)
+        found = _joint(observations, move_to_pair_frame(rig, pair), cameras)
         if found is not None and (best is None or found.spread < best.spread):
             best = found
         if best is not None and best.spread < FINE:
@@ -106,7 +106,7 @@ def cold_start_from_points(
     return best
 
 
-def in_frame_of_pair(rig: CameraRig, pair: tuple[int, int] | None) -> tuple[CameraRig, tuple[int, int]]:
+def move_to_pair_frame(rig: CameraRig, pair: tuple[int, int] | None) -> tuple[CameraRig, tuple[int, int]]:
     """Move and scale a rig so that one camera is in the origin, and another one 1000 mm away along x.
 
     Returns:
@@ -149,7 +149,7 @@ def _rays(uv: Array, seen: NDArray[np.bool_], cameras: CameraRig, factor: float)
     return np.where(seen[..., None], straight.movedim(0, 1).numpy(), 0.0)
 
 
-def _chained(rays: Array, seen: NDArray[np.bool_], focal: Array) -> RigidTransform | None:
+def _chain_cameras(rays: Array, seen: NDArray[np.bool_], focal: Array) -> RigidTransform | None:
     """Place all cameras, one after the other; None = not all can be."""
     cameras = len(focal)
     slack = CONSISTENT / float(focal.mean())
@@ -159,7 +159,7 @@ def _chained(rays: Array, seen: NDArray[np.bool_], focal: Array) -> RigidTransfo
     (a, b), rotation, translation = start
     placed: dict[int, tuple[Array, Array]] = {a: (np.eye(3), np.zeros(3)), b: (rotation, translation)}
     while len(placed) < cameras:
-        points, known = _triangulated(rays, seen, placed, slack)
+        points, known = _triangulate(rays, seen, placed, slack)
         counts = [-1 if c in placed else int((known & seen[:, c]).sum()) for c in range(cameras)]
         camera = int(np.argmax(counts))
         if counts[camera] < LEAST_COMMON:
@@ -205,7 +205,7 @@ def _first_pair(rays: Array, seen: NDArray[np.bool_], slack: float) -> tuple[tup
     return best
 
 
-def _triangulated(
+def _triangulate(
     rays: Array, seen: NDArray[np.bool_], placed: dict[int, tuple[Array, Array]], slack: float
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Points (S, 3) where the rays of the placed cameras pass nearest, and which of them are known (S,)."""
@@ -232,7 +232,7 @@ def _joint(
 ) -> PointStart | None:
     """Fit all cameras and points together: focal lengths first, then all; None = no fit comes to rest."""
     rig, pair = start
-    rows = _used(observations.seen[:, :, 0])
+    rows = _select_moments(observations.seen[:, :, 0])
     some = Observations(observations.uv[rows], observations.sigma[rows], observations.seen[rows])
     light, fit = CalibrationObject(torch.zeros(1, 3).double(), torch.ones(1, 3).double(), name="light"), None
     position = 0.5 * float(torch.cdist(rig.positions, rig.positions).max())
@@ -248,7 +248,7 @@ def _joint(
         fit = estimate(part, given, light, poses, prior_std=spread, initial_rig=rig, options=options)
         rig, poses = fit.rig, fit.rig_from_object
     assert fit is not None
-    placed, _ = in_frame_of_pair(fit.rig, pair)
+    placed, _ = move_to_pair_frame(fit.rig, pair)
     return PointStart(replace(placed, prior=cameras.prior), pair, _spread(fit))
 
 
@@ -258,7 +258,7 @@ def _spread(fit: Estimate) -> float:
     return float(fit.residual.norm(dim=-1)[seen].median()) / 1.1774
 
 
-def _used(seen: Tensor) -> Tensor:
+def _select_moments(seen: Tensor) -> Tensor:
     """Moments (U,) that two cameras see at least; where there are many, those that most see, evenly over time."""
     count = seen.sum(1)
     rows = (count >= 2).nonzero().flatten()

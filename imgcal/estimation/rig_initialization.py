@@ -20,7 +20,7 @@ from imgcal.estimation.map_estimate import Estimate, EstimationOptions, estimate
 from imgcal.estimation.pose_initialization import initial_pose
 from imgcal.estimation.relative_poses import as_transforms, relate, tree
 from imgcal.geometry import RigidTransform
-from imgcal.messages import listed
+from imgcal.messages import list_names
 from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 
 LEAST_FIDUCIALS = 4
@@ -76,7 +76,7 @@ def cold_start(observations: Observations, cameras: CameraRig, obj: CalibrationO
     """
     nowhere = RigidTransform.identity(cameras.num_cameras, dtype=torch.float64)
     cameras = replace(cameras.to(torch.float64), cam_from_rig=nowhere)
-    cam_from_object, known = poses_alone(observations, cameras, obj)
+    cam_from_object, known = single_camera_poses(observations, cameras, obj)
     require_connected([c for c in range(cameras.num_cameras) if not known[:, c].any()], cameras)
     pairs = relate(cam_from_object, known, obj.points.double().numpy(), np.random.default_rng(seed))
     groups, chained = tree(pairs, cameras.num_cameras)
@@ -96,7 +96,7 @@ def cold_start(observations: Observations, cameras: CameraRig, obj: CalibrationO
     return ColdStart(placed, first @ poses, posed, all_kept, _spread(fit.residual.norm(dim=-1)[torch.from_numpy(kept)]))
 
 
-def poses_alone(
+def single_camera_poses(
     observations: Observations, cameras: CameraRig, obj: CalibrationObject
 ) -> tuple[RigidTransform, NDArray[np.bool_]]:
     """Find the object's pose in each image by itself: cam_from_object (S, C), and (S, C) where it is known."""
@@ -150,7 +150,8 @@ def require_connected(alone: Sequence[int], cameras: CameraRig) -> None:
     """Raise `RefusedError` where cameras have nothing in common with the others."""
     if alone:
         raise RefusedError(
-            f"start without a factory calibration: camera {listed(cameras.camera_names[c] for c in alone)} cannot be "
+            f"start without a factory calibration: camera {list_names(cameras.camera_names[c] for c in alone)} "
+            "cannot be "
             "placed beside the others: carry the whole object through what it sees together with other cameras"
         )
 

@@ -38,7 +38,7 @@ class RigUncertainty:
     px_covariance: Tensor  # (K C, K C) after the alignment in pixels; nan where too little is seen for one
     mm_covariance: Tensor  # (K C, K C) after the alignment in mm; nan where cameras share too little for one
 
-    def without(self, cameras: Collection[int]) -> RigUncertainty:
+    def drop_cameras(self, cameras: Collection[int]) -> RigUncertainty:
         """Leave cameras out, and align the others anew."""
         kept = [i for i in range(self.rig.num_cameras) if i not in cameras]
         width = self.rig.num_parameters
@@ -131,7 +131,7 @@ def uncertainty_over(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigU
         weighted = px_weight.repeat_interleave(2, dim=1)[..., None] * px_moved
         px_best = _best_if_possible(motion, (px_rows.mT @ weighted).flatten(0, 1))
         mm_best = _best_if_possible(motion, mm_rows.mT @ (mm_weight.repeat_interleave(3)[:, None] * mm_moved))
-        return _without_motion(covariance, motion, px_best), mm_best
+        return _remove_motion(covariance, motion, px_best), mm_best
 
     px_covariance, mm_best = aligned()
     for _ in range(ROUNDS - 1):
@@ -140,7 +140,7 @@ def uncertainty_over(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigU
         variance = _aligned_variance(mm_rows, mm_spread, mm_moved, mm_best, covariance)
         mm_weight = _weight(_length(variance.unflatten(0, (-1, 3)).sum(-1), seen), shared)
         px_covariance, mm_best = aligned()
-    mm_covariance = _without_motion(covariance, motion, mm_best)
+    mm_covariance = _remove_motion(covariance, motion, mm_best)
     return RigUncertainty(rig, covariance, points, px_weight, mm_weight, px_covariance, mm_covariance)
 
 
@@ -182,10 +182,10 @@ def aligned_covariance(covariance: Tensor, motion: Tensor, metric: Tensor) -> Te
     Raises:
         RefusedError: the metric does not determine the motion.
     """
-    return _without_motion(covariance, motion, _best_motion(motion, metric @ motion))
+    return _remove_motion(covariance, motion, _best_motion(motion, metric @ motion))
 
 
-def _without_motion(covariance: Tensor, motion: Tensor, best: Tensor) -> Tensor:
+def _remove_motion(covariance: Tensor, motion: Tensor, best: Tensor) -> Tensor:
     """Covariance (K, K) of what is left of the parameters once the motion that `best` (6, K) measures is taken out."""
     left = covariance - motion @ (best @ covariance)
     return left - (left @ best.mT) @ motion.mT
@@ -289,6 +289,6 @@ def inverse_or_zero(information: Tensor) -> Tensor:
     return torch.where(good, torch.cholesky_inverse(torch.where(good, factor, eye)), 0.0)
 
 
-def without_gradient(rig: CameraRig) -> CameraRig:
+def detach_double(rig: CameraRig) -> CameraRig:
     """The same values, double precision, without a graph."""
     return replace(rig.map_tensors(lambda tensor, _: tensor.detach()), image_size=rig.image_size).to(torch.float64)

@@ -17,7 +17,6 @@ from imgcal.estimation.covariance import remaining_variance
 from imgcal.estimation.levenberg_marquardt import Solution
 from imgcal.estimation.linearization import Problem, State, points_at
 from imgcal.estimation.map_estimate import EstimationOptions, make_loss, minimize
-from imgcal.estimation.modes import ModeEvidence, bent, mode_evidence
 from imgcal.estimation.object_shape import (
     ScaleEvidence,
     ShapeEvidence,
@@ -26,6 +25,7 @@ from imgcal.estimation.object_shape import (
     pull_scatter,
 )
 from imgcal.estimation.pose_support import require_poses
+from imgcal.estimation.shape_modes import ModeEvidence, bend_object, mode_evidence
 
 KINDS = {
     "rotation": slice(0, 3),
@@ -223,7 +223,7 @@ def estimate_variance_components(
 def _bend(fit: _Fit, options: FitOptions) -> Problem | None:
     """The problem with the object's modes as the fit asks for them; None = they are."""
     asked = mode_evidence(fit.problem, fit.solution, make_loss(options.estimation))
-    return None if asked is None or asked.at_rest else bent(fit.problem, asked)
+    return None if asked is None or asked.at_rest else bend_object(fit.problem, asked)
 
 
 def _examine(

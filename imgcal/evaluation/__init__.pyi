@@ -1,6 +1,6 @@
 from .detectors import WRONG_PX, WRONG_RATIO, Contender, Outcome, Scene, compare_detectors, draw_capture, judge
 from .encoder_check import LEAST_RISE, EncoderCheck, check_encoder
-from .methods import BASELINES, QUICK_BASELINES, Given, Method, network_method, refined_by_sightings
+from .methods import BASELINES, QUICK_BASELINES, Given, Method, network_method, refine_by_positions
 from .metrics import Errors, cramer_rao, errors, held_out_points, reprojection_error
 from .models import Model, load_models
 from .outcome_tables import detector_tables, detector_values
@@ -55,7 +55,7 @@ __all__ = [
     "load_models",
     "markdown",
     "network_method",
-    "refined_by_sightings",
+    "refine_by_positions",
     "reprojection_error",
     "sweep",
     "write",

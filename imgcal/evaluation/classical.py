@@ -69,7 +69,7 @@ def calibrate_cameras(
             _, matrix, distortion, turns, shifts = run(*shown, sizes[camera], *start, flags=flags)
         except cv2.error:
             return None
-        found = _Camera(_array(matrix), _array(distortion).ravel()[:5], _matrix_of(turns[0]), _array(shifts[0]))
+        found = _Camera(_array(matrix), _array(distortion).ravel()[:5], _rotation_matrix(turns[0]), _array(shifts[0]))
         return found if found.usable else None
 
     return _camera_by_camera(solve, uv, seen, factory, otherwise)
@@ -120,7 +120,7 @@ def _solve_pnp(points: Array, uv: Array, matrix: Array, distortion: Array) -> tu
         turn, shift = min((turn, shift), refined, key=lambda pose: _misfit(points, uv, matrix, distortion, *pose))
     except cv2.error:
         return None
-    return _matrix_of(turn), _array(shift).ravel()
+    return _rotation_matrix(turn), _array(shift).ravel()
 
 
 def _misfit(points: Array, uv: Array, matrix: Array, distortion: Array, turn: Any, shift: Any) -> float:
@@ -129,7 +129,7 @@ def _misfit(points: Array, uv: Array, matrix: Array, distortion: Array, turn: An
     return error if np.isfinite(error) else float("inf")
 
 
-def _matrix_of(turn: Any) -> Array:
+def _rotation_matrix(turn: Any) -> Array:
     return _array(cv2.Rodrigues(turn)[0])
 
 

@@ -100,7 +100,7 @@ def compare_detectors(
     """
     cases = [(difficulty, seed * 100_000 + number) for difficulty in scene.models for number in range(count)]
     found: list[Outcome] = []
-    for outcomes in mapped(partial(_of_capture, tuple(contenders), scene), cases):
+    for outcomes in mapped(partial(_capture_values, tuple(contenders), scene), cases):
         found += [Outcome(**one) for one in outcomes]
         progress(1)
     return tuple(found)
@@ -134,15 +134,15 @@ def draw_capture(scene: Scene, difficulty: str, seed: int) -> tuple[Truth, dict[
     return truth, {name: [frames[name] for frames in snapshots] for name in scene.rig.camera_names}
 
 
-def _of_capture(contenders: Sequence[Contender], scene: Scene, case: tuple[str, int]) -> list[dict[str, Any]]:
+def _capture_values(contenders: Sequence[Contender], scene: Scene, case: tuple[str, int]) -> list[dict[str, Any]]:
     """Plain values of outcomes, which can be kept in a file."""
     difficulty, seed = case
     truth, frames = draw_capture(scene, difficulty, seed)
     ours = [contender for contender in contenders if not contender.only or difficulty in contender.only]
-    return [asdict(_of_contender(contender, scene, truth, frames, case)) for contender in ours]
+    return [asdict(_contender_values(contender, scene, truth, frames, case)) for contender in ours]
 
 
-def _of_contender(
+def _contender_values(
     contender: Contender, scene: Scene, truth: Truth, frames: dict[str, list[Frame]], case: tuple[str, int]
 ) -> Outcome:
     difficulty, seed = case

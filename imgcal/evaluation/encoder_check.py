@@ -83,13 +83,13 @@ def check_encoder(network: Network, conditions: Conditions, count: int = 64, see
         return output.mean() + output.std() * drawn
 
     def after(spoil: Spoil | None) -> float:
-        with _spoilt(encoder, spoil) as announce:
+        with _replace_output(encoder, spoil) as announce:
             return _median_error(network, sample, announce)
 
-    return EncoderCheck(after(None), after(_shuffled), after(_zeroed), after(noise))
+    return EncoderCheck(after(None), after(_shuffle), after(_zero), after(noise))
 
 
-def _shuffled(output: Tensor, rigs: int) -> Tensor:
+def _shuffle(output: Tensor, rigs: int) -> Tensor:
     """Give each rig the output of its neighbour."""
     if len(output) % rigs:
         raise ValueError(
@@ -98,12 +98,12 @@ def _shuffled(output: Tensor, rigs: int) -> Tensor:
     return output.unflatten(0, (rigs, -1)).roll(1, 0).flatten(0, 1)
 
 
-def _zeroed(output: Tensor, rigs: int) -> Tensor:
+def _zero(output: Tensor, rigs: int) -> Tensor:
     return torch.zeros_like(output)
 
 
 @contextmanager
-def _spoilt(encoder: nn.Module, spoil: Spoil | None) -> Iterator[Callable[[int], None]]:
+def _replace_output(encoder: nn.Module, spoil: Spoil | None) -> Iterator[Callable[[int], None]]:
     """Replace what an encoder returns; yields a function that is told how many rigs come next."""
     rigs = [1]
 

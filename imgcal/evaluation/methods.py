@@ -14,12 +14,12 @@ from torch import Tensor
 
 from imgcal.estimation import Estimate, EstimationOptions, estimate, initial_pose
 from imgcal.evaluation import classical
-from imgcal.networks import ImageNetwork, Network, Sightings
+from imgcal.networks import ImageNetwork, Network, Positions
 from imgcal.refinement import (
     ImageRefinementOptions,
     RobustOptions,
-    as_prediction,
-    observed,
+    make_observations,
+    make_prediction,
     refine_images,
     refine_points,
     refine_robustly,
@@ -104,26 +104,26 @@ class Method:
         return self.lens is None or set(rig.lens_models) == {self.lens}
 
 
-def factory_alone(given: Given) -> Prediction:
+def keep_factory_rig(given: Given) -> Prediction:
     """Keep the factory rig and fit only the object's pose: what a tracking system does that is not recalibrated.
 
     With the true pose RE would be larger, and nobody knows it. Least squares over all cameras, Huber's loss beyond what
     a drifted rig misses by.
     """
-    observations = observed(given.uv, given.seen, max(given.sigma, DRIFTED_SIGMA))
+    observations = make_observations(given.uv, given.seen, max(given.sigma, DRIFTED_SIGMA))
     fixed = torch.zeros_like(given.prior_std)
-    return as_prediction(estimate(observations, given.factory, given.obj, prior_std=fixed))
+    return make_prediction(estimate(observations, given.factory, given.obj, prior_std=fixed))
 
 
 def map_from_pnp(given: Given, options: EstimationOptions = EstimationOptions()) -> Prediction:
     """MAP estimation of the whole rig from the factory rig and a pose by PnP over all cameras; Huber's loss."""
-    observations = observed(given.uv, given.seen, given.sigma)
-    return as_prediction(estimate(observations, given.factory, given.obj, prior_std=given.prior_std, options=options))
+    observations = make_observations(given.uv, given.seen, given.sigma)
+    return make_prediction(estimate(observations, given.factory, given.obj, prior_std=given.prior_std, options=options))
 
 
 def factory_from_pnp(given: Given) -> Prediction:
     """Keep the factory rig and take the pose by PnP over all cameras: where `steps_from_factory` starts."""
-    pose = initial_pose(observed(given.uv, given.seen, given.sigma), given.factory, given.obj)[:, 0]
+    pose = initial_pose(make_observations(given.uv, given.seen, given.sigma), given.factory, given.obj)[:, 0]
     return Prediction(given.factory.expand(len(given.uv)), pose)
 
 
@@ -139,10 +139,10 @@ def steps_from_factory(count: int) -> Predict:
 def robust_from_pnp(given: Given) -> Prediction:
     """PnP in spite of outliers, then the same robust refinement that follows the networks."""
     start = robust_pose(given.views, given.factory, given.obj, given.sigma)
-    return refined_by_points(start, given).prediction
+    return refine_by_points(start, given).prediction
 
 
-def refined_by_points(prediction: Prediction, given: Given) -> Refined:
+def refine_by_points(prediction: Prediction, given: Given) -> Refined:
     """`refine_robustly` with what is given; it has failed where most points are outliers to the rig that it found."""
     options = RobustOptions()
     known, sigma = (given.factory, given.obj, given.prior_std), given.sigma
@@ -154,17 +154,17 @@ def refined_by_points(prediction: Prediction, given: Given) -> Refined:
 
 def pnp(given: Given) -> Prediction:
     """PnP for every camera on its own, with its factory intrinsics (OpenCV's solvePnP)."""
-    return classical.pnp(given.uv, given.seen, given.factory, given.obj, factory_alone(given))
+    return classical.pnp(given.uv, given.seen, given.factory, given.obj, keep_factory_rig(given))
 
 
 def opencv_calibrate(given: Given) -> Prediction:
     """OpenCV's calibrateCamera for every camera on its own, starting from the factory intrinsics."""
-    return classical.calibrate_cameras(given.uv, given.seen, given.factory, given.obj, factory_alone(given))
+    return classical.calibrate_cameras(given.uv, given.seen, given.factory, given.obj, keep_factory_rig(given))
 
 
 def scipy_bundle_adjustment(given: Given) -> Prediction:
     """Minimize the cost of MAP estimation, squared loss, with scipy's least_squares from a pose by PnP."""
-    observations = observed(given.uv, given.seen, given.sigma)
+    observations = make_observations(given.uv, given.seen, given.sigma)
     return classical.bundle_adjustment(observations, given.factory, given.obj, given.prior_std)
 
 
@@ -172,7 +172,7 @@ STEPS = (1, 2, 3, 5)
 """Levenberg-Marquardt steps from the factory that every table has."""
 
 QUICK_BASELINES: dict[str, Method] = {
-    "factory, pose fitted": Method(factory_alone),
+    "factory, pose fitted": Method(keep_factory_rig),
     "factory, pose by PnP": Method(factory_from_pnp),
     **{f"{count} LM step{'s'[: count > 1]} from the factory": Method(steps_from_factory(count)) for count in STEPS},
     "MAP from PnP": Method(map_from_pnp),
@@ -212,27 +212,27 @@ def network_method(network: Network, batch: int | None = None) -> Method:
         return passes(given)[-1]
 
     if options is None:
-        return Method(predict, refined_by_points, passes, batch=batch or 512)
-    return Method(predict, _refined_by_images(network, options), passes, batch=batch or 32, images=options)
+        return Method(predict, refine_by_points, passes, batch=batch or 512)
+    return Method(predict, _refine_by_images(network, options), passes, batch=batch or 32, images=options)
 
 
 @torch.no_grad()
-def refined_by_sightings(
-    prediction: Prediction, sightings: Sightings, factory: CameraRig, obj: CalibrationObject, prior_std: Tensor
+def refine_by_positions(
+    prediction: Prediction, sightings: Positions, factory: CameraRig, obj: CalibrationObject, prior_std: Tensor
 ) -> Prediction:
     """Refine on the positions that an image network has found, each with the sigma that it predicts; Cauchy's loss."""
-    return as_prediction(_fit_to_sightings(prediction, sightings, factory, obj, prior_std))
+    return make_prediction(_fit_to_positions(prediction, sightings, factory, obj, prior_std))
 
 
-def _fit_to_sightings(
-    prediction: Prediction, sightings: Sightings, factory: CameraRig, obj: CalibrationObject, prior_std: Tensor
+def _fit_to_positions(
+    prediction: Prediction, sightings: Positions, factory: CameraRig, obj: CalibrationObject, prior_std: Tensor
 ) -> Estimate:
     sigma = (sightings.sigma.square() + SIGHTED_SIGMA**2).sqrt().to("cpu", torch.float64)
     views = Views(*(None if part is None else part.cpu() for part in (sightings.views.uv, sightings.views.seen)))
     return refine_points(prediction, views, factory, obj, prior_std, sigma)
 
 
-def _refined_by_images(network: Network, options: ImageOptions) -> Refine:
+def _refine_by_images(network: Network, options: ImageOptions) -> Refine:
     """Render and compare; where images do not confirm the rig, the positions that the network has found decide."""
 
     @torch.no_grad()
@@ -242,12 +242,12 @@ def _refined_by_images(network: Network, options: ImageOptions) -> Refine:
         fit, _ = refine_images(prediction, images, given.factory, given.obj, given.prior_std, comparison)
         rows = (~fit.converged).nonzero().squeeze(-1)
         if not isinstance(network, ImageNetwork) or not len(rows):
-            return Refined(as_prediction(fit), fit.converged)
+            return Refined(make_prediction(fit), fit.converged)
         device = next(network.parameters()).device
         sightings = network.sight(images[rows].to(device))
-        mended = _fit_to_sightings(prediction[rows], sightings, given.factory, given.obj, given.prior_std)
+        mended = _fit_to_positions(prediction[rows], sightings, given.factory, given.obj, given.prior_std)
         order = torch.arange(len(images)).index_copy(0, rows, len(images) + torch.arange(len(rows)))
         found = fit.converged.index_copy(0, rows, mended.converged)
-        return Refined(Prediction.cat([as_prediction(fit), as_prediction(mended)])[order], found)
+        return Refined(Prediction.cat([make_prediction(fit), make_prediction(mended)])[order], found)
 
     return refine

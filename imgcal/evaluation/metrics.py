@@ -106,7 +106,7 @@ def errors(predicted: Prediction, truth: Prediction, obj: CalibrationObject) -> 
     cameras, true_cameras = predicted.cameras_from_object, truth.cameras_from_object
     re = reprojection_error(cameras, true_cameras, obj)
     held_out = _rms_of_pixels(cameras, true_cameras, held_out_points(obj), None)
-    return _summed_up(difference.square(), re, held_out, truth.rig.focal_length)
+    return _summarize(difference.square(), re, held_out, truth.rig.focal_length)
 
 
 @torch.no_grad()
@@ -126,7 +126,7 @@ def cramer_rao(estimate: Estimate, obj: CalibrationObject) -> Errors:
     held_out = held_out_points(obj).to(problem.points) - problem.centroid
     shape = (*problem.uv.shape[:-1], len(held_out))
     others = replace(problem, points=held_out, radius_squared=None, uv=problem.uv.new_zeros(shape))
-    return _summed_up(
+    return _summarize(
         variance.clamp_min(0), _re_bound(estimate, problem), _re_bound(estimate, others), estimate.rig.focal_length
     )
 
@@ -142,7 +142,7 @@ def _rms_of_pixels(predicted: CameraRig, truth: CameraRig, points: Tensor, radiu
     return difference.square().mean((-1, -2, -3)).sqrt()
 
 
-def _summed_up(squares: Tensor, re: Tensor, held_out: Tensor, focal_length: Tensor) -> Errors:
+def _summarize(squares: Tensor, re: Tensor, held_out: Tensor, focal_length: Tensor) -> Errors:
     """Reduce squared errors or variances (B, C, K), extrinsics relative to the first camera."""
     others = squares[..., 1:, :] if squares.shape[-2] > 1 else squares
     focal = squares[..., 6:8]

@@ -23,7 +23,7 @@ def detector_tables(outcomes: Sequence[Outcome]) -> tuple[Table, ...]:
     wrong = f"wrong: more than {WRONG_PX:g} px and {WRONG_RATIO:g} times what is claimed"
     parts: tuple[tuple[str, Callable[[Sequence[Outcome]], str]], ...] = (
         (f"Calibrated / refused / wrong, % of captures ({wrong})", _shares),
-        ("Held-out RE (px): RMS over the working volume, median over calibrated captures", _held_out),
+        ("Held-out RE (px): RMS over the working volume, median over calibrated captures", _held_out_cell),
         ("Labels that calibrations rest on: right, % / of all that is visible, %", _labels),
         ("Time a frame, median (ms), with identity and estimation", _milliseconds),
     )
@@ -63,7 +63,7 @@ def _shares(outcomes: Sequence[Outcome]) -> str:
     return " / ".join(found)
 
 
-def _held_out(outcomes: Sequence[Outcome]) -> str:
+def _held_out_cell(outcomes: Sequence[Outcome]) -> str:
     of_seeds = [[one.held_out_px for one in some if one.status == "calibrated"] for some in _by_seed(outcomes)]
     medians = [median(value for value in some if value is not None) for some in of_seeds if some]
     return number(fmean(medians)) if medians else MISSING

@@ -43,7 +43,7 @@ def draw_sweep(sweep: Sweep) -> Figure:
             axes.plot(sweep.values, _means(refined), "o-", color=f"C{number}", label=f"{name}, refined")
     reference = (evaluation.reference for evaluation in sweep.evaluations)
     axes.plot(sweep.values, _means(reference), ":", color="black", label=REFERENCE)
-    return _with_legend(figure, axes)
+    return _add_legend(figure, axes)
 
 
 def draw_training(summary: Summary) -> Figure:
@@ -52,9 +52,9 @@ def draw_training(summary: Summary) -> Figure:
     for number, (name, facts) in enumerate(summary.facts.items()):
         for key, style, label in (("re_px", "-", None), ("validation_re_px", "o-", name)):
             rows = [row for row in facts.history if row.get(key) is not None]
-            values = _clipped(row[key] for row in rows)
+            values = _clip(row[key] for row in rows)
             axes.plot([row["step"] for row in rows], values, style, color=f"C{number}", ms=3, lw=0.8, label=label)
-    return _with_legend(figure, axes)
+    return _add_legend(figure, axes)
 
 
 def draw_latency(summary: Summary) -> Figure:
@@ -69,7 +69,7 @@ def draw_latency(summary: Summary) -> Figure:
             refined = _means([row.refined])
             axes.plot([took.alone_p50, took.refined_p50], [*alone, *refined], ":", color=colour, lw=0.8)
             axes.plot([took.refined_p50], refined, "o", color=colour, label=f"{name}, refined")
-    return _with_legend(figure, axes)
+    return _add_legend(figure, axes)
 
 
 def _figure(across: str, up: str) -> tuple[Figure, Axes]:
@@ -82,14 +82,14 @@ def _figure(across: str, up: str) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _with_legend(figure: Figure, axes: Axes) -> Figure:
+def _add_legend(figure: Figure, axes: Axes) -> Figure:
     axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
 def _means(scores: Iterable[Scores]) -> list[float]:
-    return _clipped(one.statistics()["mean"] for one in scores)
+    return _clip(one.statistics()["mean"] for one in scores)
 
 
-def _clipped(values: Iterable[float]) -> list[float]:
+def _clip(values: Iterable[float]) -> list[float]:
     return [min(max(value, LEAST), MOST) for value in values]

@@ -18,8 +18,8 @@ from imgcal.estimation import Estimate
 from imgcal.evaluation.methods import Given, Method
 from imgcal.evaluation.metrics import KINDS, Errors, concatenate, cramer_rao, errors
 from imgcal.io import rig_text
-from imgcal.messages import shortened
-from imgcal.refinement import SQUARED, as_prediction, refine_points
+from imgcal.messages import shorten
+from imgcal.refinement import SQUARED, make_prediction, refine_points
 from imgcal.synthesis import LEVELS, Corrupted, Corruption, Degradation, Drift, PoseRange, RelativeDrift, synthesize
 from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 
@@ -74,7 +74,7 @@ class Protocol:
             ("count", 1, 10**7), ("trials", 1, 1000), ("batch", 1, 10**5), ("seed", 0, 2**47 - 1),
         ):  # fmt: skip
             if not least <= getattr(self, name) <= most:
-                raise InputError(f"{name}: found {shortened(str(getattr(self, name)))}, expected {least} to {most}")
+                raise InputError(f"{name}: found {shorten(str(getattr(self, name)))}, expected {least} to {most}")
 
 
 class Statistics(TypedDict):
@@ -211,7 +211,7 @@ def evaluate(
     done: dict[str, list[_Collected]] = {name: [_Collected() for _ in range(protocol.trials)] for name in methods}
     reference: list[list[Errors]] = [[] for _ in range(protocol.trials)]
     bounds: list[list[Errors]] = [[] for _ in range(protocol.trials)]
-    for found in mapped(partial(_measured, dict(methods)), _work(methods, conditions, protocol)):
+    for found in mapped(partial(_run_methods, dict(methods)), _work(methods, conditions, protocol)):
         trial = found["trial"]
         reference[trial].append(Errors(**found["reference"]))
         if found["bounds"]:
@@ -302,14 +302,14 @@ def _work(methods: Mapping[str, Method], conditions: Conditions, protocol: Proto
             yield _Batch(trial, first, sample, bounded, tuple(methods))
 
 
-def _measured(methods: Mapping[str, Method], batch: _Batch) -> dict[str, Any]:
+def _run_methods(methods: Mapping[str, Method], batch: _Batch) -> dict[str, Any]:
     """Give a batch to all methods; what comes back is dicts of numbers and tensors."""
     sample = batch.sample
     fit = sample.reference()
     rows = {name: _measure(name, method, sample, batch.first) for name, method in methods.items()}
     return {
         "trial": batch.trial,
-        "reference": vars(errors(as_prediction(fit), sample.truth, sample.conditions.obj)),
+        "reference": vars(errors(make_prediction(fit), sample.truth, sample.conditions.obj)),
         "bounds": vars(cramer_rao(fit, sample.conditions.obj)) if batch.bounded else None,
         "rows": rows,
         "rigs": len(sample) + sum(row["rigs"] for row in rows.values()),

@@ -13,15 +13,15 @@ from imgcal.io import nearest
 from imgcal.synthesis import RelativeDrift
 
 
-def _at_kappa(conditions: Conditions, value: float) -> Conditions:
+def _set_kappa(conditions: Conditions, value: float) -> Conditions:
     return replace(conditions, drift=RelativeDrift(value, value))
 
 
-def _at_phi(conditions: Conditions, value: float) -> Conditions:
+def _set_phi(conditions: Conditions, value: float) -> Conditions:
     return replace(conditions, pose_range=replace(conditions.pose_range, phi_deg=(value, value)))
 
 
-def _at_corruption(kind: str) -> Callable[[Conditions, float], Conditions]:
+def _corruption_setter(kind: str) -> Callable[[Conditions, float], Conditions]:
     return lambda conditions, value: replace(conditions, corruption=replace(conditions.corruption, **{kind: value}))
 
 
@@ -35,12 +35,12 @@ class Axis:
 
 
 AXES: dict[str, Axis] = {
-    "kappa": Axis("perturbation kappa", (0.0, 0.0125, 0.025, 0.05, 0.1), _at_kappa),
-    "phi": Axis("angle from the zenith phi (deg)", (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0), _at_phi),
-    "noise": Axis("noise (px)", (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), _at_corruption("noise")),
-    "missing": Axis("share of missing fiducials", (0.0, 0.1, 0.2, 0.3, 0.4), _at_corruption("missing")),
-    "swapped": Axis("share of swapped labels", (0.0, 0.05, 0.1, 0.2, 0.3), _at_corruption("swapped")),
-    "false": Axis("share of false blobs", (0.0, 0.05, 0.1, 0.2, 0.3), _at_corruption("false")),
+    "kappa": Axis("perturbation kappa", (0.0, 0.0125, 0.025, 0.05, 0.1), _set_kappa),
+    "phi": Axis("angle from the zenith phi (deg)", (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0), _set_phi),
+    "noise": Axis("noise (px)", (0.0, 0.05, 0.1, 0.2, 0.5, 1.0), _corruption_setter("noise")),
+    "missing": Axis("share of missing fiducials", (0.0, 0.1, 0.2, 0.3, 0.4), _corruption_setter("missing")),
+    "swapped": Axis("share of swapped labels", (0.0, 0.05, 0.1, 0.2, 0.3), _corruption_setter("swapped")),
+    "false": Axis("share of false blobs", (0.0, 0.05, 0.1, 0.2, 0.3), _corruption_setter("false")),
 }
 
 

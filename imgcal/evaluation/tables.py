@@ -108,7 +108,7 @@ def _errors(seeds: Sequence[Scores]) -> tuple[str, ...]:
     means = [one["mean"] for one in found if not math.isnan(one["mean"])]
     spread = stdev(means) if len(means) > 1 else found[0]["spread"]
     return (
-        number(_mean(means)) + ("" if spread is None else f" ± {number(spread)}") + _of_rigs(found),
+        number(_mean(means)) + ("" if spread is None else f" ± {number(spread)}") + _rig_share(found),
         number(_mean([one["median"] for one in found])),
         number(_mean([one["p99"] for one in found])),
         f"{100 * fmean(one['share_under_one_px'] for one in found):.1f} %",
@@ -118,7 +118,7 @@ def _errors(seeds: Sequence[Scores]) -> tuple[str, ...]:
     )
 
 
-def _of_rigs(found: Sequence[Statistics]) -> str:
+def _rig_share(found: Sequence[Statistics]) -> str:
     """Say of how many rigs the mean is, where the refinement of others has failed."""
     share = fmean(one["found"] for one in found)
     return "" if share == 1 else f" ({100 * share:.1f} % of rigs)"

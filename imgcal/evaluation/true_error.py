@@ -27,13 +27,13 @@ def true_error(uncertainty: RigUncertainty, truth: CameraRig, points: Tensor) ->
         (C, P) px and (P,) mm; what no camera, or fewer than two, see is nan.
     """
     rig, anchors = uncertainty.rig, uncertainty.points
-    true_from_rig = _aligned(uncertainty, truth)
+    true_from_rig = _align(uncertainty, truth)
     projection = rig.project(points)
     pixels = truth.project(true_from_rig.apply(points)).uv - projection.uv
     seen_anchors = rig.project(anchors).visible
-    anchored = _triangulated(rig, anchors, truth.project(true_from_rig.apply(anchors)).uv, seen_anchors)
+    anchored = _triangulate(rig, anchors, truth.project(true_from_rig.apply(anchors)).uv, seen_anchors)
     moved = _best_motion(anchors, anchored, uncertainty.mm_weight)
-    found = _triangulated(rig, points, truth.project(true_from_rig.apply(points)).uv, projection.visible)
+    found = _triangulate(rig, points, truth.project(true_from_rig.apply(points)).uv, projection.visible)
     distance = (found - moved.apply(points)).norm(dim=-1)
     twice = projection.visible.sum(0) >= 2
     return (
@@ -58,14 +58,14 @@ def normalized_error(uncertainty: RigUncertainty, truth: CameraRig) -> float:
     invariant extended Kalman filter as a stable observer" (IEEE TAC 2017).
     """
     rig, centre = uncertainty.rig, uncertainty.points.mean(0)
-    true_from_rig = _aligned(uncertainty, truth)
+    true_from_rig = _align(uncertainty, truth)
     laid_upon = replace(truth, cam_from_rig=truth.cam_from_rig @ true_from_rig[None])
     turn, shift = vector_from_rotation(true_from_rig.rotation), true_from_rig.apply(centre[None])[0] - centre
     error = rig.local(laid_upon).flatten() - rigid_motion(rig, centre) @ torch.cat((turn, shift))
     return float(error @ torch.linalg.solve(uncertainty.covariance, error)) / len(error)
 
 
-def _aligned(uncertainty: RigUncertainty, truth: CameraRig) -> RigidTransform:
+def _align(uncertainty: RigUncertainty, truth: CameraRig) -> RigidTransform:
     """Motion that takes points of the estimated rig to where the true rig sees them at the same pixels."""
     points, weight = uncertainty.points, uncertainty.px_weight
     centre, target = points.mean(0), uncertainty.rig.project(points).uv
@@ -87,7 +87,7 @@ def _aligned(uncertainty: RigUncertainty, truth: CameraRig) -> RigidTransform:
     return RigidTransform(turn, shift)
 
 
-def _triangulated(rig: CameraRig, start: Tensor, uv: Tensor, seen: Tensor) -> Tensor:
+def _triangulate(rig: CameraRig, start: Tensor, uv: Tensor, seen: Tensor) -> Tensor:
     """Points (P, 3) whose pixels are nearest to uv (C, P, 2), each seeing camera alike."""
     points = start
     for _ in range(STEPS):

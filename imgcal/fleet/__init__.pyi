@@ -1,12 +1,12 @@
 from .dataset import Dataset
-from .drift_information import KINDS, DriftInformation, unit_of
+from .drift_information import KINDS, DriftInformation, parameter_units
 from .engine import Done, Engine, Lost
+from .fleet_summary import KindOfRig, refusals, rig_kinds
 from .job import STATUSES, Settings
 from .learnt_prior import LearntPrior, OutlierCamera, Spread, Trend, learn_prior, outlier_cameras, standardized_offsets
-from .lessons import KindOfRig, kinds_of_rigs, refusals
 from .manifest import Item, Manifest, write_manifest
-from .mapping import Kept, Mapped, workers
 from .run import FleetCount, recalibrate_fleet
+from .work_items import Mapper, StoredResults, workers
 
 __all__ = [
     "KINDS",
@@ -17,23 +17,23 @@ __all__ = [
     "Engine",
     "FleetCount",
     "Item",
-    "Kept",
     "KindOfRig",
     "LearntPrior",
     "Lost",
     "Manifest",
-    "Mapped",
+    "Mapper",
     "OutlierCamera",
     "Settings",
     "Spread",
+    "StoredResults",
     "Trend",
-    "kinds_of_rigs",
     "learn_prior",
     "outlier_cameras",
+    "parameter_units",
     "recalibrate_fleet",
     "refusals",
+    "rig_kinds",
     "standardized_offsets",
-    "unit_of",
     "workers",
     "write_manifest",
 ]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from imgcal.errors import InputError
 from imgcal.fleet.job import TRANSIENT
-from imgcal.fleet.manifest import reason_of
+from imgcal.fleet.manifest import short_reason
 from imgcal.io import write_text
 
 FOLDER, LOCK = "results", ".lock"
@@ -102,7 +102,7 @@ class Dataset:
         except Timeout as error:
             raise InputError(f"{self.out}: another run is writing to it, expected to be the only one") from error
         except OSError as error:
-            raise InputError(f"{self.out}: cannot be written: {reason_of(error)}") from error
+            raise InputError(f"{self.out}: cannot be written: {short_reason(error)}") from error
         writer = Writer(self)
         try:
             for left in self.folder.glob("day=*/.*.part"):
@@ -161,7 +161,7 @@ class Dataset:
                 return pq.ParquetFile(file).read(None if columns is None else list(columns))
         except (OSError, pa.ArrowException) as error:
             raise InputError(
-                f"{path}: cannot be read: {reason_of(error)}; expected results of `imgcal fleet`"
+                f"{path}: cannot be read: {short_reason(error)}; expected results of `imgcal fleet`"
             ) from error
 
 
@@ -212,7 +212,7 @@ class Writer:
                 with contextlib.suppress(OSError):
                     part.unlink(missing_ok=True)
                 raise InputError(
-                    f"{folder}: cannot be written: {reason_of(error)}; {self.waiting} results are not kept"
+                    f"{folder}: cannot be written: {short_reason(error)}; {self.waiting} results are not kept"
                 ) from error
             self.written += len(rows)
             self._rows = [row for row in self._rows if _day(row) != day]

@@ -16,7 +16,7 @@ KINDS = ("rotation", "position", "focal_length", "principal_point", "distortion"
 """Kinds of value as a rig file's `prior:` names them, and in the order in which a camera's parameters stand."""
 
 
-def unit_of(rig: CameraRig) -> Tensor:
+def parameter_units(rig: CameraRig) -> Tensor:
     """What a spread of one means for each parameter: (C, K) rad, mm, the focal length in pixels, pixels, one.
 
     Zero for coefficients that a camera's lens does not have.
@@ -33,7 +33,9 @@ class DriftInformation:
     """
 
     camera_names: tuple[str, ...]
-    information: Tensor  # (D, P, P) float64, P parameters of all cameras in units of `unit_of`; positive semidefinite
+    information: (
+        Tensor  # (D, P, P) float64, P parameters of all cameras in units of `parameter_units`; positive semidefinite
+    )
     score: Tensor  # (D, P) information times the offset that the images ask for
 
     def __post_init__(self) -> None:
@@ -45,7 +47,7 @@ class DriftInformation:
             )
 
     @classmethod
-    def of(cls, estimate: Estimate) -> DriftInformation:
+    def from_estimates(cls, estimate: Estimate) -> DriftInformation:
         """Take the prior out of estimates.
 
         Args:
@@ -55,17 +57,17 @@ class DriftInformation:
             RefusedError: the information of an estimate is singular.
         """
         problem, solution = estimate.problem, estimate.solution
-        return cls.whitened(
+        return cls.from_whitened(
             estimate.rig.camera_names,
             torch.linalg.inv(whitened_covariance(solution)),
             solution.state.offset.flatten(1),
             problem.prior_std.flatten(1),
-            unit_of(problem.factory).expand(problem.prior_std.shape).flatten(1),
+            parameter_units(problem.factory).expand(problem.prior_std.shape).flatten(1),
             torch.full((len(problem.prior_std),), estimate.mean_inflation, dtype=torch.float64),
         )
 
     @classmethod
-    def whitened(
+    def from_whitened(
         cls,
         camera_names: tuple[str, ...],
         precision: Tensor,
@@ -81,7 +83,7 @@ class DriftInformation:
             precision: (D, P, P) inverse covariance, the prior's part the identity.
             offset: (D, P) estimated.
             prior_std: (D, P) standard deviations of the prior; what it holds fixed, at zero, tells nothing.
-            unit: (D, P) of `unit_of`.
+            unit: (D, P) of `parameter_units`.
             inflation: (D) factor on what noise adds to standard deviations.
         """
         scale = torch.where(prior_std > 0, unit / prior_std.clamp_min(1e-300), 0.0) / inflation[:, None]
@@ -91,7 +93,7 @@ class DriftInformation:
         return cls(camera_names, 0.5 * (information + information.mT), asked)
 
     @classmethod
-    def joined(cls, parts: Sequence[DriftInformation]) -> DriftInformation:
+    def concatenate(cls, parts: Sequence[DriftInformation]) -> DriftInformation:
         """Concatenate devices.
 
         Raises:

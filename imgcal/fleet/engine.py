@@ -17,9 +17,9 @@ from types import TracebackType
 from typing import Any, Generic, TypeVar
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.fleet.manifest import reason_of
+from imgcal.fleet.manifest import short_reason
 from imgcal.machine import usable_cores
-from imgcal.messages import quoted
+from imgcal.messages import quote
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -64,7 +64,7 @@ class Engine:
 
     Examples:
         >>> with Engine(cores=1) as engine:  # doctest: +SKIP
-        ...     list(engine.mapped(len, ["a", "bb"]))
+        ...     list(engine.map(len, ["a", "bb"]))
         [1, 2]
     """
 
@@ -98,8 +98,8 @@ class Engine:
                 ray.init(**where, log_to_driver=False, logging_level=logging.ERROR)
             except Exception as error:
                 if self.address is None:
-                    raise InputError(f"Ray cannot be started on this machine: {reason_of(error)}") from error
-                raise InputError(f"--address: found no cluster at {self.address}: {reason_of(error)}") from error
+                    raise InputError(f"Ray cannot be started on this machine: {short_reason(error)}") from error
+                raise InputError(f"--address: found no cluster at {self.address}: {short_reason(error)}") from error
             self._ours = True
         self.cores = int(ray.cluster_resources().get("CPU", self.cores))
         return self
@@ -154,7 +154,7 @@ class Engine:
                     return
                 ready, _ = ray.wait(list(running), num_returns=1, timeout=1.0)
                 for reference in ready:
-                    yield from self._settled(reference, running.pop(reference), again)
+                    yield from self._settle(reference, running.pop(reference), again)
                 for reference in [r for r, batch in running.items() if time.monotonic() > batch.deadline]:
                     batch = running.pop(reference)
                     with contextlib.suppress(Exception):
@@ -165,7 +165,7 @@ class Engine:
                 with contextlib.suppress(Exception):
                     ray.cancel(reference, force=True)
 
-    def _settled(
+    def _settle(
         self, reference: Any, batch: _Batch[Item], again: deque[_Batch[Item]]
     ) -> Iterator[Done[Item, Result] | Lost[Item]]:
         import ray
@@ -179,9 +179,9 @@ class Engine:
         except ray.exceptions.NodeDiedError:
             again.append(batch)  # no fault of its own
         except ray.exceptions.RayError as error:
-            yield from _split(batch, again, timed_out=False, reason=reason_of(error))
+            yield from _split(batch, again, timed_out=False, reason=short_reason(error))
 
-    def mapped(
+    def map(
         self,
         function: Callable[[Item], Result],
         items: Iterable[Item],
@@ -222,7 +222,7 @@ def _ask(address: str) -> None:
     expected = "expected the head of a running Ray cluster, HOST:PORT as `ray start --head` says it"
     host, _, port = address.rpartition("://")[2].rpartition(":")
     if not host or not port.isdecimal():
-        raise InputError(f"--address: found {quoted(address)}, {expected}")
+        raise InputError(f"--address: found {quote(address)}, {expected}")
     try:
         with socket.create_connection((host.strip("[]"), int(port)), PATIENCE) as connection:
             if os.environ.get("RAY_USE_TLS", "0") != "1":
@@ -231,7 +231,7 @@ def _ask(address: str) -> None:
                 if connection.recv(4)[3:] != b"\4":
                     raise InputError(f"--address: found something that is not Ray at {address}, {expected}")
     except (OSError, OverflowError) as error:
-        raise InputError(f"--address: found no cluster at {address} ({reason_of(error)}), {expected}") from error
+        raise InputError(f"--address: found no cluster at {address} ({short_reason(error)}), {expected}") from error
 
 
 def _each(items: Sequence[tuple[int, Item]], function: Callable[[Item], Result]) -> list[tuple[int, Result]]:

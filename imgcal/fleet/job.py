@@ -26,12 +26,12 @@ import imgcal
 from imgcal.association import PipelineOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import flat_std, whitened_covariance
-from imgcal.fleet.drift_information import unit_of
-from imgcal.fleet.manifest import Item, opened, reason_of
+from imgcal.fleet.drift_information import parameter_units
+from imgcal.fleet.manifest import Item, open_file, short_reason
 from imgcal.formats import load_rig
 from imgcal.io import Capture, load_object, open_input, rig_text, shipped_names
 from imgcal.messages import one_line
-from imgcal.pipeline import Calibration, Detector, DetectorName, calibrate, detect_capture, sight_of_capture
+from imgcal.pipeline import Calibration, Detector, DetectorName, calibrate, capture_sight, detect_capture
 from imgcal.types import CalibrationObject, CameraRig
 
 try:
@@ -69,16 +69,16 @@ class Settings:
 
 
 class TooLongError(BaseException):
-    """The time limit of a capture is over. Only `processed` catches it."""
+    """The time limit of a capture is over. Only `process` catches it."""
 
 
-def item_of(item: Item) -> str:
+def item_id(item: Item) -> str:
     """Identify a row of the manifest by its cells, whatever its files hold: 32 hexadecimal digits."""
     said = json.dumps([item.capture, item.rig, item.object, item.device, item.time])
     return hashlib.blake2b(said.encode(), digest_size=16).hexdigest()
 
 
-def processed(item: Item, settings: Settings, known: frozenset[str] | Any = frozenset()) -> dict[str, Any] | None:
+def process(item: Item, settings: Settings, known: frozenset[str] | Any = frozenset()) -> dict[str, Any] | None:
     """Recalibrate one capture.
 
     Args:
@@ -90,17 +90,17 @@ def processed(item: Item, settings: Settings, known: frozenset[str] | Any = froz
         A row of the results; None where its key is known. Never raises for what is wrong with a capture.
     """
     started, spent = time.perf_counter(), time.process_time()
-    row = _row_of(item)
+    row = _capture_row(item)
     status, extra = "ok", dict[str, Any]()
     try:
         if item.fault:
             raise InputError(item.fault)
-        with tempfile.TemporaryDirectory(prefix="imgcal-fleet-") as folder, _limited(settings):
-            path = fetched(item.capture, Path(folder))
+        with tempfile.TemporaryDirectory(prefix="imgcal-fleet-") as folder, _limit(settings):
+            path = fetch(item.capture, Path(folder))
             row["key"] = content_key(path, item, settings)
             if row["key"] in known:
                 return None
-            extra = _recalibrated(path, *_world(item.rig, item.object), settings)
+            extra = _recalibrate(path, *_world(item.rig, item.object), settings)
     except RefusedError as error:
         status, row["reason"] = "refused", one_line(error.reason)
     except InputError as error:
@@ -117,14 +117,14 @@ def processed(item: Item, settings: Settings, known: frozenset[str] | Any = froz
 
 def failed_row(item: Item, status: Status, reason: str) -> dict[str, Any]:
     """Row of a capture whose process died."""
-    return _row_of(item) | {"status": status, "reason": reason, "seconds": 0.0, "cpu_seconds": 0.0}
+    return _capture_row(item) | {"status": status, "reason": reason, "seconds": 0.0, "cpu_seconds": 0.0}
 
 
-def _row_of(item: Item) -> dict[str, Any]:
+def _capture_row(item: Item) -> dict[str, Any]:
     """The columns of a capture that do not depend on the outcome."""
     moment = None if item.time is None else datetime.datetime.fromtimestamp(item.time, datetime.UTC)
     return {
-        "item": item_of(item), "key": "", "device": item.device, "time": moment, "capture": item.capture,
+        "item": item_id(item), "key": "", "device": item.device, "time": moment, "capture": item.capture,
         "rig": item.rig, "object": item.object, "given": list(item.given), "reason": "",
     }  # fmt: skip
 
@@ -133,7 +133,7 @@ class _Unreachable(Exception):
     """A file that could not be fetched: a network failure, or a wrong path."""
 
 
-def fetched(url: str, folder: Path) -> Path:
+def fetch(url: str, folder: Path) -> Path:
     """Bring a capture to this machine; a local one stays where it is.
 
     Raises:
@@ -150,16 +150,16 @@ def fetched(url: str, folder: Path) -> Path:
         name = path.rstrip("/").rsplit("/", 1)[-1]
         system.get(path.rstrip("/"), str(folder / name), recursive=system.isdir(path))
     except Exception as error:
-        raise _Unreachable(f"{url}: cannot be read: {reason_of(error)}") from error
+        raise _Unreachable(f"{url}: cannot be read: {short_reason(error)}") from error
     return folder / name
 
 
 def content_key(path: Path, item: Item, settings: Settings) -> str:
     """Digest of everything that a result depends on: 32 hexadecimal digits."""
     digest = hashlib.blake2b(digest_size=16)
-    digest.update(f"{settings.key()}\n{item_of(item)}\n".encode())
+    digest.update(f"{settings.key()}\n{item_id(item)}\n".encode())
     for url in (item.rig, item.object):
-        digest.update(_content_of(url))
+        digest.update(_read_content(url))
     try:
         files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
         for file in files:
@@ -172,7 +172,7 @@ def content_key(path: Path, item: Item, settings: Settings) -> str:
     return digest.hexdigest()
 
 
-def _content_of(url: str) -> bytes:
+def _read_content(url: str) -> bytes:
     """Bytes of a rig or object file; the name itself of a shipped one."""
     return url.encode() if _is_shipped(url) else _small_file(url, _stamp(url))
 
@@ -198,7 +198,7 @@ def _stat(path: str, expected: str, *, folder: bool = False) -> os.stat_result:
     try:
         found = Path(path).stat()
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read: {reason_of(error)}") from error
+        raise InputError(f"{path}: cannot be read: {short_reason(error)}") from error
     if not (stat.S_ISREG(found.st_mode) or (folder and stat.S_ISDIR(found.st_mode))):
         kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a device or pipe"
         raise InputError(f"{path}: found {kind}, expected {expected}")
@@ -207,16 +207,16 @@ def _stat(path: str, expected: str, *, folder: bool = False) -> os.stat_result:
 
 @lru_cache(maxsize=256)
 def _small_file(url: str, stamp: str) -> bytes:
-    with opened(url) as file:
+    with open_file(url) as file:
         return bytes(file.read())
 
 
 def _world(rig: str, obj: str) -> tuple[CameraRig, CalibrationObject]:
-    return _loaded(rig, _content_of(rig), "rig"), _loaded(obj, _content_of(obj), "object")
+    return _load(rig, _read_content(rig), "rig"), _load(obj, _read_content(obj), "object")
 
 
 @lru_cache(maxsize=256)
-def _loaded(url: str, content: bytes, kind: Literal["rig", "object"]) -> Any:
+def _load(url: str, content: bytes, kind: Literal["rig", "object"]) -> Any:
     load = load_rig if kind == "rig" else load_object
     if "://" not in url:
         return load(url)
@@ -226,20 +226,20 @@ def _loaded(url: str, content: bytes, kind: Literal["rig", "object"]) -> Any:
         return load(str(path))
 
 
-def _recalibrated(path: Path, rig: CameraRig, obj: CalibrationObject, settings: Settings) -> dict[str, Any]:
+def _recalibrate(path: Path, rig: CameraRig, obj: CalibrationObject, settings: Settings) -> dict[str, Any]:
     """The columns of a capture that was recalibrated."""
     source = open_input(path, rig, obj.rows)
     detector: Detector = "classical"
     if isinstance(source, Capture):
         if settings.detector != "classical":
-            detector = sight_of_capture(source, settings.detector)
+            detector = capture_sight(source, settings.detector)
         source, _ = detect_capture(source, board=obj.board)
     options = PipelineOptions(blind_cameras=settings.blind_cameras)
     result = calibrate(source, rig, obj, options, detector=detector)
-    return columns_of(result) | ({"rig_file": rig_text(result.rig)} if settings.keep_rig else {})
+    return result_columns(result) | ({"rig_file": rig_text(result.rig)} if settings.keep_rig else {})
 
 
-def columns_of(result: Calibration) -> dict[str, Any]:
+def result_columns(result: Calibration) -> dict[str, Any]:
     """What a row keeps of a calibration; `information_factor` is R of R^T R = 1 + information / prior, row by row."""
     estimate, solution = result.estimate, result.estimate.solution
     whitened = torch.linalg.inv(whitened_covariance(solution))[0]
@@ -254,7 +254,7 @@ def columns_of(result: Calibration) -> dict[str, Any]:
         "offset": offset.flatten().tolist(),
         "std": flat_std(estimate).flatten().tolist(),
         "prior_std": estimate.problem.prior_std.flatten().tolist(),
-        "unit": unit_of(result.factory).flatten().tolist(),
+        "unit": parameter_units(result.factory).flatten().tolist(),
         "whitened_offset": solution.state.offset.flatten().tolist(),
         "information_factor": factor[upper[0], upper[1]].float().numpy(),  # thousands: no list of Python's
         "inflation": estimate.mean_inflation,
@@ -278,7 +278,7 @@ def _fault(error: Exception, settings: Settings) -> tuple[Status, str]:
 
 
 @contextlib.contextmanager
-def _limited(settings: Settings) -> Iterator[None]:
+def _limit(settings: Settings) -> Iterator[None]:
     """Hold what runs in the block to its time (not on Windows) and its memory (on Linux)."""
 
     def over(number: int, frame: FrameType | None) -> None:

@@ -150,8 +150,8 @@ def learn_prior(
     freed = torch.zeros(len(drift), len(drift.camera_names), dtype=torch.bool)
     for _ in range(ROUNDS):
         slopes, slope_sigma = _slopes(drift, model, theta, freed, centred)
-        level = _levelled(drift, centred, slopes)
-        theta, sigma = _scored(level, model, theta, freed)
+        level = _remove_slopes(drift, centred, slopes)
+        theta, sigma = _score_variances(level, model, theta, freed)
         found = _outliers(level, model, theta)
         now = torch.zeros_like(freed)
         for outlier in found:
@@ -248,7 +248,7 @@ def _look(drift: DriftInformation, variance: Tensor) -> _Seen:
     return _Seen(place, known / (std[:, :, None] * std[:, None, :]))
 
 
-def _scored(drift: DriftInformation, model: _Model, theta: Tensor, freed: Tensor) -> tuple[Tensor, Tensor]:
+def _score_variances(drift: DriftInformation, model: _Model, theta: Tensor, freed: Tensor) -> tuple[Tensor, Tensor]:
     """Find the most probable variances (K,), and the standard deviation of each relative to itself (K,)."""
     for _ in range(STEPS):
         score, fisher = _score_and_fisher(drift, model, theta, freed)
@@ -293,7 +293,7 @@ def _slopes(
     return slopes, inverse.diagonal().clamp_min(0).sqrt().reshape(count, size)
 
 
-def _levelled(drift: DriftInformation, covariates: Mapping[str, Tensor], slopes: Tensor) -> DriftInformation:
+def _remove_slopes(drift: DriftInformation, covariates: Mapping[str, Tensor], slopes: Tensor) -> DriftInformation:
     """Take slopes out of what was seen."""
     if not covariates:
         return drift

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from imgcal.errors import InputError
-from imgcal.messages import listed, quoted
+from imgcal.messages import list_names, quote
 
 REQUIRED = ("capture",)
 PARQUET = (".parquet", ".pq")
@@ -63,7 +63,7 @@ class Manifest:
                 return int(pyarrow.parquet.ParquetFile(file).metadata.num_rows)
         if "://" in self.url:
             return None
-        with opened(self.url) as file:
+        with open_file(self.url) as file:
             lines = sum(block.count(b"\n") for block in iter(lambda: file.read(1 << 20), b""))
         return max(lines - 1, 0)
 
@@ -87,7 +87,8 @@ class Manifest:
             lacking = [name for name in REQUIRED if name not in table.column_names]
             if lacking:
                 raise InputError(
-                    f"{self.url}: found columns {listed(table.column_names)}; expected {', '.join(lacking)} among them"
+                    f"{self.url}: found columns {list_names(table.column_names)}; expected {', '.join(lacking)} "
+                    "among them"
                 )
             columns = table.to_pydict()
             items = [
@@ -126,7 +127,7 @@ class Manifest:
         """Open the file; Arrow's errors become an `InputError`."""
         import pyarrow as pa
 
-        with opened(self.url) as file:
+        with open_file(self.url) as file:
             try:
                 yield file
             except (pa.ArrowException, OSError, csv.Error) as error:
@@ -136,15 +137,15 @@ class Manifest:
     def _item(self, row: int, values: dict[str, Any]) -> Item:
         given = tuple((n, number) for n, v in values.items() if n not in KNOWN and (number := _number(v)) is not None)
         faults = [
-            f"found {name} {quoted(repr(values[name]))}, expected text"
+            f"found {name} {quote(repr(values[name]))}, expected text"
             for name in KNOWN[:-1]
             if not isinstance(values.get(name), str | int | float | None)
         ]
         text = {name: str(values[name]) if values.get(name) else None for name in KNOWN[:-1]}
         named = {
-            "capture": text["capture"] and _beside(self.url, text["capture"]),
-            "rig": _beside(self.url, text["rig"]) if text["rig"] else self.rig,
-            "object": _beside(self.url, text["object"]) if text["object"] else self.object,
+            "capture": text["capture"] and _base_folder(self.url, text["capture"]),
+            "rig": _base_folder(self.url, text["rig"]) if text["rig"] else self.rig,
+            "object": _base_folder(self.url, text["object"]) if text["object"] else self.object,
         }
         faults += [
             f"found no {name}, expected one in its column, or for all by an option"
@@ -162,7 +163,7 @@ class Manifest:
 
 
 @lru_cache(maxsize=4096)
-def _beside(url: str, path: str) -> str:
+def _base_folder(url: str, path: str) -> str:
     """Take relative paths from the folder of the manifest at an address; names of shipped files stay."""
     if "://" in path or posixpath.isabs(path):
         return path
@@ -176,7 +177,7 @@ def _beside(url: str, path: str) -> str:
     return str(found) if is_file else path
 
 
-def opened(url: str) -> Any:
+def open_file(url: str) -> Any:
     """Open a local or remote file for reading.
 
     Raises:
@@ -187,13 +188,13 @@ def opened(url: str) -> Any:
     try:
         return fsspec.open(url, "rb").open()
     except Exception as error:  # what fsspec's file systems raise is not theirs alone
-        raise InputError(f"{url}: cannot be read: {reason_of(error)}") from error
+        raise InputError(f"{url}: cannot be read: {short_reason(error)}") from error
 
 
-def reason_of(error: BaseException) -> str:
+def short_reason(error: BaseException) -> str:
     """Shorten an error to a few words."""
     text = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return quoted(" ".join(str(text).split()))
+    return quote(" ".join(str(text).split()))
 
 
 def _problem(text: str) -> str:
@@ -234,10 +235,10 @@ def _seconds(value: Any) -> float | None:
             moment = (moment if moment.tzinfo else moment.replace(tzinfo=datetime.UTC)).timestamp()
     except (ValueError, OverflowError) as error:
         raise ValueError(
-            f"found time {quoted(repr(value))}, expected 2026-01-31T12:00:00 (UTC without an offset) or seconds"
+            f"found time {quote(repr(value))}, expected 2026-01-31T12:00:00 (UTC without an offset) or seconds"
         ) from error
     if not EARLIEST <= moment <= LATEST:
-        raise ValueError(f"found time {quoted(str(value))}, expected seconds since 1970, in the years 1900 to 2200")
+        raise ValueError(f"found time {quote(str(value))}, expected seconds since 1970, in the years 1900 to 2200")
     return float(moment)
 
 

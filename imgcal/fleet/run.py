@@ -12,7 +12,7 @@ import torch
 
 from imgcal.fleet.dataset import ROWS, SECONDS, Dataset, Keys
 from imgcal.fleet.engine import Engine, Lost
-from imgcal.fleet.job import Settings, Status, failed_row, processed
+from imgcal.fleet.job import Settings, Status, failed_row, process
 from imgcal.fleet.manifest import Item, Manifest
 
 BATCH = 32
@@ -58,7 +58,7 @@ def recalibrate_fleet(
     known = dataset.keys(again=again)
     with dataset.written() as writer:
         flushed = time.monotonic()
-        outcomes = engine.run(_processed, manifest.batches(batch), settings, known.frozen(), seconds=settings.seconds)
+        outcomes = engine.run(_process, manifest.batches(batch), settings, known.frozen(), seconds=settings.seconds)
         for outcome in outcomes:
             if isinstance(outcome, Lost):
                 status: Status = "timed_out" if outcome.timed_out else "crashed"
@@ -86,6 +86,6 @@ def _fresh(rows: Sequence[dict[str, Any] | None], known: Keys) -> Iterator[dict[
             yield row
 
 
-def _processed(items: Sequence[Item], settings: Settings, known: Keys) -> list[dict[str, Any] | None]:
+def _process(items: Sequence[Item], settings: Settings, known: Keys) -> list[dict[str, Any] | None]:
     torch.set_num_threads(1)
-    return [processed(item, settings, known) for item in items]
+    return [process(item, settings, known) for item in items]

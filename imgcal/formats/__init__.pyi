@@ -1,4 +1,4 @@
-from .conversion import Held, describe_lens, from_camera_rig, held_by, to_camera_rig, with_image_sizes
+from .conversion import Held, describe_lens, fill_image_sizes, fit_to_target, from_camera_rig, to_camera_rig
 from .documents import Element, parse_xml
 from .fitting import Fit, Holds
 from .foreign_rig import ForeignCamera, ForeignRig
@@ -6,11 +6,11 @@ from .format import Files, Format
 from .lens import Lens
 from .limits import LIMIT
 from .loading import load_cameras, load_rig
-from .registry import FORMATS, format_named, is_foreign, read_foreign_rig
+from .registry import FORMATS, find_format, is_foreign, read_foreign_rig
 from .units import in_millimetres, millimetres
 from .verification import known_points, worst_difference
-from .write_back import Updated, written_back
-from .writing import OURS, Written, converted, selected
+from .write_back import Updated, write_into
+from .writing import OURS, Written, convert_rig, select_cameras
 
 __all__ = [
     "FORMATS",
@@ -27,11 +27,12 @@ __all__ = [
     "Lens",
     "Updated",
     "Written",
-    "converted",
+    "convert_rig",
     "describe_lens",
-    "format_named",
+    "fill_image_sizes",
+    "find_format",
+    "fit_to_target",
     "from_camera_rig",
-    "held_by",
     "in_millimetres",
     "is_foreign",
     "known_points",
@@ -40,9 +41,8 @@ __all__ = [
     "millimetres",
     "parse_xml",
     "read_foreign_rig",
-    "selected",
+    "select_cameras",
     "to_camera_rig",
-    "with_image_sizes",
     "worst_difference",
-    "written_back",
+    "write_into",
 ]

@@ -8,29 +8,29 @@ from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig
 from imgcal.formats.format import Files, Format
 from imgcal.formats.source import Source
-from imgcal.formats.toml_cameras import cameras_of, lenses_of, tables_of, toml_text
-from imgcal.formats.values import vector_of_rotation
+from imgcal.formats.toml_cameras import find_tables, read_all_lenses, read_cameras, toml_text
+from imgcal.formats.values import vector_from_rotation
 
 TITLE = "anipose calibration.toml"
 
 
 def _recognizes(source: Source) -> bool:
-    return tables_of(source) is not None
+    return find_tables(source) is not None
 
 
 def _read(source: Source) -> ForeignRig:
-    tables = tables_of(source)
+    tables = find_tables(source)
     assert tables is not None
     notes: list[str] = []
-    cameras = cameras_of(tables.cameras, notes)
+    cameras = read_cameras(tables.cameras, notes)
     return ForeignRig(FORMAT.name, cameras, None, "the file's world (anipose: near the first camera)", tuple(notes))
 
 
 def read_lenses(source: Source) -> list[ForeignCamera]:
     """Read the cameras of a file without their places."""
-    tables = tables_of(source)
+    tables = find_tables(source)
     assert tables is not None
-    return lenses_of(tables.cameras)
+    return read_all_lenses(tables.cameras)
 
 
 def camera_table(camera: ForeignCamera, coefficients: int = 5) -> dict[str, Any]:
@@ -40,8 +40,8 @@ def camera_table(camera: ForeignCamera, coefficients: int = 5) -> dict[str, Any]
         "name": camera.name,
         "size": list(camera.image_size or ()),
         "matrix": camera.lens.matrix.tolist(),
-        "distortions": camera.lens.padded(4 if fisheye else coefficients),
-        "rotation": vector_of_rotation(camera.rotation).tolist(),
+        "distortions": camera.lens.pad(4 if fisheye else coefficients),
+        "rotation": vector_from_rotation(camera.rotation).tolist(),
         "translation": camera.translation.tolist(),
         "fisheye": fisheye,
     }

@@ -12,39 +12,41 @@ from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
 from imgcal.formats.format import Files, Format
 from imgcal.formats.source import Source
-from imgcal.formats.toml_cameras import Table, cameras_of, has_tables, lenses_of, tables_of, toml_text
-from imgcal.formats.values import named, number, text, vector_of_rotation
+from imgcal.formats.toml_cameras import Table, find_tables, has_tables, read_all_lenses, read_cameras, toml_text
+from imgcal.formats.values import name_cameras, number, text, vector_from_rotation
 
 TITLE = "caliscope camera array"
 OLD = "caliscope-config"
 
 
 def _recognizes(source: Source) -> bool:
-    tables = tables_of(source)
+    tables = find_tables(source)
     return tables is not None and any("rotation_count" in table for table in tables.cameras.values())
 
 
 def _read(source: Source) -> ForeignRig:
-    tables = _named_tables(source)
+    tables = _tables_by_name(source)
     ignored = [name for name, table in tables.items() if table.get("ignore") is True]
     notes = ["metres"]
-    cameras = cameras_of(tables, notes)
+    cameras = read_cameras(tables, notes)
     if kept := [name for name in ignored if name in [camera.name for camera in cameras]]:
-        notes.append(f"{named(kept)}: marked `ignore` in the file, and taken all the same, with the pose that it has")
+        notes.append(
+            f"{name_cameras(kept)}: marked `ignore` in the file, and taken all the same, with the pose that it has"
+        )
     return ForeignRig(FORMAT.name, cameras, "m", "the file's world (as set in caliscope)", tuple(notes))
 
 
 def _read_lenses(source: Source) -> list[ForeignCamera]:
-    return lenses_of(_named_tables(source))
+    return read_all_lenses(_tables_by_name(source))
 
 
-def _named_tables(source: Source) -> dict[str, Table]:
+def _tables_by_name(source: Source) -> dict[str, Table]:
     """The tables by the names of the cameras.
 
     Raises:
         FormatError: images were turned.
     """
-    tables = tables_of(source)
+    tables = find_tables(source)
     assert tables is not None
     named_tables: dict[str, Table] = {}
     turned = []
@@ -55,7 +57,8 @@ def _named_tables(source: Source) -> dict[str, Table]:
             turned.append(name)
     if turned:
         raise FormatError(
-            f"{named(turned)}: rotation_count is not 0: the images were turned before they were used, and the file "
+            f"{name_cameras(turned)}: rotation_count is not 0: the images were turned before they were used, and "
+            "the file "
             "does not say what K then refers to; turn the videos, and calibrate anew"
         )
     return named_tables
@@ -85,10 +88,10 @@ def _tables(rig: ForeignRig, matrix: bool) -> dict[int, dict[str, Any]]:
             "ignore": False,
             "size": list(camera.image_size or ()),
             "matrix": camera.lens.matrix.tolist(),
-            "distortions": camera.lens.padded(4 if fisheye else 5),
+            "distortions": camera.lens.pad(4 if fisheye else 5),
             "fisheye": fisheye,
             "translation": camera.translation.tolist(),
-            "rotation": camera.rotation.tolist() if matrix else vector_of_rotation(camera.rotation).tolist(),
+            "rotation": camera.rotation.tolist() if matrix else vector_from_rotation(camera.rotation).tolist(),
         }
     return tables
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from imgcal.formats.foreign_rig import FormatError
 from imgcal.formats.lens import Array
-from imgcal.formats.values import named, nearest_rotation
+from imgcal.formats.values import name_cameras, nearest_rotation
 
 Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,) of destination_from_source
 IDENTITY: Pose = (np.eye(3), np.zeros(3))
@@ -24,7 +24,7 @@ class Link:
     pose: Pose
 
 
-def pose_of_matrix(matrix: Array, what: str) -> Pose:
+def pose_from_matrix(matrix: Array, what: str) -> Pose:
     """Take a 4 x 4 (or 3 x 4) matrix apart."""
     if matrix.shape == (4, 4) and not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
         raise FormatError(f"{what}: found the last row {matrix[3].tolist()}, expected 0 0 0 1")
@@ -42,7 +42,7 @@ def compose(outer: Pose, inner: Pose) -> Pose:
     return outer[0] @ inner[0], outer[0] @ inner[1] + outer[1]
 
 
-def from_root(root: str, cameras: Sequence[str], links: Sequence[Link]) -> dict[str, Pose]:
+def follow_links(root: str, cameras: Sequence[str], links: Sequence[Link]) -> dict[str, Pose]:
     """Follow links to every camera: camera_from_root.
 
     Raises:
@@ -62,5 +62,5 @@ def from_root(root: str, cameras: Sequence[str], links: Sequence[Link]) -> dict[
                 waiting.append(destination)
     lost = [camera for camera in cameras if camera not in poses]
     if lost:
-        raise FormatError(f"{named(lost)}: no pose relative to {root}, so that there is no rig")
+        raise FormatError(f"{name_cameras(lost)}: no pose relative to {root}, so that there is no rig")
     return {camera: poses[camera] for camera in cameras}

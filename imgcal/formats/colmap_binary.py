@@ -14,9 +14,9 @@ from imgcal.formats.colmap_model import (
     ColmapCamera,
     ColmapImage,
     ColmapRig,
-    model_of_rig,
-    pose_of,
-    rig_of_model,
+    model_from_rig,
+    pose_from_quaternion,
+    rig_from_model,
     seven,
 )
 from imgcal.formats.documents import read_bytes
@@ -39,7 +39,7 @@ class _Reader:
     def __init__(self, path: Path) -> None:
         self.path, self.name, self.content, self.place = path, path.name, read_bytes(path, MOST_BYTES), 0
 
-    def take(self, layout: str) -> tuple[Any, ...]:
+    def read(self, layout: str) -> tuple[Any, ...]:
         size = struct.calcsize("<" + layout)
         self.need(size)
         values = struct.unpack_from("<" + layout, self.content, self.place)
@@ -48,7 +48,7 @@ class _Reader:
 
     def count(self, smallest: int) -> int:
         """A number of records of at least so many bytes each."""
-        (count,) = self.take("Q")
+        (count,) = self.read("Q")
         self.need(count * smallest)
         return int(count)
 
@@ -69,35 +69,35 @@ class _Reader:
         return At(self.path, self.place)
 
     def pose(self) -> Pose:
-        return pose_of([number(value, self.name) for value in self.take("7d")], self.name)
+        return pose_from_quaternion([number(value, self.name) for value in self.read("7d")], self.name)
 
 
 def _recognizes(source: Source) -> bool:
-    return source.named("cameras.bin") is not None
+    return source.find_file("cameras.bin") is not None
 
 
 def _read(source: Source) -> ForeignRig:
-    path = source.named("cameras.bin")
+    path = source.find_file("cameras.bin")
     assert path is not None
     cameras = _cameras(_Reader(path))
-    rigs_path, images_path = source.named("rigs.bin"), source.named("images.bin")
+    rigs_path, images_path = source.find_file("rigs.bin"), source.find_file("images.bin")
     rigs = _rigs(_Reader(rigs_path)) if rigs_path else []
     if images_path is None and not any(len(rig.sensors) > 1 for rig in rigs):
         raise FormatError("intrinsics alone: expected images.bin or rigs.bin beside cameras.bin")
-    return rig_of_model(FORMAT.name, cameras, _images(_Reader(images_path)) if images_path else [], rigs, source.rig)
+    return rig_from_model(FORMAT.name, cameras, _images(_Reader(images_path)) if images_path else [], rigs, source.rig)
 
 
 def _cameras(reader: _Reader) -> list[ColmapCamera]:
     found = []
     for _ in range(reader.count(24)):
-        camera, model, width, height = reader.take("IiQQ")
+        camera, model, width, height = reader.read("IiQQ")
         if not 0 <= model < len(MODELS):
             raise FormatError(
                 f"{reader.name}: camera {camera}: found the model number {model}, which is none of COLMAP's"
             )
         name = MODELS[model]
         at = reader.at()
-        parameters = tuple(number(value, reader.name) for value in reader.take(f"{COUNTS[name]}d"))
+        parameters = tuple(number(value, reader.name) for value in reader.read(f"{COUNTS[name]}d"))
         found.append(ColmapCamera(camera, name, (width, height), parameters, at))
     return found
 
@@ -105,15 +105,15 @@ def _cameras(reader: _Reader) -> list[ColmapCamera]:
 def _rigs(reader: _Reader) -> list[ColmapRig]:
     found = []
     for _ in range(reader.count(8)):
-        rig, sensors = reader.take("II")
+        rig, sensors = reader.read("II")
         reader.need(9 * max(sensors - 1, 0))
         poses: dict[int, Pose | None] = {}
         places: dict[int, At] = {}
         for place in range(sensors):
-            kind, sensor = reader.take("iI")
+            kind, sensor = reader.read("iI")
             pose: Pose | None = IDENTITY
             if place:
-                (posed,) = reader.take("B")
+                (posed,) = reader.read("B")
                 places[sensor] = reader.at()
                 pose = reader.pose() if posed else None
             if kind == CAMERA:
@@ -125,10 +125,10 @@ def _rigs(reader: _Reader) -> list[ColmapRig]:
 def _images(reader: _Reader) -> list[ColmapImage]:
     found = []
     for _ in range(reader.count(73)):
-        (image,) = reader.take("I")
+        (image,) = reader.read("I")
         at = reader.at()
         pose = reader.pose()
-        (camera,) = reader.take("I")
+        (camera,) = reader.read("I")
         name = reader.name_of_image()
         points = reader.count(POINT)
         reader.place += points * POINT
@@ -137,7 +137,7 @@ def _images(reader: _Reader) -> list[ColmapImage]:
 
 
 def _write(rig: ForeignRig) -> Files:
-    cameras, images, colmap_rig, rig_from_world = model_of_rig(rig)
+    cameras, images, colmap_rig, rig_from_world = model_from_rig(rig)
     count = struct.pack("<Q", len(cameras))
     camera_rows = [
         struct.pack(f"<IiQQ{len(c.parameters)}d", c.id, MODELS.index(c.model), *(c.image_size or (0, 0)), *c.parameters)

@@ -16,8 +16,8 @@ from imgcal.formats import places
 from imgcal.formats.chains import IDENTITY, Pose, compose, inverse
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.lens import Array, Lens
-from imgcal.formats.values import named, quaternion_of_rotation, rotation_of_quaternion
-from imgcal.messages import shortened
+from imgcal.formats.values import name_cameras, quaternion_from_rotation, rotation_from_quaternion
+from imgcal.messages import shorten
 
 HALF = 0.5
 MODELS = (
@@ -63,7 +63,7 @@ class ColmapCamera:
         """The parameters of a camera of this model."""
         fx, fy, cx, cy = places.focal_and_centre(camera)
         focal = [fx] if self.one_focal_length else [fx, fy]
-        return [*focal, cx + HALF, cy + HALF, *camera.lens.padded(len(self.parameters) - len(focal) - 2)]
+        return [*focal, cx + HALF, cy + HALF, *camera.lens.pad(len(self.parameters) - len(focal) - 2)]
 
     def camera(self, name: str, pose: Pose, *others: Place) -> ForeignCamera:
         """The camera, where it stands."""
@@ -103,7 +103,7 @@ class ColmapImage:
 
     def place(self, before: Pose) -> list[Place]:
         """Where its pose stands, which goes along with its camera."""
-        return [self.at.place(places.carried(before, self.pose, places.seven))] if self.at is not None else []
+        return [self.at.place(places.carry_pose(before, self.pose, places.seven))] if self.at is not None else []
 
 
 @dataclass(frozen=True)
@@ -115,12 +115,12 @@ class ColmapRig:
     at: dict[int, At] = field(default_factory=dict)  # of the poses
 
 
-def pose_of(row: Sequence[float], what: str) -> Pose:
+def pose_from_quaternion(row: Sequence[float], what: str) -> Pose:
     """A quaternion w, x, y, z (Hamilton) and a translation."""
-    return rotation_of_quaternion(list(row[:4]), what), np.array(row[4:7], dtype=np.float64)
+    return rotation_from_quaternion(list(row[:4]), what), np.array(row[4:7], dtype=np.float64)
 
 
-def rig_of_model(
+def rig_from_model(
     name: str,
     cameras: Sequence[ColmapCamera],
     images: Sequence[ColmapImage],
@@ -137,8 +137,8 @@ def rig_of_model(
     together = [rig for rig in rigs if len(rig.sensors) > 1]
     if together:
         chosen = together[chosen_rig(_rig_names(together, images), wanted)]
-        return _of_rig(name, chosen, known, images, notes)
-    return _of_images(name, known, images, notes)
+        return _convert_rig(name, chosen, known, images, notes)
+    return _convert_images(name, known, images, notes)
 
 
 def chosen_rig(names: Sequence[str], wanted: str | None) -> int:
@@ -151,7 +151,7 @@ def chosen_rig(names: Sequence[str], wanted: str | None) -> int:
         raise FormatError(f"found {len(names)} rigs of several cameras: choose one with --source-rig {names[0]} (of "
                           f"{', '.join(names[:8])}), to imgcal convert")  # fmt: skip
     if wanted is not None and wanted not in names:
-        raise FormatError(f"--source-rig: found {shortened(wanted)}, expected one of {', '.join(names[:8])}")
+        raise FormatError(f"--source-rig: found {shorten(wanted)}, expected one of {', '.join(names[:8])}")
     return 0 if wanted is None else list(names).index(wanted)
 
 
@@ -160,11 +160,11 @@ def _rig_names(rigs: Sequence[ColmapRig], images: Sequence[ColmapImage]) -> list
     names = []
     for rig in rigs:
         folders = [PurePosixPath(image.name).parts[:-1] for image in images if image.camera in rig.sensors]
-        names.append("/".join(prefix_of(folders)))
+        names.append("/".join(common_prefix(folders)))
     return names if all(names) and len(set(names)) == len(names) else [str(rig.id) for rig in rigs]
 
 
-def prefix_of(folders: Sequence[Sequence[str]]) -> list[str]:
+def common_prefix(folders: Sequence[Sequence[str]]) -> list[str]:
     """What several folders have in common at their beginning."""
     common = []
     for parts in zip(*folders, strict=False):
@@ -187,13 +187,13 @@ def _names(rig: ColmapRig, images: Sequence[ColmapImage]) -> dict[int, str]:
     return {sensor: str(sensor) for sensor in rig.sensors}
 
 
-def _of_rig(
+def _convert_rig(
     name: str, rig: ColmapRig, known: dict[int, ColmapCamera], images: Sequence[ColmapImage], notes: list[str]
 ) -> ForeignRig:
     names = _names(rig, images)
     lost = [names[sensor] for sensor, pose in rig.sensors.items() if pose is None]
     if lost:
-        notes.append(f"{named(lost)}: left out, without a pose in the rig")
+        notes.append(f"{name_cameras(lost)}: left out, without a pose in the rig")
     found: list[ForeignCamera] = []
     root = None
     for sensor, pose in rig.sensors.items():
@@ -208,11 +208,11 @@ def _of_rig(
             others.append(rig.at[sensor].place(places.seven))
         found.append(known[sensor].camera(names[sensor], pose, *others))
     if len(found) < 2:
-        raise FormatError(f"rig {rig.id}: {named(lost)} without a pose in it, so that there is no rig")
+        raise FormatError(f"rig {rig.id}: {name_cameras(lost)} without a pose in it, so that there is no rig")
     return ForeignRig(name, tuple(found), None, f"rig {rig.id} (its reference camera)", tuple(notes), root=root)
 
 
-def _of_images(
+def _convert_images(
     name: str, known: dict[int, ColmapCamera], images: Sequence[ColmapImage], notes: list[str]
 ) -> ForeignRig:
     if len(images) < 2:
@@ -271,7 +271,7 @@ def _check_steady(frames: dict[str, dict[str, ColmapImage]], first: dict[str, Co
                 )
 
 
-def model_of_rig(rig: ForeignRig) -> tuple[list[ColmapCamera], list[ColmapImage], ColmapRig, Pose]:
+def model_from_rig(rig: ForeignRig) -> tuple[list[ColmapCamera], list[ColmapImage], ColmapRig, Pose]:
     """Take a rig apart for writing: cameras, an image each, the rig (first camera = reference), and rig_from_world."""
     first = (rig.cameras[0].rotation, rig.cameras[0].translation)
     cameras, images, sensors = [], [], dict[int, Pose | None]()
@@ -288,14 +288,14 @@ def _row(number: int, camera: ForeignCamera) -> ColmapCamera:
     (fx, fy), (cx, cy) = lens.focal_length, lens.principal_point
     start = (fx, fy, cx + HALF, cy + HALF)
     if lens.model == "fisheye":
-        return ColmapCamera(number, "OPENCV_FISHEYE", camera.image_size, (*start, *lens.padded(4)))
+        return ColmapCamera(number, "OPENCV_FISHEYE", camera.image_size, (*start, *lens.pad(4)))
     if lens.length == 0:
         return ColmapCamera(number, "PINHOLE", camera.image_size, start)
     if lens.length <= 4:
-        return ColmapCamera(number, "OPENCV", camera.image_size, (*start, *lens.padded(4)))
-    return ColmapCamera(number, "FULL_OPENCV", camera.image_size, (*start, *lens.padded(8)))
+        return ColmapCamera(number, "OPENCV", camera.image_size, (*start, *lens.pad(4)))
+    return ColmapCamera(number, "FULL_OPENCV", camera.image_size, (*start, *lens.pad(8)))
 
 
 def seven(pose: Pose) -> Array:
     """A pose as COLMAP writes it: quaternion w, x, y, z and translation."""
-    return np.concatenate((quaternion_of_rotation(pose[0]), pose[1]))
+    return np.concatenate((quaternion_from_rotation(pose[0]), pose[1]))

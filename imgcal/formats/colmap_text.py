@@ -15,17 +15,17 @@ from imgcal.formats.colmap_model import (
     ColmapImage,
     ColmapRig,
     chosen_rig,
-    model_of_rig,
-    pose_of,
-    prefix_of,
-    rig_of_model,
+    common_prefix,
+    model_from_rig,
+    pose_from_quaternion,
+    rig_from_model,
     seven,
 )
 from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.format import Files, Format
 from imgcal.formats.source import Source
-from imgcal.formats.values import array, mapping, number, numbers, rotation_of_quaternion, text
+from imgcal.formats.values import array, mapping, number, numbers, rotation_from_quaternion, text
 
 TITLE = "COLMAP model (text)"
 CONFIG_TITLE = "COLMAP rig_config.json"
@@ -34,18 +34,18 @@ MOST_ROW = 2**26  # characters: the points of an image stand in one row
 
 
 def _recognizes(source: Source) -> bool:
-    return source.named("cameras.txt") is not None
+    return source.find_file("cameras.txt") is not None
 
 
 def _read(source: Source) -> ForeignRig:
-    path = source.named("cameras.txt")
+    path = source.find_file("cameras.txt")
     assert path is not None
     cameras = [_camera(row, line, path) for line, row in _rows(path)]
-    rigs_path, images_path = source.named("rigs.txt"), source.named("images.txt")
+    rigs_path, images_path = source.find_file("rigs.txt"), source.find_file("images.txt")
     rigs = [_rig(row, line, rigs_path) for line, row in _rows(rigs_path)] if rigs_path else []
     if images_path is None and not any(len(rig.sensors) > 1 for rig in rigs):
         raise FormatError("intrinsics alone: expected images.txt or rigs.txt beside cameras.txt")
-    return rig_of_model(FORMAT.name, cameras, list(_images(images_path)) if images_path else [], rigs, source.rig)
+    return rig_from_model(FORMAT.name, cameras, list(_images(images_path)) if images_path else [], rigs, source.rig)
 
 
 def _camera(row: list[str], number_of_line: int, path: Path) -> ColmapCamera:
@@ -76,7 +76,9 @@ def _rig(row: list[str], line: int, path: Path) -> ColmapRig:
             posed, taken = rest[2] == "1", 3
             if posed:
                 pose, taken = (
-                    pose_of([number(v, place) for v in rest[3:10]], place) if len(rest) >= 10 else _short(place),
+                    pose_from_quaternion([number(v, place) for v in rest[3:10]], place)
+                    if len(rest) >= 10
+                    else _short(place),
                     10,
                 )
         if kind == "CAMERA" and taken == 10:
@@ -104,7 +106,7 @@ def _images(path: Path) -> Iterator[ColmapImage]:
         place = f"images.txt: line {line}"
         if len(row) < 10:
             raise FormatError(f"{place}: found {len(row)} values, expected ID QW QX QY QZ TX TY TZ CAMERA NAME")
-        pose = pose_of([number(value, place) for value in row[1:8]], place)
+        pose = pose_from_quaternion([number(value, place) for value in row[1:8]], place)
         at = At(path, line, 1)
         yield ColmapImage(int(number(row[0], place)), pose, int(number(row[8], place)), " ".join(row[9:]), at)
         expects_points = True
@@ -130,7 +132,7 @@ def _rows(path: Path, keep_empty: bool = False) -> Iterator[tuple[int, list[str]
 
 
 def _write(rig: ForeignRig) -> Files:
-    cameras, images, colmap_rig, rig_from_world = model_of_rig(rig)
+    cameras, images, colmap_rig, rig_from_world = model_from_rig(rig)
 
     def row(*values: Any) -> str:
         return " ".join(v if isinstance(v, str) else repr(float(v)) if isinstance(v, float) else str(v) for v in values)
@@ -170,7 +172,7 @@ def _config_names(rigs: list[dict[str, Any]]) -> list[str]:
     names = []
     for rig in rigs:
         entries = [entry for entry in rig.get("cameras") or [] if isinstance(entry, dict)]
-        names.append("/".join(prefix_of([str(entry.get("image_prefix", "")).split("/")[:-1] for entry in entries])))
+        names.append("/".join(common_prefix([str(entry.get("image_prefix", "")).split("/")[:-1] for entry in entries])))
     return names if all(names) and len(set(names)) == len(names) else [str(n) for n in range(1, len(rigs) + 1)]
 
 
@@ -199,7 +201,7 @@ def _read_config(source: Source) -> ForeignRig:
             without.append(name)
             continue
         else:
-            pose = rotation_of_quaternion(turn, name), array(shift, (3,), name)
+            pose = rotation_from_quaternion(turn, name), array(shift, (3,), name)
             sign = numbers(turn, name)
             others += [
                 Place(path, (*keys, "cam_from_rig_rotation"), _quaternion_like(sign)),

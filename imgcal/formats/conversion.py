@@ -10,12 +10,12 @@ import numpy as np
 import torch
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.formats.fitting import Fit, Holds, fitted
+from imgcal.formats.fitting import Fit, Holds, fit_lens
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig
 from imgcal.formats.lens import Lens
 from imgcal.formats.limits import LIMIT
-from imgcal.formats.values import named
-from imgcal.geometry import LENS_MODELS, RigidTransform, lens_width, named_lenses
+from imgcal.formats.values import name_cameras
+from imgcal.geometry import LENS_MODELS, RigidTransform, lens_label, lens_width
 from imgcal.io import RigCovariance
 from imgcal.types import CameraRig, check_rig
 
@@ -37,7 +37,7 @@ class Held:
         return max(fit.worst for fit in self.fits)
 
 
-def with_image_sizes(rig: ForeignRig, where: str, sizes: Mapping[str, tuple[int, int]]) -> ForeignRig:
+def fill_image_sizes(rig: ForeignRig, where: str, sizes: Mapping[str, tuple[int, int]]) -> ForeignRig:
     """Fill in the image sizes that a file does not have.
 
     Args:
@@ -50,7 +50,9 @@ def with_image_sizes(rig: ForeignRig, where: str, sizes: Mapping[str, tuple[int,
     """
     unknown = [name for name in sizes if name and name not in rig.names]
     if unknown:
-        raise InputError(f"--image-size: found {named(unknown)}, expected cameras of {where}: {named(rig.names)}")
+        raise InputError(
+            f"--image-size: found {name_cameras(unknown)}, expected cameras of {where}: {name_cameras(rig.names)}"
+        )
     cameras, missing = [], []
     for camera in rig.cameras:
         given = sizes.get(camera.name, sizes.get(""))
@@ -62,14 +64,15 @@ def with_image_sizes(rig: ForeignRig, where: str, sizes: Mapping[str, tuple[int,
         cameras.append(replace(camera, image_size=camera.image_size or given))
     if missing:
         raise InputError(
-            f"{where}: {named(missing)}: the size of the images is not said in the file: state it with --image-size "
+            f"{where}: {name_cameras(missing)}: the size of the images is not said in the file: state it with "
+            "--image-size "
             f"1280x720 for all, or --image-size {missing[0]}=1280x720, to imgcal convert; in Python load_rig(..., "
             "image_size=(1280, 720))"
         )
     return replace(rig, cameras=tuple(cameras))
 
 
-def held_by(rig: ForeignRig, holds: Holds, title: str, limit: float = LIMIT) -> Held:
+def fit_to_target(rig: ForeignRig, holds: Holds, title: str, limit: float = LIMIT) -> Held:
     """Say every lens in a model of the target.
 
     Raises:
@@ -78,7 +81,7 @@ def held_by(rig: ForeignRig, holds: Holds, title: str, limit: float = LIMIT) -> 
     fits = []
     for camera in rig.cameras:
         assert camera.image_size is not None
-        fit = fitted(camera.lens, camera.image_size, holds)
+        fit = fit_lens(camera.lens, camera.image_size, holds)
         if not fit.worst <= limit:
             off = f"by {fit.worst:.3g} px" if np.isfinite(fit.worst) else "by any amount in a part of the image"
             raise RefusedError(
@@ -100,7 +103,7 @@ def describe_lens(lens: Lens) -> str:
 
 
 def to_camera_rig(rig: ForeignRig, name: str) -> CameraRig:
-    """Make a `CameraRig` of a rig in millimetres whose lenses it can say (`held_by`); `name` is for one without.
+    """Make a `CameraRig` of a rig in millimetres whose lenses it can say (`fit_to_target`); `name` is for one without.
 
     Raises:
         InputError: a value that no rig has.
@@ -109,13 +112,13 @@ def to_camera_rig(rig: ForeignRig, name: str) -> CameraRig:
     def column(values: list[Any]) -> torch.Tensor:
         return torch.tensor(np.array(values), dtype=torch.float64)
 
-    models = [_model_of(camera.lens) for camera in rig.cameras]
-    width = lens_width(named_lenses(models))
+    models = [_model_name(camera.lens) for camera in rig.cameras]
+    width = lens_width(lens_label(models))
     values: dict[str, Any] = {
         "focal_length": column([camera.lens.focal_length for camera in rig.cameras]),
         "principal_point": column([camera.lens.principal_point for camera in rig.cameras]),
-        "distortion": column([camera.lens.padded(width) for camera in rig.cameras]),
-        "lens_model": named_lenses(models),
+        "distortion": column([camera.lens.pad(width) for camera in rig.cameras]),
+        "lens_model": lens_label(models),
         "cam_from_rig": RigidTransform(
             column([camera.rotation for camera in rig.cameras]), column([camera.translation for camera in rig.cameras])
         ),
@@ -127,7 +130,7 @@ def to_camera_rig(rig: ForeignRig, name: str) -> CameraRig:
     return made
 
 
-def _model_of(lens: Lens) -> str:
+def _model_name(lens: Lens) -> str:
     """The name that a lens has in a rig file: the plainest model that says it."""
     if lens.model == "fisheye":
         return FISHEYE

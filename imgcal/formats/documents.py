@@ -16,7 +16,7 @@ from xml.parsers import expat
 
 from imgcal.errors import InputError
 from imgcal.io import is_prose, looks_like, parse_foreign_yaml, read_json
-from imgcal.messages import quoted
+from imgcal.messages import quote
 
 MOST_BYTES = 2**26
 MOST_TOML = 2**20  # the parser needs a square of what a hostile one nests; a camera has half a kilobyte
@@ -85,9 +85,9 @@ def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
 
 def parse_document(content: bytes, path: Path) -> Document:
     """Do the work of `read_document` on what a file holds."""
-    text = _decoded(content, path)
+    text = _decode_text(content, path)
     try:
-        return _parsed(text, path)
+        return _parse(text, path)
     except InputError:
         if not is_prose(text):
             raise
@@ -95,7 +95,7 @@ def parse_document(content: bytes, path: Path) -> Document:
         raise InputError(f"{path}: found {looks_like(text)}, expected {expected}") from None
 
 
-def _parsed(text: str, path: Path) -> Document:
+def _parse(text: str, path: Path) -> Document:
     first = next((line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
     if first.startswith("<"):
         return Document(path, "xml", parse_xml(text, str(path)))
@@ -164,7 +164,7 @@ class _Builder:
         raise InputError(f"{self.where}: found an XML entity, expected plain elements")
 
 
-def _decoded(content: bytes, path: Path) -> str:
+def _decode_text(content: bytes, path: Path) -> str:
     return decode(content, path)[0]
 
 
@@ -202,7 +202,7 @@ def _toml(text: str, where: str) -> Any:
     try:
         value = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{where}: not valid TOML: {quoted(str(error))}") from error
+        raise InputError(f"{where}: not valid TOML: {quote(str(error))}") from error
     except (RecursionError, ValueError) as error:
         raise InputError(f"{where}: not valid TOML: nested too deeply, or a number of too many digits") from error
     return value
@@ -213,7 +213,7 @@ def _json_or_python(text: str, path: Path) -> Document:
     try:
         return Document(path, "json", read_json(text))
     except ValueError as error:
-        problem = quoted(str(error))
+        problem = quote(str(error))
     try:
         return Document(path, "python", _literal(text))
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError) as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from imgcal.formats import places
-from imgcal.formats.file_storage import merged, place_of, storage_text
+from imgcal.formats.file_storage import key_place, merge_storages, storage_text
 from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.format import Files, Format
@@ -16,32 +16,32 @@ from imgcal.formats.values import (
     camera_matrix,
     coefficients,
     image_size,
-    named,
+    name_cameras,
     number,
     numbers,
     rotation,
     text,
-    vector_of_rotation,
+    vector_from_rotation,
 )
 
 TITLE = "EasyMocap intri.yml and extri.yml"
 
 
 def _recognizes(source: Source) -> bool:
-    values = merged(source)
-    inside, outside = set(_named_by(values, "K_")), set(_named_by(values, "Rot_", "R_"))
+    values = merge_storages(source)
+    inside, outside = set(_find_names(values, "K_")), set(_find_names(values, "Rot_", "R_"))
     return bool(inside & outside or ((inside or outside) and isinstance(values.get("names"), list)))
 
 
-def _named_by(values: dict[str, Any], *prefixes: str) -> list[str]:
+def _find_names(values: dict[str, Any], *prefixes: str) -> list[str]:
     """The cameras of keys with a prefix."""
     found = [key[len(p) :] for p in prefixes for key in values if key.startswith(p) and isinstance(values[key], dict)]
     return list(dict.fromkeys(found))
 
 
 def _read(source: Source) -> ForeignRig:
-    values = merged(source)
-    inside, outside = _named_by(values, "K_"), [n for n in _named_by(values, "Rot_", "R_") if f"T_{n}" in values]
+    values = merge_storages(source)
+    inside, outside = _find_names(values, "K_"), [n for n in _find_names(values, "Rot_", "R_") if f"T_{n}" in values]
     if not outside:
         raise FormatError("intri.yml alone: give extri.yml, too, or the folder of both")
     if not inside:
@@ -51,9 +51,11 @@ def _read(source: Source) -> ForeignRig:
     order = sorted(set(inside) & set(outside), key=lambda name: listed.index(name) if name in listed else len(listed))
     notes = ["metres, as EasyMocap has them"]
     if lost := sorted(set(inside) ^ set(outside)):
-        notes.append(f"{named(lost)}: left out, not in both files")
+        notes.append(f"{name_cameras(lost)}: left out, not in both files")
     if not order:
-        raise FormatError(f"no camera is in both files: intrinsics of {named(inside)}, poses of {named(outside)}")
+        raise FormatError(
+            f"no camera is in both files: intrinsics of {name_cameras(inside)}, poses of {name_cameras(outside)}"
+        )
     cameras = []
     for name in order:
         focal, centre, skew = camera_matrix(values[f"K_{name}"], f"K_{name}")
@@ -73,7 +75,7 @@ def _read(source: Source) -> ForeignRig:
         for key in (f"Rot_{name}", f"R_{name}"):
             if key in values:
                 parts[key] = places.rotation_like(numbers(values[key], key))
-        found = tuple(Place(*place_of(source, key), of) for key, of in parts.items() if key in values)
+        found = tuple(Place(*key_place(source, key), of) for key, of in parts.items() if key in values)
         cameras.append(ForeignCamera(name, lens, size, rotation(turn, f"Rot_{name}"), moved, found))
     return ForeignRig(FORMAT.name, tuple(cameras), "m", "the file's world", tuple(notes))
 
@@ -90,10 +92,10 @@ def _write(rig: ForeignRig) -> Files:
     for camera in rig.cameras:
         name = camera.name
         intri[f"K_{name}"] = camera.lens.matrix
-        intri[f"dist_{name}"] = array(camera.lens.padded(5), (1, 5), "dist")
+        intri[f"dist_{name}"] = array(camera.lens.pad(5), (1, 5), "dist")
         if camera.image_size:
             intri[f"H_{name}"], intri[f"W_{name}"] = camera.image_size[1], camera.image_size[0]
-        extri[f"R_{name}"] = vector_of_rotation(camera.rotation)[:, None]
+        extri[f"R_{name}"] = vector_from_rotation(camera.rotation)[:, None]
         extri[f"Rot_{name}"] = camera.rotation
         extri[f"T_{name}"] = camera.translation[:, None]
     return {"intri.yml": storage_text(intri), "extri.yml": storage_text(extri)}

@@ -26,7 +26,7 @@ def storages(source: Source) -> list[tuple[Document, dict[str, Any]]]:
     return found
 
 
-def merged(source: Source) -> dict[str, Any]:
+def merge_storages(source: Source) -> dict[str, Any]:
     """The keys and values of all FileStorages together; the first that has a key counts."""
     together: dict[str, Any] = {}
     for _, values in storages(source):
@@ -35,7 +35,7 @@ def merged(source: Source) -> dict[str, Any]:
     return together
 
 
-def place_of(source: Source, key: str) -> tuple[Path, tuple[str, ...]]:
+def key_place(source: Source, key: str) -> tuple[Path, tuple[str, ...]]:
     """Where the numbers of a key stand: the document that counts, and the keys to them."""
     document, values = next((document, values) for document, values in storages(source) if key in values)
     outer = (ROOT,) if document.kind == "xml" else ()
@@ -78,9 +78,9 @@ def storage_text(content: dict[str, Any]) -> bytes:
             lines += [f"{key}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", f"   dt: {kind}"]
             lines += [f"   data: [ {data} ]"]
         elif isinstance(value, list):
-            lines += [f"{key}:", *(f"   - {_quoted(str(entry))}" for entry in value)]
+            lines += [f"{key}:", *(f"   - {_quote(str(entry))}" for entry in value)]
         else:
-            lines.append(f"{key}: {_quoted(value) if isinstance(value, str) else _number(value)}")
+            lines.append(f"{key}: {_quote(value) if isinstance(value, str) else _number(value)}")
     return ("\n".join(lines) + "\n").encode()
 
 
@@ -89,7 +89,7 @@ def _number(value: float) -> str:
     return text.replace(".0", ".") if text.endswith(".0") else text
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 

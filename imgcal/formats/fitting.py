@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imgcal.formats.lens import Array, Lens, distorted
+from imgcal.formats.lens import Array, Lens, distort
 
 GRID = 33  # pixels along each side of the image, border included
 
@@ -35,7 +35,7 @@ class Fit:
     exact: bool
 
 
-def fitted(lens: Lens, image_size: tuple[int, int], holds: Holds) -> Fit:
+def fit_lens(lens: Lens, image_size: tuple[int, int], holds: Holds) -> Fit:
     """Say a lens in another model.
 
     Args:
@@ -48,34 +48,34 @@ def fitted(lens: Lens, image_size: tuple[int, int], holds: Holds) -> Fit:
     """
     if holds.exactly(lens):
         return Fit(replace(lens, model="opencv") if lens.model == "to_ideal" else lens, 0.0, 0.0, True)
-    uv = pixels_of(image_size, GRID)
+    uv = pixel_grid(image_size, GRID)
     rays = lens.rays(uv)
     if not np.isfinite(rays).all():
         return Fit(lens, np.inf, np.inf, False)
     tried = [_opencv(lens, uv, rays, holds.opencv[-1])] if holds.opencv else []
     if holds.fisheye:
         tried.append(_fisheye(lens, uv, rays))
-    fits = [_judged(lens, candidate, image_size) for candidate in tried]
+    fits = [_judge(lens, candidate, image_size) for candidate in tried]
     return min(fits, key=lambda fit: fit.worst)
 
 
-def pixels_of(image_size: tuple[int, int], count: int) -> Array:
+def pixel_grid(image_size: tuple[int, int], count: int) -> Array:
     """A grid of pixels over an image, its border included: (count^2, 2)."""
     sides = [np.linspace(-0.5, side - 0.5, count) for side in image_size]
     return np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
 
 
-def _judged(lens: Lens, candidate: Lens, image_size: tuple[int, int]) -> Fit:
+def _judge(lens: Lens, candidate: Lens, image_size: tuple[int, int]) -> Fit:
     """Compare on a finer grid than the fit's, with its own points between."""
-    uv = pixels_of(image_size, 2 * GRID)
+    uv = pixel_grid(image_size, 2 * GRID)
     away = np.linalg.norm(candidate.project(lens.rays(uv)) - uv, axis=-1)
-    back = candidate.rays(pixels_of(image_size, 9))  # its fold must lie outside
+    back = candidate.rays(pixel_grid(image_size, 9))  # its fold must lie outside
     if not np.isfinite(away).all() or not np.isfinite(back).all():
         return Fit(candidate, np.inf, np.inf, False)
     return Fit(candidate, float(away.max()), float(np.sqrt((away**2).mean())), False)
 
 
-def fitted_like(
+def fit_lens_like(
     lens: Lens, image_size: tuple[int, int], like: Lens, one_focal_length: bool = False, limit: float = np.inf
 ) -> Fit:
     """Say a lens in the model, and with as many coefficients, that another one has.
@@ -93,20 +93,20 @@ def fitted_like(
     count = len(like.coefficients)
     sayable = not one_focal_length or lens.focal_length[0] == lens.focal_length[1]
     if like.model == lens.model and lens.length <= count and sayable and not lens.skew:
-        return Fit(replace(lens, coefficients=tuple(lens.padded(count))), 0.0, 0.0, True)
-    uv = pixels_of(image_size, GRID)
+        return Fit(replace(lens, coefficients=tuple(lens.pad(count))), 0.0, 0.0, True)
+    uv = pixel_grid(image_size, GRID)
     rays = lens.rays(uv)
     if not np.isfinite(rays).all():
         return Fit(lens, np.inf, np.inf, False)
     if like.model == "to_ideal":
         radial = min(count, 3)
-        tied = _judged(lens, _to_ideal(lens, uv, rays, radial, like, False), image_size)
+        tied = _judge(lens, _to_ideal(lens, uv, rays, radial, like, False), image_size)
         if tied.worst <= limit or count < 5:
             return tied
-        free = _judged(lens, _to_ideal(lens, uv, rays, radial, like, True), image_size)
+        free = _judge(lens, _to_ideal(lens, uv, rays, radial, like, True), image_size)
         return min((tied, free), key=lambda fit: fit.worst)
     fit = _fisheye if like.model == "fisheye" else _opencv
-    return _judged(lens, fit(lens, uv, rays, count, one_focal_length), image_size)
+    return _judge(lens, fit(lens, uv, rays, count, one_focal_length), image_size)
 
 
 def _to_ideal(lens: Lens, uv: Array, rays: Array, count: int, like: Lens, free: bool) -> Lens:
@@ -123,14 +123,14 @@ def _to_ideal(lens: Lens, uv: Array, rays: Array, count: int, like: Lens, free: 
         return np.stack((2 * uv[:, 0] + du * factor - fx * x - cx, 2 * uv[:, 1] + dv * factor - fy * y - cy), axis=-1)
 
     start = [*lens.focal_length, *lens.principal_point]
-    start += [value * unit ** (2 * n + 2) for n, value in enumerate(like.padded(count))]
+    start += [value * unit ** (2 * n + 2) for n, value in enumerate(like.pad(count))]
     start += [0.0, 0.0] if free else []
     values = _least_squares(predicted, uv, start)
     ks = [value / unit ** (2 * n + 2) for n, value in enumerate(values[4 : 4 + count])]
     return Lens((values[0], values[1]), (values[2], values[3]), (*ks, *values[4 + count :]), "to_ideal")
 
 
-def _with_focal_lengths(values: Array, one: bool) -> Array:
+def _repeat_focal_length(values: Array, one: bool) -> Array:
     """Fx, fy, cx, cy and so on, of values in which fy may be left out."""
     return np.concatenate((values[:1], values)) if one else values
 
@@ -138,18 +138,18 @@ def _with_focal_lengths(values: Array, one: bool) -> Array:
 def _opencv(lens: Lens, uv: Array, rays: Array, count: int, one_focal_length: bool = False) -> Lens:
     """Fit focal lengths, principal point and `count` coefficients."""
     count = min(count, 8)  # thin prisms and tilts are small, and hard to tell from the rest
-    start = lens.padded(8) if lens.model == "opencv" else [0.0] * 8
+    start = lens.pad(8) if lens.model == "opencv" else [0.0] * 8
     start = [*start[: min(count, 5)], *[0.0] * (count - min(count, 5))]
     x, y = rays[:, 0], rays[:, 1]
 
     def predicted(values: Array) -> Array:
-        fx, fy, cx, cy, *coefficients = _with_focal_lengths(values, one_focal_length)
-        u, v = distorted(x, y, [*coefficients, *[0.0] * (14 - count)])
+        fx, fy, cx, cy, *coefficients = _repeat_focal_length(values, one_focal_length)
+        u, v = distort(x, y, [*coefficients, *[0.0] * (14 - count)])
         return np.stack((fx * u + cx, fy * v + cy), axis=-1)
 
     focal = lens.focal_length[: 1 if one_focal_length else 2]
     found = _least_squares(predicted, uv, [*focal, *lens.principal_point, *start])
-    values = _with_focal_lengths(np.array(found), one_focal_length).tolist()
+    values = _repeat_focal_length(np.array(found), one_focal_length).tolist()
     return Lens((values[0], values[1]), (values[2], values[3]), tuple(values[4:]))
 
 
@@ -159,16 +159,16 @@ def _fisheye(lens: Lens, uv: Array, rays: Array, count: int = 4, one_focal_lengt
     angle = np.arctan(radius)
 
     def predicted(values: Array) -> Array:
-        fx, fy, cx, cy, *ks = _with_focal_lengths(values, one_focal_length)
+        fx, fy, cx, cy, *ks = _repeat_focal_length(values, one_focal_length)
         ks = [*ks, *[0.0] * (4 - count)]
         square = angle * angle
         bent = angle * (1 + square * (ks[0] + square * (ks[1] + square * (ks[2] + square * ks[3])))) / radius
         return np.stack((fx * x * bent + cx, fy * y * bent + cy), axis=-1)
 
-    start = (lens.padded(4) if lens.model == "fisheye" else [0.3, 0.1, 0.0, 0.0])[:count]
+    start = (lens.pad(4) if lens.model == "fisheye" else [0.3, 0.1, 0.0, 0.0])[:count]
     focal = lens.focal_length[: 1 if one_focal_length else 2]
     found = _least_squares(predicted, uv, [*focal, *lens.principal_point, *start])
-    values = _with_focal_lengths(np.array(found), one_focal_length).tolist()
+    values = _repeat_focal_length(np.array(found), one_focal_length).tolist()
     return Lens((values[0], values[1]), (values[2], values[3]), tuple(values[4:]), "fisheye")
 
 

@@ -49,7 +49,7 @@ class ForeignCamera:
         """Project points of the rig's frame by the lens of the file: (N, 3) -> (N, 2) pixels."""
         return self.lens.project(self.in_camera(points_rig))
 
-    def seen_from(self, other: ForeignCamera) -> ForeignCamera:
+    def in_frame_of(self, other: ForeignCamera) -> ForeignCamera:
         """The same camera in the frame of another one."""
         rotation = self.rotation @ other.rotation.T
         return replace(self, rotation=rotation, translation=self.translation - rotation @ other.translation)
@@ -83,14 +83,14 @@ class ForeignRig:
         """The cameras' names."""
         return [camera.name for camera in self.cameras]
 
-    def scaled(self, factor: float, unit: str) -> ForeignRig:
+    def scale(self, factor: float, unit: str) -> ForeignRig:
         """The same rig with every length `factor` times as many of another unit."""
         cameras = tuple(replace(camera, translation=camera.translation * factor) for camera in self.cameras)
         return replace(self, cameras=cameras, unit=unit)
 
-    def seen_from_first(self, root: int = 0) -> ForeignRig:
+    def in_camera_frame(self, root: int = 0) -> ForeignRig:
         """The same rig in the frame of its first camera, or of another one."""
         first = self.cameras[root]
-        cameras = [camera.seen_from(first) for camera in self.cameras]
+        cameras = [camera.in_frame_of(first) for camera in self.cameras]
         cameras[root] = replace(first, rotation=np.eye(3), translation=np.zeros(3))
         return replace(self, cameras=tuple(cameras), frame=f"camera {first.name}")

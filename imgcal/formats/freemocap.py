@@ -10,22 +10,22 @@ from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignRig
 from imgcal.formats.format import Files, Format
 from imgcal.formats.source import Source
-from imgcal.formats.toml_cameras import cameras_of, has_tables, tables_of, toml_key, toml_text
+from imgcal.formats.toml_cameras import find_tables, has_tables, read_cameras, toml_key, toml_text
 
 TITLE = "FreeMoCap camera calibration"
 WORLD = ("world_position", "world_orientation")
 
 
 def _recognizes(source: Source) -> bool:
-    tables = tables_of(source)
+    tables = find_tables(source)
     return tables is not None and any(key in table for table in tables.cameras.values() for key in WORLD)
 
 
 def _read(source: Source) -> ForeignRig:
-    tables = tables_of(source)
+    tables = find_tables(source)
     assert tables is not None
     notes = ["millimetres, as FreeMoCap's boards are measured"]
-    cameras = cameras_of(tables.cameras, notes)
+    cameras = read_cameras(tables.cameras, notes)
     plane = tables.metadata.get("groundplane_applied") or "groundplane_calibration" in tables.metadata
     if plane:
         notes.append("the world is the board that lay on the ground")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from imgcal.formats import places
-from imgcal.formats.chains import Link, Pose, from_root, inverse, pose_of_matrix
+from imgcal.formats.chains import Link, Pose, follow_links, inverse, pose_from_matrix
 from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.format import Files, Format
@@ -18,7 +18,7 @@ from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
 from imgcal.formats.values import array, coefficients, focal_length, image_size, mapping, numbers, text
 from imgcal.io import Flow, yaml_text
-from imgcal.messages import listed
+from imgcal.messages import list_names
 
 TITLE = "Kalibr camchain"
 CAMERA = re.compile(r"cam(\d+)")
@@ -35,15 +35,15 @@ DISTORTIONS = {
 def _recognizes(source: Source) -> bool:
     return any(
         CAMERA.fullmatch(key) and isinstance(value, dict) and "intrinsics" in value
-        for key, value in source.merged().items()
+        for key, value in source.merge().items()
     )
 
 
 def _read(source: Source) -> ForeignRig:
-    values = source.merged()
-    twice = next((key for key in values if CAMERA.fullmatch(key) and len(_with(source, key)) > 1), None)
+    values = source.merge()
+    twice = next((key for key in values if CAMERA.fullmatch(key) and len(_files_with_key(source, key)) > 1), None)
     if twice is not None:
-        raise FormatError(f"{twice} stands in {listed(_with(source, twice))}: give one of these files")
+        raise FormatError(f"{twice} stands in {list_names(_files_with_key(source, twice))}: give one of these files")
     entries = {key: mapping(values[key], key) for key in values if CAMERA.fullmatch(key)}
     names = sorted(entries, key=lambda name: int(name[3:]))
     lenses = {name: _lens(name, entries[name]) for name in names}
@@ -52,9 +52,9 @@ def _read(source: Source) -> ForeignRig:
     notes = ["T_cn_cnm1 takes points from the camera before to this one; metres, as Kalibr's targets are"]
     direct = [link for link in links if "imu" not in (link.destination, link.source)]
     try:
-        poses = from_root(root, names, direct)
+        poses = follow_links(root, names, direct)
     except FormatError:
-        poses = from_root(root, names, links)
+        poses = follow_links(root, names, links)
         notes.append("some cameras are linked by the IMU only (T_cam_imu)")
     cameras = tuple(
         ForeignCamera(name, lenses[name], image_size(entries[name].get("resolution"), name), *poses[name])
@@ -68,7 +68,7 @@ def _places(source: Source, values: dict[str, Any], camera: ForeignCamera, names
     """Where a camera's numbers stand; poses to the IMU go along with the camera."""
     name, entry = camera.name, values[camera.name]
     before = (camera.rotation, camera.translation)
-    path = _path_of(source, name)
+    path = _find_path(source, name)
     found = [
         Place(path, (name, "intrinsics"), places.focal_and_centre),
         Place(path, (name, "distortion_coeffs"), places.coefficients(len(camera.lens.coefficients))),
@@ -77,35 +77,35 @@ def _places(source: Source, values: dict[str, Any], camera: ForeignCamera, names
         found.append(Place(path, (name, "T_cn_cnm1"), places.matrix_rows, relative_to=names.index(name) - 1))
     if "T_cam_imu" in entry:
         pose = _pose(entry["T_cam_imu"], "T_cam_imu")
-        found.append(Place(path, (name, "T_cam_imu"), places.carried(before, pose, places.matrix_rows)))
+        found.append(Place(path, (name, "T_cam_imu"), places.carry_pose(before, pose, places.matrix_rows)))
     elif "T_imu_cam" in entry:
         pose = inverse(_pose(entry["T_imu_cam"], "T_imu_cam"))
-        found.append(Place(path, (name, "T_imu_cam"), places.carried(before, pose, places.inverse_rows)))
+        found.append(Place(path, (name, "T_imu_cam"), places.carry_pose(before, pose, places.inverse_rows)))
     groups = [((), values), *(((other,), values[other]) for other in names)]
     for outer, group in groups:
         for key, value in group.items():
             between = BETWEEN.fullmatch(key)
             if between is None or value is None or name not in between.groups():
                 continue
-            path = _path_of(source, outer[0] if outer else key)
+            path = _find_path(source, outer[0] if outer else key)
             if between[1] == name and between[2] in names:
                 of: places.Numbers = places.matrix_rows
                 base: int | None = names.index(between[2])
             elif between[2] == name and between[1] in names:
                 continue  # it is among the other camera's
             elif between[1] == name:
-                of, base = places.carried(before, _pose(value, key), places.matrix_rows), None
+                of, base = places.carry_pose(before, _pose(value, key), places.matrix_rows), None
             else:
-                of, base = places.carried(before, inverse(_pose(value, key)), places.inverse_rows), None
+                of, base = places.carry_pose(before, inverse(_pose(value, key)), places.inverse_rows), None
             found.append(Place(path, (*outer, key), of, relative_to=base))
     return tuple(found)
 
 
-def _path_of(source: Source, key: str) -> Path:
+def _find_path(source: Source, key: str) -> Path:
     return next(document.path for document, values in source.mappings if key in values)
 
 
-def _with(source: Source, key: str) -> list[str]:
+def _files_with_key(source: Source, key: str) -> list[str]:
     """Names of the files with a key."""
     return [document.path.name for document, values in source.mappings if key in values]
 
@@ -155,7 +155,7 @@ def _node(name: str) -> str:
 
 def _pose(value: Any, what: str) -> Pose:
     rows = len(numbers(value, what)) // 4
-    return pose_of_matrix(array(value, (4 if rows == 4 else 3, 4), what), what)
+    return pose_from_matrix(array(value, (4 if rows == 4 else 3, 4), what), what)
 
 
 def _write(rig: ForeignRig) -> Files:
@@ -172,7 +172,7 @@ def _write(rig: ForeignRig) -> Files:
         entry |= {
             "cam_overlaps": Flow(other for other in range(len(rig.cameras)) if other != number),
             "camera_model": "pinhole",
-            "distortion_coeffs": Flow(camera.lens.padded(4)),
+            "distortion_coeffs": Flow(camera.lens.pad(4)),
             "distortion_model": "equidistant" if fisheye else "radtan",
             "intrinsics": Flow([*camera.lens.focal_length, *camera.lens.principal_point]),
             "resolution": Flow(camera.image_size or ()),

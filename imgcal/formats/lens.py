@@ -46,7 +46,7 @@ class Lens:
         (fx, fy), (cx, cy) = self.focal_length, self.principal_point
         return np.array([[fx, self.skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
-    def padded(self, count: int) -> list[float]:
+    def pad(self, count: int) -> list[float]:
         """The coefficients, filled with zeros or cut to `count`."""
         return [float(value) for value in (*self.coefficients, *(0.0,) * count)[:count]]
 
@@ -63,23 +63,23 @@ class Lens:
         if self.model == "fisheye":
             radius = np.hypot(x, y)
             angle = np.arctan2(radius, z)
-            bent = _fisheye(angle, self.padded(4))
+            bent = _fisheye(angle, self.pad(4))
             scale = np.where(radius > TINY, bent / np.maximum(radius, TINY), 1.0 / np.where(z == 0, 1.0, z))
             return self._pixels(x * scale, y * scale)
         with np.errstate(divide="ignore", invalid="ignore"):
             x, y = np.where(z > 0, x / z, np.nan), np.where(z > 0, y / z, np.nan)
         if self.model == "to_ideal":
             return self._from_ideal(self._pixels(x, y))
-        return self._pixels(*distorted(x, y, self.padded(14)))
+        return self._pixels(*distort(x, y, self.pad(14)))
 
     def rays(self, uv: Array) -> Array:
         """Find the ray of each pixel: (N, 2) -> (N, 3) with z = 1; nan where the model has none (beyond its fold)."""
         if self.model == "to_ideal":
-            return _with_one(self._plane(self._to_ideal(uv)))
+            return _append_one(self._plane(self._to_ideal(uv)))
         wanted = self._plane(uv)
         if self.model == "fisheye":
-            return _with_one(_straightened(wanted, self.padded(4)))
-        return _with_one(undistorted(wanted, self.padded(14)))
+            return _append_one(_undistort_fisheye(wanted, self.pad(4)))
+        return _append_one(undistort(wanted, self.pad(14)))
 
     def _pixels(self, x: Array, y: Array) -> Array:
         (fx, fy), (cx, cy) = self.focal_length, self.principal_point
@@ -94,7 +94,7 @@ class Lens:
     @property
     def _centre(self) -> Array:
         """Of a distortion `to_ideal`: (2,) pixels."""
-        return np.array(self.principal_point) + self.padded(5)[3:]
+        return np.array(self.principal_point) + self.pad(5)[3:]
 
     def _radius(self, offset: Array) -> Array:
         """Distance from the centre in pixels of the u axis."""
@@ -103,14 +103,14 @@ class Lens:
     def _to_ideal(self, uv: Array) -> Array:
         offset = uv - self._centre
         square = self._radius(offset) ** 2
-        k1, k2, k3 = self.padded(3)
+        k1, k2, k3 = self.pad(3)
         return uv + offset * (square * (k1 + square * (k2 + square * k3)))[:, None]
 
     def _from_ideal(self, ideal: Array) -> Array:
         """Invert `_to_ideal` along each radius."""
         offset = ideal - self._centre
         wanted = self._radius(offset)
-        k1, k2, k3 = self.padded(3)
+        k1, k2, k3 = self.pad(3)
         radius = np.zeros_like(wanted)
         sound = np.isfinite(wanted)
         with np.errstate(all="ignore"):
@@ -126,7 +126,7 @@ class Lens:
         return self._centre + offset * scale[:, None]
 
 
-def distorted(x: Any, y: Any, coefficients: Sequence[Any]) -> tuple[Any, Any]:
+def distort(x: Any, y: Any, coefficients: Sequence[Any]) -> tuple[Any, Any]:
     """OpenCV's model of 14 coefficients on the z = 1 plane; x and y may be complex, for derivatives."""
     k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tx, ty = coefficients
     square = x * x + y * y
@@ -146,26 +146,26 @@ def distorted(x: Any, y: Any, coefficients: Sequence[Any]) -> tuple[Any, Any]:
     )
 
 
-def undistorted(wanted: Array, coefficients: list[float]) -> Array:
-    """Invert `distorted` by Newton steps, followed from the centre outwards: (N, 2) -> (N, 2), nan beyond the fold."""
+def undistort(wanted: Array, coefficients: list[float]) -> Array:
+    """Invert `distort` by Newton steps, followed from the centre outwards: (N, 2) -> (N, 2), nan beyond the fold."""
     tiny = 1e-200
     at = np.zeros_like(wanted)
     sound = np.ones(len(wanted), dtype=bool)
-    centre = np.stack(distorted(np.zeros(1), np.zeros(1), coefficients), axis=-1)  # a tilted sensor moves it
+    centre = np.stack(distort(np.zeros(1), np.zeros(1), coefficients), axis=-1)  # a tilted sensor moves it
     with np.errstate(all="ignore"):
         for step in range(1, STEPS + 1):
             target = centre + (wanted - centre) * (step / STEPS)
             for _ in range(NEWTON if step == STEPS else 4):
                 x, y = at.T
-                u_x, v_x = distorted(x + 1j * tiny, y, coefficients)
-                u_y, v_y = distorted(x, y + 1j * tiny, coefficients)
+                u_x, v_x = distort(x + 1j * tiny, y, coefficients)
+                u_y, v_y = distort(x, y + 1j * tiny, coefficients)
                 a, b, c, d = u_x.imag / tiny, u_y.imag / tiny, v_x.imag / tiny, v_y.imag / tiny
                 determinant = a * d - b * c
                 miss_u, miss_v = u_x.real - target[:, 0], v_x.real - target[:, 1]
                 move = np.stack((d * miss_u - b * miss_v, a * miss_v - c * miss_u), axis=-1) / determinant[:, None]
                 at = at - move
             sound &= (determinant > 0) & (a + d > 0)
-        miss = np.abs(np.stack(distorted(at[:, 0], at[:, 1], coefficients), axis=-1) - wanted).max(axis=-1)
+        miss = np.abs(np.stack(distort(at[:, 0], at[:, 1], coefficients), axis=-1) - wanted).max(axis=-1)
         sound &= miss < CLOSE * (1 + np.abs(wanted).max(axis=-1))
     return np.where(sound[:, None], at, np.nan)
 
@@ -176,7 +176,7 @@ def _fisheye(angle: Array, coefficients: list[float]) -> Array:
     return angle * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
 
 
-def _straightened(wanted: Array, coefficients: list[float]) -> Array:
+def _undistort_fisheye(wanted: Array, coefficients: list[float]) -> Array:
     """Invert the fisheye: (N, 2) on the image -> (N, 2) on the z = 1 plane, nan beyond the fold or 89.5 degrees."""
     k1, k2, k3, k4 = coefficients
     radius = np.hypot(*wanted.T)
@@ -195,5 +195,5 @@ def _straightened(wanted: Array, coefficients: list[float]) -> Array:
     return np.where(sound[:, None], wanted * scale[:, None], np.nan)
 
 
-def _with_one(xy: Array) -> Array:
+def _append_one(xy: Array) -> Array:
     return np.concatenate((xy, np.ones((len(xy), 1))), axis=-1)

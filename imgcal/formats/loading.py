@@ -7,7 +7,7 @@ from pathlib import Path
 
 from imgcal import io
 from imgcal.errors import InputError
-from imgcal.formats.conversion import NATIVE, held_by, to_camera_rig, with_image_sizes
+from imgcal.formats.conversion import NATIVE, fill_image_sizes, fit_to_target, to_camera_rig
 from imgcal.formats.foreign_rig import ForeignRig
 from imgcal.formats.limits import LIMIT
 from imgcal.formats.registry import is_foreign, read_foreign_lenses, read_foreign_rig
@@ -56,7 +56,7 @@ def load_rig(
         return io.load_rig(path)
     if path.exists() and not is_foreign(path):
         raise InputError(f"{path}: a rig file of our own says its unit, image sizes and format itself")
-    return _held(in_millimetres(read_foreign_rig(path, format), str(path), unit), path, image_size, fit_limit)
+    return _convert_lenses(in_millimetres(read_foreign_rig(path, format), str(path), unit), path, image_size, fit_limit)
 
 
 def load_cameras(
@@ -91,11 +91,13 @@ def load_cameras(
     stated = image_size is not None or format is not None
     if not stated and not (path.exists() and is_foreign(path)):
         return io.load_cameras(path)
-    return io.unplaced(_held(read_foreign_lenses(path, format), path, image_size, fit_limit))
+    return io.drop_poses(_convert_lenses(read_foreign_lenses(path, format), path, image_size, fit_limit))
 
 
-def _held(rig: ForeignRig, path: Path, image_size: Size | Mapping[str, Size] | None, fit_limit: float) -> CameraRig:
+def _convert_lenses(
+    rig: ForeignRig, path: Path, image_size: Size | Mapping[str, Size] | None, fit_limit: float
+) -> CameraRig:
     """Say a rig in lenses of ours, its image sizes filled in."""
     sizes = image_size if isinstance(image_size, Mapping) else {} if image_size is None else {"": image_size}
-    held = held_by(with_image_sizes(rig, str(path), sizes), NATIVE, "a rig of ours", fit_limit)
-    return to_camera_rig(held.rig, io.title_of(path if path.is_file() else path.resolve()))
+    held = fit_to_target(fill_image_sizes(rig, str(path), sizes), NATIVE, "a rig of ours", fit_limit)
+    return to_camera_rig(held.rig, io.title_from_name(path if path.is_file() else path.resolve()))

@@ -16,7 +16,7 @@ from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, P
 from imgcal.formats.format import Format
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
-from imgcal.formats.values import focal_length, image_size, named, nearest_rotation, number
+from imgcal.formats.values import focal_length, image_size, name_cameras, nearest_rotation, number
 
 TITLE = "OptiTrack Motive calibration (.mcal)"
 COEFFICIENTS = ("k1", "k2", "TangentialX", "TangentialY", "k3")  # in OpenCV's order
@@ -49,7 +49,7 @@ def _read(source: Source) -> ForeignRig:
         "whether pixel centres lie at 0 or 0.5 is not documented: up to half a pixel is open",
     ]
     if lost:
-        notes.append(f"{named(lost)}: left out, not calibrated")
+        notes.append(f"{name_cameras(lost)}: left out, not calibrated")
     return ForeignRig(FORMAT.name, tuple(cameras), "m", "Motive's world (y up)", tuple(notes))
 
 

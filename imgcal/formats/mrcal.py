@@ -16,7 +16,15 @@ from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, P
 from imgcal.formats.format import Files, Format
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
-from imgcal.formats.values import array, focal_length, image_size, numbers, rotation_of_vector, text, vector_of_rotation
+from imgcal.formats.values import (
+    array,
+    focal_length,
+    image_size,
+    numbers,
+    rotation_from_vector,
+    text,
+    vector_from_rotation,
+)
 
 TITLE = "mrcal cameramodel"
 COUNTS = {"PINHOLE": 0, "NONE": 0, "OPENCV4": 4, "OPENCV5": 5, "OPENCV8": 8, "OPENCV12": 12}
@@ -64,12 +72,12 @@ def _camera(path: Path, values: dict[str, Any]) -> ForeignCamera:
     size = image_size(values.get("imagersize"), f"{name}: imagersize")
     turned = places.rotation_like(six[:3].tolist())
     count = COUNTS[short]
-    where = [Place(path, ("intrinsics",), lambda one: [*places.focal_and_centre(one), *one.lens.padded(count)])]
+    where = [Place(path, ("intrinsics",), lambda one: [*places.focal_and_centre(one), *one.lens.pad(count)])]
     where += [
         Place(path, (key,), lambda one: [*turned(one), *places.translation(one)])
         for key in ("rt_cam_ref", "extrinsics") if values.get(key) is not None
     ]  # fmt: skip
-    return ForeignCamera(name, lens, size, rotation_of_vector(six[:3]), six[3:], tuple(where))
+    return ForeignCamera(name, lens, size, rotation_from_vector(six[:3]), six[3:], tuple(where))
 
 
 def _write(rig: ForeignRig) -> Files:
@@ -78,8 +86,8 @@ def _write(rig: ForeignRig) -> Files:
         count = next(count for count in (0, 4, 5, 8, 12) if camera.lens.length <= count)
         model = "PINHOLE" if count == 0 else f"OPENCV{count}"
         lens = camera.lens
-        intrinsics = [*lens.focal_length, *lens.principal_point, *lens.padded(count)]
-        pose = np.concatenate((vector_of_rotation(camera.rotation), camera.translation)).tolist()
+        intrinsics = [*lens.focal_length, *lens.principal_point, *lens.pad(count)]
+        pose = np.concatenate((vector_from_rotation(camera.rotation), camera.translation)).tolist()
         files[f"{camera.name}.cameramodel"] = (
             "{\n"
             f"    'lensmodel':  'LENSMODEL_{model}',\n\n"

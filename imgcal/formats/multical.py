@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from imgcal.formats import places
-from imgcal.formats.chains import IDENTITY, Link, Pose, from_root
+from imgcal.formats.chains import IDENTITY, Link, Pose, follow_links
 from imgcal.formats.documents import Document
 from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
@@ -23,7 +23,7 @@ from imgcal.formats.values import (
     coefficients,
     image_size,
     mapping,
-    named,
+    name_cameras,
     numbers,
     rotation,
     text,
@@ -68,10 +68,10 @@ def _read(source: Source) -> ForeignRig:
     posed = [name for name in cameras if name not in lost]
     notes = ["`B_to_A` holds B_from_A, A the master; metres"]
     if lost:
-        notes.append(f"{named(lost)}: left out, without a pose")
+        notes.append(f"{name_cameras(lost)}: left out, without a pose")
     if not links and len(cameras) > 1:
         raise FormatError("camera_poses holds no pose of one camera to another")
-    found = from_root(root, posed, links) if links else {root: IDENTITY}
+    found = follow_links(root, posed, links) if links else {root: IDENTITY}
     made = [ForeignCamera(name, _lens(name, cameras[name]), _size(name, cameras[name]), *found[name]) for name in posed]
     made = [replace(camera, places=_places(document.path, camera, poses, posed)) for camera in made]
     return ForeignRig(FORMAT.name, tuple(made), "m", f"camera {root}", tuple(notes), root=posed.index(root))
@@ -94,7 +94,7 @@ def _places(path: Path, camera: ForeignCamera, poses: dict[str, Any], names: lis
             pose: Pose = rotation(entry["R"], key), array(entry["T"], (3,), key)
             if np.abs(pose[1]).max() > 1e-6 or np.abs(pose[0] - np.eye(3)).max() > 1e-6:
                 found += [
-                    Place(path, ("camera_poses", key, part), places.carried(before, pose, of))
+                    Place(path, ("camera_poses", key, part), places.carry_pose(before, pose, of))
                     for part, of in parts.items()
                 ]
     return tuple(found)
@@ -125,7 +125,7 @@ def _write(rig: ForeignRig) -> Files:
             "model": model,
             "image_size": list(camera.image_size or ()),
             "K": camera.lens.matrix.tolist(),
-            "dist": [camera.lens.padded(count)],
+            "dist": [camera.lens.pad(count)],
         }
         key = camera.name if camera.name == master else f"{camera.name}_to_{master}"
         poses[key] = {"R": camera.rotation.tolist(), "T": camera.translation.tolist()}

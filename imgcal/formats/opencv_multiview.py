@@ -11,25 +11,25 @@ from typing import Any
 import numpy as np
 
 from imgcal.formats import places
-from imgcal.formats.file_storage import is_matrix, matrix, merged, place_of, storage_text
+from imgcal.formats.file_storage import is_matrix, key_place, matrix, merge_storages, storage_text
 from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.format import Files, Format
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
-from imgcal.formats.values import camera_matrix, coefficients, image_size, numbers, rotation, text, vector_of_rotation
+from imgcal.formats.values import camera_matrix, coefficients, image_size, numbers, rotation, text, vector_from_rotation
 
 TITLE = "OpenCV multi-view calibration (FileStorage)"
 PINHOLE, FISHEYE = 0, 1
 
 
 def _recognizes(source: Source) -> bool:
-    values = merged(source)
+    values = merge_storages(source)
     return all(is_matrix(values.get(key)) for key in ("Rs", "Ts", "Ks"))
 
 
 def _read(source: Source) -> ForeignRig:
-    values = merged(source)
+    values = merge_storages(source)
     matrices = numbers(values["Ks"], "Ks")
     count = len(matrices) // 9
     if count == 0 or len(matrices) != 9 * count:
@@ -59,7 +59,7 @@ def _read(source: Source) -> ForeignRig:
             "distortions": (len(distortions[number]), places.coefficients(len(ks))),
         }
         found = tuple(
-            Place(*place_of(source, key), of, first=width * number)
+            Place(*key_place(source, key), of, first=width * number)
             for key, (width, of) in parts.items() if key in values
         )  # fmt: skip
         cameras.append(ForeignCamera(name, lens, size, turned, np.array(shifts[number]), found))
@@ -69,10 +69,10 @@ def _read(source: Source) -> ForeignRig:
 def _write(rig: ForeignRig) -> Files:
     count = 14 if any(camera.lens.length > 5 for camera in rig.cameras) else 5
     content: dict[str, Any] = {
-        "Rs": np.array([vector_of_rotation(camera.rotation) for camera in rig.cameras]),
+        "Rs": np.array([vector_from_rotation(camera.rotation) for camera in rig.cameras]),
         "Ts": np.array([camera.translation for camera in rig.cameras]),
         "Ks": np.array([camera.lens.matrix.ravel() for camera in rig.cameras]),
-        "distortions": np.array([camera.lens.padded(count) for camera in rig.cameras]),
+        "distortions": np.array([camera.lens.pad(count) for camera in rig.cameras]),
         "models": np.array([[FISHEYE if camera.lens.model == "fisheye" else PINHOLE] for camera in rig.cameras]),
         "image_sizes": np.array([camera.image_size for camera in rig.cameras]),
         "cam_ids": rig.names,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from imgcal.formats import places
-from imgcal.formats.file_storage import is_matrix, merged, place_of, storage_text
+from imgcal.formats.file_storage import is_matrix, key_place, merge_storages, storage_text
 from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.format import Files, Format
@@ -32,7 +32,7 @@ SIDES = (("1", "l", "left", "0"), ("2", "r", "right", "1"))
 
 
 def _recognizes(source: Source) -> bool:
-    keys = _keys(merged(source))
+    keys = _keys(merge_storages(source))
     return len(_sides(keys, MATRIX)) == 2 or (
         _first(keys, ROTATION) is not None and _first(keys, TRANSLATION) is not None
         and {"q", "p1", "p2"} & keys.keys() != set()
@@ -40,7 +40,7 @@ def _recognizes(source: Source) -> bool:
 
 
 def _read(source: Source) -> ForeignRig:
-    keys = _keys(merged(source))
+    keys = _keys(merge_storages(source))
     matrix_keys, distortion_keys = _sides(keys, MATRIX), _sides(keys, DISTORTION)
     matrices, distortions = [keys[key] for key in matrix_keys], [keys[key] for key in distortion_keys]
     turn, shift = _first(keys, ROTATION), _first(keys, TRANSLATION)
@@ -67,10 +67,10 @@ def _read(source: Source) -> ForeignRig:
     if translation[0] > 0:
         notes.append("T[0] > 0: camera 2 stands to the left of camera 1; taken as it is")
     poses = ((np.eye(3), np.zeros(3)), (turned, translation))
-    written = {_plain(key): key for key in reversed(list(merged(source)))}
+    written = {_plain(key): key for key in reversed(list(merge_storages(source)))}
 
     def place(key: str, of: places.Numbers) -> Place:
-        return Place(*place_of(source, written[key]), of)
+        return Place(*key_place(source, written[key]), of)
 
     cameras = []
     for side, (lens, pose) in enumerate(zip(lenses, poses, strict=True)):
@@ -90,7 +90,7 @@ def _write(rig: ForeignRig) -> Files:
     for side, camera in enumerate(rig.cameras, start=1):
         count = next(count for count in (5, 8, 12, 14) if count >= camera.lens.length)
         intrinsics[f"M{side}"] = camera.lens.matrix
-        intrinsics[f"D{side}"] = np.array([camera.lens.padded(count)])
+        intrinsics[f"D{side}"] = np.array([camera.lens.pad(count)])
     if first.image_size == second.image_size and first.image_size is not None:
         intrinsics["image_width"], intrinsics["image_height"] = first.image_size
     extrinsics = {"R": second.rotation, "T": second.translation[:, None]}

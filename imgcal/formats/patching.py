@@ -63,7 +63,7 @@ class TextFile:
         if self.mark + self.text.encode(self.encoding) != content:
             raise FormatError(f"{self.name}: its text does not survive decoding and encoding")
 
-    def patched(self, changes: Sequence[Change], digits: int) -> bytes:
+    def patch(self, changes: Sequence[Change], digits: int) -> bytes:
         """The file with other numbers, each in the form of the one in its place.
 
         Args:
@@ -95,21 +95,21 @@ class TextFile:
         new: dict[Span, str] = {}
         for key in {key for key, _ in groups}:
             spans = [span for other, group in groups if other == key for span in group]
-            style = style_of([tokens[span] for span in spans])
+            style = number_style([tokens[span] for span in spans])
             for span in spans:
                 before, after = wanted[span]
                 if not _is_same(tokens[span], before, after):
-                    new[span] = like(tokens[span], after, style, digits)
-        return self._replaced(new)
+                    new[span] = write_like(tokens[span], after, style, digits)
+        return self._replace(new)
 
-    def _replaced(self, new: dict[Span, str]) -> bytes:
+    def _replace(self, new: dict[Span, str]) -> bytes:
         pieces, at = [], 0
         for (start, end), token in sorted(new.items()):
             pieces += [self.text[at:start], token]
             at = end
         return self.mark + "".join([*pieces, self.text[at:]]).encode(self.encoding)
 
-    def stamped(self, now: datetime) -> tuple[bytes, list[str], list[str]]:
+    def stamp(self, now: datetime) -> tuple[bytes, list[str], list[str]]:
         """The file with `now` in the place of its times of calibration, in their own forms.
 
         Returns:
@@ -130,7 +130,7 @@ class TextFile:
                 start = self.text.index(text, node.span[0])
                 new[(start, start + len(text))] = made
                 replaced.append(key.lstrip("@"))
-        return self._replaced(new), list(dict.fromkeys(replaced)), list(dict.fromkeys(left))
+        return self._replace(new), list(dict.fromkeys(replaced)), list(dict.fromkeys(left))
 
 
 def _is_near(before: float, after: float) -> bool:
@@ -167,7 +167,7 @@ class Style:
     usual: str | None = None  # a number that shows how many decimals there are, for those that show none
 
 
-def style_of(tokens: Sequence[str]) -> Style:
+def number_style(tokens: Sequence[str]) -> Style:
     """Tell from the numbers that stand there how such numbers are written."""
     shown = [token for token in tokens if not _is_short(token)]
     forms = {(bool(_parts(token)[4]), len(_parts(token)[3])) for token in shown}
@@ -177,7 +177,7 @@ def style_of(tokens: Sequence[str]) -> Style:
     return Style(usual=max(shown, key=lambda token: len(_parts(token)[3]), default=None))
 
 
-def like(token: str, value: float, style: Style | None = None, digits: int = 0) -> str:
+def write_like(token: str, value: float, style: Style | None = None, digits: int = 0) -> str:
     """Write a number in the form of another one: fixed or with an exponent, with as many decimals.
 
     Args:
@@ -187,9 +187,9 @@ def like(token: str, value: float, style: Style | None = None, digits: int = 0) 
         digits: significant digits that there are to be at least.
 
     Examples:
-        >>> like("-0.046183", 0.0512345678), like("1.20E-08", -3.14159e-9)
+        >>> write_like("-0.046183", 0.0512345678), write_like("1.20E-08", -3.14159e-9)
         ('0.051235', '-3.14E-09')
-        >>> like("0", 0.25, Style(usual="1.125"))
+        >>> write_like("0", 0.25, Style(usual="1.125"))
         '0.250'
     """
     style = style or Style()
@@ -239,7 +239,7 @@ def _with_point(text: str) -> str:
     return text if "." in mantissa or not e else f"{mantissa}.0e{power}"
 
 
-def patched_bytes(content: bytes, changes: Sequence[Change]) -> bytes:
+def patch_bytes(content: bytes, changes: Sequence[Change]) -> bytes:
     """The same for a binary file: `keys` is the offset of little-endian doubles."""
     made = bytearray(content)
     for change in changes:

@@ -12,7 +12,7 @@ from imgcal.formats.chains import Pose, compose, inverse
 from imgcal.formats.documents import Element
 from imgcal.formats.foreign_rig import ForeignCamera, Place
 from imgcal.formats.lens import Array
-from imgcal.formats.values import quaternion_of_rotation, vector_of_rotation
+from imgcal.formats.values import quaternion_from_rotation, vector_from_rotation
 
 Numbers = Callable[[ForeignCamera], Sequence[float]]
 
@@ -36,7 +36,7 @@ def focal_and_centre(camera: ForeignCamera) -> list[float]:
 
 def coefficients(count: int) -> Numbers:
     """As many distortion coefficients."""
-    return lambda camera: camera.lens.padded(count)
+    return lambda camera: camera.lens.pad(count)
 
 
 def translation(camera: ForeignCamera) -> list[float]:
@@ -60,7 +60,7 @@ def rotation_like(found: Sequence[float]) -> Numbers:
         return rotation_matrix
 
     def vector(camera: ForeignCamera) -> list[float]:
-        made = vector_of_rotation(camera.rotation)
+        made = vector_from_rotation(camera.rotation)
         angle = float(np.linalg.norm(made))
         turns = [made * (1 + 2 * np.pi * n / angle) for n in (-1, 0, 1)] if angle > 1e-9 else [made]
         return [float(value) for value in min(turns, key=lambda one: float(np.linalg.norm(one - np.array(found))))]
@@ -70,12 +70,12 @@ def rotation_like(found: Sequence[float]) -> Numbers:
 
 def seven(camera: ForeignCamera) -> list[float]:
     """Quaternion w, x, y, z and translation of cam_from_rig."""
-    return [*quaternion_of_rotation(camera.rotation).tolist(), *translation(camera)]
+    return [*quaternion_from_rotation(camera.rotation).tolist(), *translation(camera)]
 
 
 def near_quaternion(rotation: Array, wxyz: Sequence[float]) -> list[float]:
     """A rotation's quaternion w, x, y, z with the sign of the one in the file."""
-    made = quaternion_of_rotation(rotation)
+    made = quaternion_from_rotation(rotation)
     return [float(value) for value in (made if made @ np.array(wxyz) >= 0 else -made)]
 
 
@@ -84,7 +84,7 @@ def matrix_rows(camera: ForeignCamera) -> list[float]:
     return [float(value) for value in np.column_stack((camera.rotation, camera.translation)).ravel()]
 
 
-def carried(before: Pose, pose: Pose, numbers: Numbers) -> Numbers:
+def carry_pose(before: Pose, pose: Pose, numbers: Numbers) -> Numbers:
     """Numbers of a pose of the file that goes along with a camera (camera_from_imu, the pose of an image).
 
     Args:

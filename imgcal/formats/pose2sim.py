@@ -7,14 +7,14 @@ from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignRig
 from imgcal.formats.format import Files, Format
 from imgcal.formats.source import Source
-from imgcal.formats.toml_cameras import cameras_of, has_tables, tables_of, toml_key, toml_text
+from imgcal.formats.toml_cameras import find_tables, has_tables, read_cameras, toml_key, toml_text
 from imgcal.formats.values import numbers
 
 TITLE = "Pose2Sim Calib.toml"
 
 
 def _recognizes(source: Source) -> bool:
-    tables = tables_of(source)
+    tables = find_tables(source)
     if tables is None or any("rotation_count" in table for table in tables.cameras.values()):
         return False
     # Anipose writes five, of a fisheye four as well.
@@ -24,10 +24,10 @@ def _recognizes(source: Source) -> bool:
 
 
 def _read(source: Source) -> ForeignRig:
-    tables = tables_of(source)
+    tables = find_tables(source)
     assert tables is not None
     notes = ["four coefficients in each camera: Pose2Sim's, in metres, z up"]
-    cameras = cameras_of(tables.cameras, notes)
+    cameras = read_cameras(tables.cameras, notes)
     return ForeignRig(FORMAT.name, cameras, "m", "the file's world (z up)", tuple(notes))
 
 

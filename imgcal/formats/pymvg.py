@@ -89,7 +89,7 @@ def _write(rig: ForeignRig) -> Files:
                 "height": height,
                 "P": np.concatenate((matrix, np.zeros((3, 1))), axis=1).tolist(),
                 "K": matrix.tolist(),
-                "D": camera.lens.padded(5),
+                "D": camera.lens.pad(5),
                 "R": np.eye(3).tolist(),
                 "Q": camera.rotation.tolist(),
                 "translation": camera.translation.tolist(),

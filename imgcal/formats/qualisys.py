@@ -16,7 +16,7 @@ from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
 from imgcal.formats.format import Format
 from imgcal.formats.lens import Array, Lens
 from imgcal.formats.source import Source
-from imgcal.formats.values import focal_length, named, nearest_rotation, number
+from imgcal.formats.values import focal_length, name_cameras, nearest_rotation, number
 
 TITLE = "Qualisys calibration"
 FRACTION = 64.0
@@ -54,10 +54,11 @@ def _read(source: Source) -> ForeignRig:
     else:
         notes.append("QTM does not document whether its pixel centres lie at 0 or 0.5: up to half a pixel is open")
     if lost:
-        notes.append(f"{named(lost)}: left out, not active or not calibrated")
+        notes.append(f"{name_cameras(lost)}: left out, not active or not calibrated")
     if turned:
         notes.append(
-            f"{named(turned)}: mounted turned (viewrotation): the numbers are those of the sensor's own image, before "
+            f"{name_cameras(turned)}: mounted turned (viewrotation): the numbers are those of the sensor's own "
+            "image, before "
             "a video is turned upright"
         )
     return ForeignRig(FORMAT.name, tuple(cameras), "mm", "QTM's world (z up)", tuple(notes))

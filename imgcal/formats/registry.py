@@ -27,7 +27,7 @@ from imgcal.formats import (
     ros_camera_info,
     vicon,
 )
-from imgcal.formats.file_storage import is_matrix, merged
+from imgcal.formats.file_storage import is_matrix, merge_storages
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
 from imgcal.formats.format import Format
 from imgcal.formats.source import Source
@@ -73,7 +73,7 @@ def read_foreign_rig(
         InputError: one line with the file, what it is and what it lacks.
     """
     source = Source([Path(one) for one in ([paths] if isinstance(paths, str | Path) else paths)], rig)
-    return _read(source, format_of(source) if name is None else _asked_for(source, format_named(name)))
+    return _read(source, recognize_format(source) if name is None else _check_requested(source, find_format(name)))
 
 
 def read_foreign_lenses(path: str | Path, name: str | None = None) -> ForeignRig:
@@ -90,14 +90,14 @@ def read_foreign_lenses(path: str | Path, name: str | None = None) -> ForeignRig
         InputError: one line with the file, what it is and what it lacks.
     """
     source = Source([Path(path)])
-    one = format_of(source) if name is None else _asked_for(source, format_named(name))
+    one = recognize_format(source) if name is None else _check_requested(source, find_format(name))
     if one.read_lenses is None:
         return _read(source, one)
     read = one.read_lenses
     return _read(source, replace(one, read=lambda found: ForeignRig(one.name, tuple(read(found)), None, "unknown")))
 
 
-def format_named(name: str) -> Format:
+def find_format(name: str) -> Format:
     """Find a format by its name.
 
     Raises:
@@ -108,7 +108,7 @@ def format_named(name: str) -> Format:
     return BY_NAME[name]
 
 
-def format_of(source: Source) -> Format:
+def recognize_format(source: Source) -> Format:
     """Recognize a format by content.
 
     Raises:
@@ -125,7 +125,7 @@ def format_of(source: Source) -> Format:
     raise InputError(f"{source.where}: {_instead(source)}")
 
 
-def _asked_for(source: Source, one: Format) -> Format:
+def _check_requested(source: Source, one: Format) -> Format:
     """A format that the user names instead of the content: the file must be able to be one."""
     try:
         if (one.accepts or one.recognizes)(source):
@@ -138,7 +138,7 @@ def _asked_for(source: Source, one: Format) -> Format:
 def _other(source: Source) -> str:
     """Which format it is instead, in words; empty where it is none."""
     try:
-        found = format_of(source)
+        found = recognize_format(source)
     except InputError:
         return ""
     return f"it is a {found.title} ({found.name})"
@@ -157,7 +157,7 @@ def is_foreign(path: Path) -> bool:
 
 def _instead(source: Source) -> str:
     """What a source without a rig is, as far as can be told."""
-    values = merged(source)
+    values = merge_storages(source)
     if is_matrix(values.get("camera_matrix")) or is_matrix(values.get("cameraMatrix")) or is_matrix(values.get("K")):
         return (
             "this is an OpenCV calibration of one camera: extrinsics in it are those of its boards; a rig needs where "
@@ -172,7 +172,9 @@ def _instead(source: Source) -> str:
     if any(path.suffix == ".cal" for path in source.files):
         return "this looks like a Motive .cal, which is binary and not documented: export .mcal (Motive 3.2 or newer)"
     titles = "; ".join(dict.fromkeys(one.title for one in FORMATS))
-    found = f"found {source.shown()}" if not source.alone else f"found none of the keys of a calibration{_keys(values)}"
+    found = (
+        f"found {source.describe()}" if not source.alone else f"found none of the keys of a calibration{_keys(values)}"
+    )
     return f"{found}, expected `format: imgcal-rig/1` or one of: {titles}"
 
 
@@ -187,10 +189,10 @@ def _read(source: Source, one: Format) -> ForeignRig:
         raise InputError(f"{source.where}: this is a {one.title}: {error}") from error
     if len(rig.cameras) > limits.MOST_CAMERAS:
         raise InputError(f"{source.where}: found {len(rig.cameras)} cameras, expected at most {limits.MOST_CAMERAS}")
-    return _with_sound_names(replace(rig, format=one.name))
+    return _make_names_sound(replace(rig, format=one.name))
 
 
-def _with_sound_names(rig: ForeignRig) -> ForeignRig:
+def _make_names_sound(rig: ForeignRig) -> ForeignRig:
     """Names are files of a capture, too: without slashes, each once."""
     cameras: list[ForeignCamera] = []
     renamed, frame = [], rig.frame

@@ -174,7 +174,7 @@ def _write(rig: ForeignRig) -> Files:
             _file_name(camera): _info_text(camera, np.eye(3), camera.lens.focal_length, camera.lens.principal_point)
         }
     left, right = rig.cameras
-    of_left, of_right, shift = _rectification(right.seen_from(left), left.name)
+    of_left, of_right, shift = _rectification(right.in_frame_of(left), left.name)
     focal = float(min(*left.lens.focal_length, *right.lens.focal_length))
     width, height = left.image_size or (0, 0)
     centre = ((width - 1) / 2, (height - 1) / 2)
@@ -232,7 +232,7 @@ def _info_text(
             "camera_name": camera.name,
             "camera_matrix": block(3, 3, lens.matrix.ravel().tolist()),
             "distortion_model": model,
-            "distortion_coefficients": block(1, count, lens.padded(count)),
+            "distortion_coefficients": block(1, count, lens.pad(count)),
             "rectification_matrix": block(3, 3, rectified.ravel().tolist()),
             "projection_matrix": block(3, 4, projection),
         }

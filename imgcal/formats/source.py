@@ -9,7 +9,7 @@ from typing import Any
 
 from imgcal.errors import InputError
 from imgcal.formats.documents import Document, Element, read_document
-from imgcal.messages import listed, quoted
+from imgcal.messages import list_names, quote
 
 MOST_FILES = 1000
 SUFFIXES = frozenset(
@@ -37,7 +37,7 @@ class Source:
             InputError: a path that does not exist, a device, or one that is given twice.
         """
         self.rig = rig
-        self.where = quoted(", ".join(map(str, paths)))
+        self.where = quote(", ".join(map(str, paths)))
         self.alone = False  # one file, whose faults are the user's to know
         self.files: list[Path] = []
         for number, path in enumerate(paths):
@@ -47,7 +47,7 @@ class Source:
                 self.files += _inside(path)
             elif path.is_file():
                 self.alone = len(paths) == 1
-                self.files += _with_partner(path)
+                self.files += _add_partner(path)
             else:
                 raise InputError(f"{path}: {'found a device or pipe' if path.exists() else 'no such file or folder'}")
         self.title = paths[0].stem if paths[0].is_file() else paths[0].resolve().name
@@ -73,7 +73,7 @@ class Source:
         """The documents that are keys and values."""
         return [(document, document.value) for document in self.documents if isinstance(document.value, dict)]
 
-    def merged(self) -> dict[str, Any]:
+    def merge(self) -> dict[str, Any]:
         """The keys and values of all documents together; the first one that has a key counts."""
         together: dict[str, Any] = {}
         for _, values in self.mappings:
@@ -86,13 +86,13 @@ class Source:
         roots = [one.value for one in self.documents if isinstance(one.value, Element)]
         return [root for root in roots if not tags or root.tag in tags]
 
-    def named(self, name: str) -> Path | None:
+    def find_file(self, name: str) -> Path | None:
         """The file of a name, if it is there."""
         return next((path for path in self.files if path.name == name), None)
 
-    def shown(self) -> str:
+    def describe(self) -> str:
         """Its files in a few words, for messages."""
-        return listed(path.name for path in self.files) or "an empty folder"
+        return list_names(path.name for path in self.files) or "an empty folder"
 
 
 def _inside(folder: Path) -> list[Path]:
@@ -105,7 +105,7 @@ def _inside(folder: Path) -> list[Path]:
     return found
 
 
-def _with_partner(path: Path) -> list[Path]:
+def _add_partner(path: Path) -> list[Path]:
     """The file, and what it is one calibration with."""
     if path.name in COLMAP_FILES:
         return [path, *(one for one in _inside(path.parent) if one.name in COLMAP_FILES and one != path)]

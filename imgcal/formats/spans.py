@@ -94,15 +94,15 @@ def _yaml(text: str) -> Node:
     # As long as before, and a comment: OpenCV's first line is no YAML.
     plain = re.sub(r"\A%YAML[^\n]*", lambda match: "#" * len(match[0]), text)
     root = yaml.compose(plain, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    return _of_yaml(root) if root is not None else Node((0, 0))
+    return _make_node(root) if root is not None else Node((0, 0))
 
 
-def _of_yaml(node: Any) -> Node:
+def _make_node(node: Any) -> Node:
     made = Node((node.start_mark.index, node.end_mark.index))
     if isinstance(node, yaml.MappingNode):
-        made.children = {key.value: _of_yaml(value) for key, value in node.value if isinstance(key, yaml.ScalarNode)}
+        made.children = {key.value: _make_node(value) for key, value in node.value if isinstance(key, yaml.ScalarNode)}
     elif isinstance(node, yaml.SequenceNode):
-        made.children = {place: _of_yaml(value) for place, value in enumerate(node.value)}
+        made.children = {place: _make_node(value) for place, value in enumerate(node.value)}
     return made
 
 

@@ -12,8 +12,8 @@ from imgcal.formats import places
 from imgcal.formats.foreign_rig import ForeignCamera, FormatError, Place, unplaced_camera
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
-from imgcal.formats.values import array, camera_matrix, coefficients, image_size, named, numbers, rotation, text
-from imgcal.messages import listed
+from imgcal.formats.values import array, camera_matrix, coefficients, image_size, name_cameras, numbers, rotation, text
+from imgcal.messages import list_names
 
 Table = dict[str, Any]
 AT = ""  # the key of a table under which it is kept where it stands: path and keys
@@ -27,7 +27,7 @@ class Tables:
     metadata: Table
 
 
-def tables_of(source: Source) -> Tables | None:
+def find_tables(source: Source) -> Tables | None:
     """Find the tables that are cameras; None where there are none.
 
     Raises:
@@ -47,13 +47,13 @@ def tables_of(source: Source) -> Tables | None:
             metadata = values.get("metadata")
             found.append((document.path.name, Tables(cameras, metadata if isinstance(metadata, dict) else {})))
     if len(found) > 1:
-        raise FormatError(f"{listed(name for name, _ in found)} have cameras in TOML each: give one of these files")
+        raise FormatError(f"{list_names(name for name, _ in found)} have cameras in TOML each: give one of these files")
     return found[0][1] if found else None
 
 
 def has_tables(source: Source) -> bool:
     """Tell whether there are tables of cameras: whose they are is then a question of details."""
-    return tables_of(source) is not None
+    return find_tables(source) is not None
 
 
 def is_camera(value: Any) -> bool:
@@ -66,7 +66,7 @@ def is_missing(value: Any) -> bool:
     return value is None or value in ("null", "None", "", [])
 
 
-def cameras_of(tables: Mapping[str, Table], notes: list[str]) -> tuple[ForeignCamera, ...]:
+def read_cameras(tables: Mapping[str, Table], notes: list[str]) -> tuple[ForeignCamera, ...]:
     """Read the cameras that have a lens and a pose; the others are named in `notes`.
 
     Raises:
@@ -87,16 +87,18 @@ def cameras_of(tables: Mapping[str, Table], notes: list[str]) -> tuple[ForeignCa
             at_origin.append(name)
     own = len(notes)
     if without_lens:
-        notes.append(f"{named(without_lens)}: left out, intrinsics are not calibrated")
+        notes.append(f"{name_cameras(without_lens)}: left out, intrinsics are not calibrated")
     if without_pose:
-        notes.append(f"{named(without_pose)}: left out, where they stand is not calibrated")
+        notes.append(f"{name_cameras(without_pose)}: left out, where they stand is not calibrated")
     if not cameras:
         raise FormatError(
             f"no camera has both intrinsics and a pose: {'; '.join(notes[own:])}; imgcal calibrate --cameras finds out "
             "where they stand"
         )
     if len(at_origin) > 1:
-        raise FormatError(f"{named(at_origin)}: rotation and translation are zero: extrinsics were never calibrated")
+        raise FormatError(
+            f"{name_cameras(at_origin)}: rotation and translation are zero: extrinsics were never calibrated"
+        )
     return tuple(cameras)
 
 
@@ -106,7 +108,7 @@ def camera_name(key: str, table: Table) -> str:
     return text(name, key)
 
 
-def lenses_of(tables: Mapping[str, Table]) -> list[ForeignCamera]:
+def read_all_lenses(tables: Mapping[str, Table]) -> list[ForeignCamera]:
     """Read all cameras as if none had a pose: all are at the origin.
 
     Raises:
@@ -117,7 +119,8 @@ def lenses_of(tables: Mapping[str, Table]) -> list[ForeignCamera]:
         name = camera_name(key, table)
         if is_missing(table.get("matrix")) or is_missing(table.get("distortions")):
             raise FormatError(
-                f"{named([name])}: intrinsics are not calibrated: imgcal rig cameras writes a file with a field of view"
+                f"{name_cameras([name])}: intrinsics are not calibrated: imgcal rig cameras writes a file with a "
+                "field of view"
             )
         cameras.append(unplaced_camera(name, *_lens(name, table)))
     return cameras

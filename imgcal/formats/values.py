@@ -11,7 +11,7 @@ import numpy as np
 
 from imgcal.formats.foreign_rig import FormatError
 from imgcal.formats.lens import Array
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 from imgcal.types import limits
 
 LARGEST = 1e12
@@ -118,11 +118,11 @@ def rotation(value: Any, what: str) -> Array:
     """Read a rotation: a 3 x 3 matrix, or a rotation vector in rad (Rodrigues) where there are three numbers."""
     found = numbers(value, what)
     if len(found) == 3:
-        return rotation_of_vector(np.array(found))
+        return rotation_from_vector(np.array(found))
     return nearest_rotation(array(found, (3, 3), what), what)
 
 
-def rotation_of_vector(vector: Array) -> Array:
+def rotation_from_vector(vector: Array) -> Array:
     """The rotation matrix of a rotation vector in rad."""
     angle = float(np.linalg.norm(vector))
     if angle < 1e-12:
@@ -133,9 +133,9 @@ def rotation_of_vector(vector: Array) -> Array:
     )
 
 
-def vector_of_rotation(matrix: Array) -> Array:
+def vector_from_rotation(matrix: Array) -> Array:
     """The rotation vector in rad of a rotation matrix; of a half turn, too."""
-    w, x, y, z = quaternion_of_rotation(matrix)
+    w, x, y, z = quaternion_from_rotation(matrix)
     axis = np.array([x, y, z])
     sine = float(np.linalg.norm(axis))
     if sine < 1e-15:
@@ -143,7 +143,7 @@ def vector_of_rotation(matrix: Array) -> Array:
     return axis * (2 * math.atan2(sine, w) / sine)
 
 
-def rotation_of_quaternion(value: Any, what: str) -> Array:
+def rotation_from_quaternion(value: Any, what: str) -> Array:
     """The rotation matrix of a Hamilton quaternion w, x, y, z, which is normalized first."""
     q = array(value, (4,), what)
     length = float(np.linalg.norm(q))
@@ -159,7 +159,7 @@ def rotation_of_quaternion(value: Any, what: str) -> Array:
     )
 
 
-def quaternion_of_rotation(matrix: Array) -> Array:
+def quaternion_from_rotation(matrix: Array) -> Array:
     """The Hamilton quaternion w, x, y, z with w >= 0: the eigenvector that is stable at every angle."""
     (a, b, c), (d, e, f), (g, h, i) = matrix
     symmetric = np.array(
@@ -194,7 +194,7 @@ def text(value: Any, what: str) -> str:
     return str(value)
 
 
-def named(names: Sequence[str]) -> str:
+def name_cameras(names: Sequence[str]) -> str:
     """Name cameras in a sentence: `camera a`, `cameras a, b`."""
-    shown = ", ".join(shortened(name) for name in names[:8]) + (f", ... ({len(names)})" if len(names) > 8 else "")
+    shown = ", ".join(shorten(name) for name in names[:8]) + (f", ... ({len(names)})" if len(names) > 8 else "")
     return f"camera{'s' if len(names) > 1 else ''} {shown}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from imgcal.formats.fitting import pixels_of
+from imgcal.formats.fitting import pixel_grid
 from imgcal.formats.foreign_rig import ForeignRig
 from imgcal.formats.lens import Array
 
@@ -22,7 +22,7 @@ def known_points(rig: ForeignRig) -> list[Array]:
     found = []
     for camera in rig.cameras:
         assert camera.image_size is not None
-        rays = camera.lens.rays(pixels_of(camera.image_size, SIDE))
+        rays = camera.lens.rays(pixel_grid(camera.image_size, SIDE))
         rays = rays[np.isfinite(rays).all(axis=-1)]
         points_cam = np.concatenate([rays * depth * size for depth in DEPTHS])
         found.append((points_cam - camera.translation) @ camera.rotation)

@@ -16,7 +16,15 @@ from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, P
 from imgcal.formats.format import Format
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
-from imgcal.formats.values import array, focal_length, image_size, named, number, numbers, rotation_of_quaternion
+from imgcal.formats.values import (
+    array,
+    focal_length,
+    image_size,
+    name_cameras,
+    number,
+    numbers,
+    rotation_from_quaternion,
+)
 
 TITLE = "Vicon calibration (.xcp)"
 
@@ -48,9 +56,9 @@ def _read(source: Source) -> ForeignRig:
         "pixel centres are taken to lie at whole numbers: not documented, but best by a real calibration",
     ]
     if lost:
-        notes.append(f"{named(lost)}: left out, without a KeyFrame")
+        notes.append(f"{name_cameras(lost)}: left out, without a KeyFrame")
     if several:
-        notes.append(f"{named(several)}: moves (several KeyFrames); the first is taken")
+        notes.append(f"{name_cameras(several)}: moves (several KeyFrames); the first is taken")
     return ForeignRig(FORMAT.name, tuple(cameras), "mm", "Vicon's world", tuple(notes))
 
 
@@ -71,7 +79,7 @@ def _camera(name: str, element: Element, frame: Element, path: Path) -> ForeignC
     sensor = element.attributes.get("SENSOR_SIZE")
     size = image_size(numbers(sensor, name), f"{name}: SENSOR_SIZE") if sensor else None
     quaternion = numbers(get("ORIENTATION"), f"{name}: ORIENTATION")
-    rotation = rotation_of_quaternion([*quaternion[3:], *quaternion[:3]], f"{name}: ORIENTATION")
+    rotation = rotation_from_quaternion([*quaternion[3:], *quaternion[:3]], f"{name}: ORIENTATION")
     centre = array(get("POSITION"), (3,), f"{name}: POSITION")
     lens = Lens(focal, (x, y), ks, "to_ideal", skew)
     found = _places(path, element, frame, quaternion)
@@ -86,7 +94,7 @@ def _places(path: Path, element: Element, frame: Element, quaternion: list[float
         return [*xyz, w]
 
     def with_centre(camera: ForeignCamera) -> list[float]:
-        k1, k2, k3, x, y = camera.lens.padded(5)
+        k1, k2, k3, x, y = camera.lens.pad(5)
         return [camera.lens.principal_point[0] + x, camera.lens.principal_point[1] + y, k1, k2, k3]
 
     fixed: dict[str, places.Numbers] = {

@@ -13,14 +13,14 @@ import numpy as np
 from imgcal.errors import InputError, RefusedError
 from imgcal.formats.conversion import describe_lens
 from imgcal.formats.documents import read_bytes
-from imgcal.formats.fitting import Fit, fitted_like
+from imgcal.formats.fitting import Fit, fit_lens_like
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
 from imgcal.formats.limits import LIMIT
-from imgcal.formats.patching import Change, TextFile, patched_bytes
-from imgcal.formats.registry import format_named, is_foreign, read_foreign_rig
+from imgcal.formats.patching import Change, TextFile, patch_bytes
+from imgcal.formats.registry import find_format, is_foreign, read_foreign_rig
 from imgcal.formats.source import SUFFIXES, Source
 from imgcal.formats.units import millimetres
-from imgcal.formats.values import named
+from imgcal.formats.values import name_cameras
 from imgcal.formats.verification import worst_difference
 
 DIGITS = (0, 9, 12, 17)  # tried in this order: those of the file first
@@ -43,7 +43,7 @@ class Updated:
     points: int  # known points that were compared
 
 
-def written_back(
+def write_into(
     rig: ForeignRig,
     original: Sequence[Path],
     now: datetime,
@@ -73,7 +73,7 @@ def written_back(
         if path.is_file() and not is_foreign(path):
             raise InputError(f"{path}: found a rig file of imgcal, expected the calibration of another tool")
     old = read_foreign_rig(original, name, original_rig)
-    title = format_named(old.format).title
+    title = find_format(old.format).title
     try:
         return _written(rig, old, original, now, unit, limit, original_rig)
     except FormatError as error:
@@ -89,41 +89,42 @@ def _written(
     limit: float,
     original_rig: str | None,
 ) -> Updated:
-    where, title = ", ".join(map(str, original)), format_named(old.format).title
+    where, title = ", ".join(map(str, original)), find_format(old.format).title
     absent = [camera for camera in rig.names if camera not in old.names]
     if absent:
         raise InputError(
-            f"{where}: {named(absent)} not in it, which has {named(old.names)}: choose with --cameras, or rename"
+            f"{where}: {name_cameras(absent)} not in it, which has {name_cameras(old.names)}: choose with "
+            "--cameras, or rename"
         )
     if unit is None and old.unit is None and len(old.cameras) > 1:
         raise InputError(
             f"{where}: its unit of length is not said in the file: state it with --out-unit mm, cm, m, inch"
         )
     length = millimetres(unit or old.unit or "mm", "--out-unit")
-    found = {camera.name: camera for camera in rig.scaled(1.0 / length, unit or old.unit or "mm").cameras}
+    found = {camera.name: camera for camera in rig.scale(1.0 / length, unit or old.unit or "mm").cameras}
     _check_sizes(where, old, found)
     fits: dict[str, Fit] = {}
     cameras = []
     for camera in old.cameras:
         new = found.get(camera.name)
-        if new is None or _stayed(camera, new):
+        if new is None or _is_unchanged(camera, new):
             cameras.append(camera)
             continue
         assert new.image_size is not None
-        fits[camera.name] = fitted_like(new.lens, new.image_size, camera.lens, camera.one_focal_length, limit)
+        fits[camera.name] = fit_lens_like(new.lens, new.image_size, camera.lens, camera.one_focal_length, limit)
         cameras.append(replace(new, lens=fits[camera.name].lens))
     _check_fits(fits, old, found, title, limit)
     wanted = replace(old, cameras=tuple(cameras))
     if old.root is not None:
-        wanted = wanted.seen_from_first(old.root)
+        wanted = wanted.in_camera_frame(old.root)
     notes = _frame_notes(where, old, wanted, found)
-    contents = {path: read_bytes(path, MOST_BYTES) for path in _files_of(original)}
+    contents = {path: read_bytes(path, MOST_BYTES) for path in _list_files(original)}
     changes = _changes(old, wanted)
-    sized = _with_sizes(wanted, rig)
+    sized = _fill_sizes(wanted, rig)
     for digits in DIGITS:
-        files, stamps = _patched(contents, changes, digits, now)
+        files, stamps = _patch(contents, changes, digits, now)
         back = _read_back(files, old, original_rig)
-        reread, points = worst_difference(sized, _with_sizes(back, rig))
+        reread, points = worst_difference(sized, _fill_sizes(back, rig))
         if reread <= ROUNDING:
             break
     else:
@@ -167,7 +168,7 @@ def _check_fits(
             )
 
 
-def _stayed(camera: ForeignCamera, new: ForeignCamera) -> bool:
+def _is_unchanged(camera: ForeignCamera, new: ForeignCamera) -> bool:
     """Tell whether the file says a camera as it is now."""
     one, other = (ForeignRig("", (replace(c, image_size=new.image_size),), None, "") for c in (camera, new))
     near = np.allclose(camera.centre, new.centre, rtol=1e-9, atol=1e-9)
@@ -204,7 +205,8 @@ def _frame_notes(where: str, old: ForeignRig, wanted: ForeignRig, found: Mapping
     behind = [camera.name for camera in old.cameras if camera.name not in found]
     if behind:
         raise FormatError(
-            f"the rig is in another frame than the file ({said}), and {named(behind)}, which the rig does not have, "
+            f"the rig is in another frame than the file ({said}), and {name_cameras(behind)}, which the rig does "
+            "not have, "
             "would stay behind: convert the file itself to a rig, and recalibrate that"
         )
     return [f"the frame of the rig is not that of the file: {said}"] if old.root is None else []
@@ -217,7 +219,7 @@ def _angle(rotation: np.ndarray) -> float:
     return float(np.arctan2(np.linalg.norm(skewed), np.trace(rotation) - 1))
 
 
-def _files_of(original: Sequence[Path]) -> list[Path]:
+def _list_files(original: Sequence[Path]) -> list[Path]:
     source = Source(list(original))
     if source.alone:
         return source.files
@@ -232,8 +234,8 @@ def _changes(old: ForeignRig, wanted: ForeignRig) -> dict[Path, list[Change]]:
             raise FormatError(f"camera {camera.name}: where its numbers stand is not known: it is only read")
         for place in camera.places:
             base = place.relative_to
-            before = camera if base is None else camera.seen_from(old.cameras[base])
-            after = new if base is None else new.seen_from(wanted.cameras[base])
+            before = camera if base is None else camera.in_frame_of(old.cameras[base])
+            after = new if base is None else new.in_frame_of(wanted.cameras[base])
             numbers = list(place.numbers(after))
             changes.setdefault(place.path, []).append(
                 Change(place.keys, list(place.numbers(before))[: len(numbers)], numbers, place.first)
@@ -241,7 +243,7 @@ def _changes(old: ForeignRig, wanted: ForeignRig) -> dict[Path, list[Change]]:
     return changes
 
 
-def _patched(
+def _patch(
     contents: Mapping[Path, bytes], changes: Mapping[Path, list[Change]], digits: int, now: datetime
 ) -> tuple[dict[str, bytes], list[str]]:
     """The files of a calibration by name, and what is to be said of their times."""
@@ -250,11 +252,11 @@ def _patched(
     for path, content in contents.items():
         made = content
         if path.suffix == ".bin":
-            made = patched_bytes(content, changes.get(path, []))
+            made = patch_bytes(content, changes.get(path, []))
         elif path in changes:
-            made = TextFile(content, path).patched(changes[path], digits)
+            made = TextFile(content, path).patch(changes[path], digits)
             if made != content:
-                made, replaced, left = TextFile(made, path).stamped(now)
+                made, replaced, left = TextFile(made, path).stamp(now)
                 if replaced:
                     notes.append(f"{path.name}: {', '.join(replaced)} set to {now:%Y-%m-%d %H:%M:%S}")
                 if left:
@@ -277,7 +279,7 @@ def _read_back(files: Mapping[str, bytes], old: ForeignRig, rig: str | None) -> 
     return back
 
 
-def _with_sizes(one: ForeignRig, rig: ForeignRig) -> ForeignRig:
+def _fill_sizes(one: ForeignRig, rig: ForeignRig) -> ForeignRig:
     """Image sizes of the rig for cameras that have none in the file."""
     sizes = {camera.name: camera.image_size for camera in rig.cameras}
     some = next(iter(sizes.values()))

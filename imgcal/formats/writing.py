@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from imgcal.errors import InputError
-from imgcal.formats.conversion import NATIVE, Held, describe_lens, from_camera_rig, held_by, to_camera_rig
+from imgcal.formats.conversion import NATIVE, Held, describe_lens, fit_to_target, from_camera_rig, to_camera_rig
 from imgcal.formats.foreign_rig import ForeignRig, FormatError
 from imgcal.formats.format import Files, Format
 from imgcal.formats.limits import HELD_DISTORTION, LIMIT
-from imgcal.formats.registry import FORMATS, format_named, read_foreign_rig
+from imgcal.formats.registry import FORMATS, find_format, read_foreign_rig
 from imgcal.formats.units import in_millimetres, millimetres
 from imgcal.formats.verification import worst_difference
 from imgcal.io import RigCovariance, rig_from_text, rig_text
@@ -32,7 +32,7 @@ class Written:
     points: int  # known points that were compared
 
 
-def converted(
+def convert_rig(
     rig: ForeignRig,
     to: str,
     name: str,
@@ -56,16 +56,16 @@ def converted(
         RefusedError: a lens cannot be said within `limit`.
     """
     if to == OURS:
-        held = held_by(rig, NATIVE, "a rig file of ours", limit)
+        held = fit_to_target(rig, NATIVE, "a rig file of ours", limit)
         made = to_camera_rig(held.rig, name)
         if hold_distortion:
             made = replace(made, prior=replace(made.prior or RigPrior(), distortion=HELD_DISTORTION))
-        text = rig_text(made, name, _kept_covariance(held))
+        text = rig_text(made, name, _valid_covariance(held))
         back = from_camera_rig(rig_from_text(text, name))
-        lost = rig.covariance is not None and _kept_covariance(held) is None
+        lost = rig.covariance is not None and _valid_covariance(held) is None
         notes = ["standard deviations are left out: they are those of other lens parameters"] if lost else []
-        return _compared(rig, held, back, {"": text.encode()}, notes)
-    target = format_named(to)
+        return _compare(rig, held, back, {"": text.encode()}, notes)
+    target = find_format(to)
     if target.write is None:
         able = ", ".join(one.name for one in FORMATS if one.write is not None)
         raise InputError(f"--to {to}: {target.title} is only read, expected one of imgcal, {able}")
@@ -75,29 +75,29 @@ def converted(
         raise InputError(
             f"--to {to}: {target.title} holds {count} cameras, found {len(rig.cameras)}: choose with --cameras"
         )
-    held = held_by(rig, target.holds, target.title, limit)
+    held = fit_to_target(rig, target.holds, target.title, limit)
     notes = ["standard deviations are left out: the format has no place for them"] if rig.covariance is not None else []
     files_unit = unit or target.unit
     if unit is not None and target.states_unit and millimetres(unit) != millimetres(target.unit):
         raise InputError(f"--out-unit {unit}: {target.title} is always in {target.unit}")
-    placed = held.rig.seen_from_first() if target.from_first else held.rig
+    placed = held.rig.in_camera_frame() if target.from_first else held.rig
     if target.from_first and rig.format != to and len(rig.cameras) > 1:
         notes.append(f"the frame of the files is that of camera {rig.names[0]}")
     length = millimetres(files_unit)
     notes.append(f"lengths in the files: {files_unit}")
     try:
-        files = target.write(placed.scaled(1.0 / length, files_unit))
+        files = target.write(placed.scale(1.0 / length, files_unit))
     except FormatError as error:
         raise InputError(f"--to {to}: {error}") from error
     back = _read_back(files, target, files_unit)
     if sorted(back.names) == sorted(rig.names):  # files of a folder come in the order of their names
-        back = selected(back, tuple(rig.names))
+        back = select_cameras(back, tuple(rig.names))
     else:
         notes.append(f"cameras are called otherwise there, in this order: {', '.join(back.names[:8])}")
-    return _compared(rig, held, back, files, notes)
+    return _compare(rig, held, back, files, notes)
 
 
-def _kept_covariance(held: Held) -> RigCovariance | None:
+def _valid_covariance(held: Held) -> RigCovariance | None:
     """The uncertainty is that of the parameters as they were: with fitted ones it is another."""
     return held.rig.covariance if all(fit.exact for fit in held.fits) else None
 
@@ -110,7 +110,7 @@ def _read_back(files: Files, target: Format, unit: str) -> ForeignRig:
         return in_millimetres(read_foreign_rig(where, target.name), target.name, None if target.states_unit else unit)
 
 
-def _compared(rig: ForeignRig, held: Held, back: ForeignRig, files: Files, notes: list[str]) -> Written:
+def _compare(rig: ForeignRig, held: Held, back: ForeignRig, files: Files, notes: list[str]) -> Written:
     """Compare what was read back with what was to be written, and with the source."""
     exact, _ = worst_difference(held.rig, back)
     between, points = worst_difference(rig, back)
@@ -125,7 +125,7 @@ def _compared(rig: ForeignRig, held: Held, back: ForeignRig, files: Files, notes
     return Written(files, tuple(notes), exact, between, points)
 
 
-def selected(rig: ForeignRig, names: tuple[str, ...]) -> ForeignRig:
+def select_cameras(rig: ForeignRig, names: tuple[str, ...]) -> ForeignRig:
     """Keep the cameras of some names, in that order.
 
     Raises:
@@ -139,10 +139,10 @@ def selected(rig: ForeignRig, names: tuple[str, ...]) -> ForeignRig:
     by_name = {camera.name: camera for camera in rig.cameras}
     own = rig.own.select([rig.names.index(name) for name in names]) if rig.own is not None else None
     chosen = replace(rig, cameras=tuple(by_name[name] for name in names), covariance=None, own=own)
-    return chosen if rig.covariance is None else _with_uncertainty(chosen, rig, rig.covariance)
+    return chosen if rig.covariance is None else _select_uncertainty(chosen, rig, rig.covariance)
 
 
-def _with_uncertainty(chosen: ForeignRig, rig: ForeignRig, covariance: RigCovariance) -> ForeignRig:
+def _select_uncertainty(chosen: ForeignRig, rig: ForeignRig, covariance: RigCovariance) -> ForeignRig:
     """What is known of the cameras that were chosen, unless it is relative to one that was not."""
     if covariance.reference_camera is not None and covariance.reference_camera not in chosen.names:
         note = f"standard deviations are left out: they are relative to camera {covariance.reference_camera}"

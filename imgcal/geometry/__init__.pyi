@@ -6,9 +6,9 @@ from .lenses import (
     distort_by_coefficients,
     distort_with_jacobian,
     lens_codes,
+    lens_label,
     lens_names,
     lens_width,
-    named_lenses,
     undistort,
 )
 from .object_turns import free_turns, pose_rank
@@ -45,9 +45,9 @@ __all__ = [
     "left_jacobian",
     "lens_codes",
     "lens_kernels",
+    "lens_label",
     "lens_names",
     "lens_width",
-    "named_lenses",
     "pose_rank",
     "project_components",
     "project_cpu",

@@ -131,7 +131,7 @@ def subtract_gram(matrix, tall):
 
 
 @njit(nogil=True)
-def ranked(values, count, rank):
+def select_rank(values, count, rank):
     """Value of a rank among the first `count` ones, which are reordered: none before it is larger then (Hoare)."""
     low, high = 0, count - 1
     while low < high:

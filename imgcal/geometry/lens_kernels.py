@@ -39,7 +39,7 @@ class CompiledLens(NamedTuple):
     blind_from: Formula  # (k) -> squared radius from which the slope need not be looked at any more
 
 
-def compiled_as(name: str, **options: Any) -> Callable[[Formula], Formula]:
+def compile_as(name: str, **options: Any) -> Callable[[Formula], Formula]:
     """Do what `njit` does to one of several functions of the same name in the source, without a cache of its own.
 
     Code that different processes have cached calls its parts by their names, and counts: parts of one name would be
@@ -53,16 +53,16 @@ def compiled_as(name: str, **options: Any) -> Callable[[Formula], Formula]:
     return decorate
 
 
-def _inlined(function: Formula) -> Formula:
+def _inline(function: Formula) -> Formula:
     return njit(cache=False, fastmath=FAST, inline="always", error_model="numpy")(function)
 
 
-def _compiled(model: LensModel) -> CompiledLens:
-    radial, growth, radial_by_coefficients = map(_inlined, (model.radial, model.growth, model.by_coefficients))
+def _compile(model: LensModel) -> CompiledLens:
+    radial, growth, radial_by_coefficients = map(_inline, (model.radial, model.growth, model.by_coefficients))
     size, (first, second) = len(model.coefficients), model.decentering or (0, 0)
     decentred = model.decentering is not None
 
-    @_inlined
+    @_inline
     def distort(one, x, y, k):
         two = one + one
         xx, yy, xy2 = x * x, y * y, two * x * y
@@ -77,7 +77,7 @@ def _compiled(model: LensModel) -> CompiledLens:
             jxy = jxy + two * (p1 * x + p2 * y)
         return xd, yd, jxx, jxy, jyy, rr, factor + rr * grown
 
-    @_inlined
+    @_inline
     def by_coefficients(x, y, rr, k, along, down, at, rows):
         slopes = radial_by_coefficients(1.0, rr, k)
         for i in range(size):
@@ -87,9 +87,9 @@ def _compiled(model: LensModel) -> CompiledLens:
             rows[0, at + second], rows[1, at + second] = along * (rr + 2 * x * x), down * 2 * x * y
 
     if model.inverse is not None:
-        inverse = _inlined(model.inverse)
+        inverse = _inline(model.inverse)
 
-        @_inlined
+        @_inline
         def undistort(xd, yd, k):
             factor = inverse(1.0, xd * xd + yd * yd, k)
             return xd * factor, yd * factor
@@ -97,7 +97,7 @@ def _compiled(model: LensModel) -> CompiledLens:
         start = undistort
     else:
 
-        @_inlined
+        @_inline
         def undistort(xd, yd, k):
             x, y = xd, yd
             for _ in range(10):
@@ -110,11 +110,11 @@ def _compiled(model: LensModel) -> CompiledLens:
                 x, y = (xd - along) / factor, (yd - down) / factor
             return x, y
 
-        @_inlined
+        @_inline
         def start(xd, yd, k):
             return xd, yd
 
-    @compiled_as(model.name, error_model="numpy")
+    @compile_as(model.name, error_model="numpy")
     def sampled(k):
         """Squared radius where the slope, or the factor before a pole, falls to zero."""
         low, high, found = 0.0, np.inf, False
@@ -135,11 +135,11 @@ def _compiled(model: LensModel) -> CompiledLens:
             low = at
         return low
 
-    blind_from = sampled if model.blind_from is None else _inlined(model.blind_from)
+    blind_from = sampled if model.blind_from is None else _inline(model.blind_from)
     return CompiledLens(model.name, distort, by_coefficients, undistort, start, blind_from)
 
 
-COMPILED_LENSES = tuple(_compiled(model) for model in LENS_MODELS.values())
+COMPILED_LENSES = tuple(_compile(model) for model in LENS_MODELS.values())
 USUAL = list(LENS_MODELS).index(DEFAULT)
 USUAL_WIDTH = len(LENS_MODELS[DEFAULT].coefficients)
 
@@ -155,14 +155,14 @@ def _chosen(kind: str, functions: tuple[Formula, ...], number: int = 0) -> Formu
     here = functions[number]
     if number == len(functions) - 1:
 
-        @compiled_as(f"{kind}{number}", fastmath=FAST, error_model="numpy")
+        @compile_as(f"{kind}{number}", fastmath=FAST, error_model="numpy")
         def choose(model, *arguments):
             return here(*arguments)
 
     else:
         others = _chosen(kind, functions, number + 1)
 
-        @compiled_as(f"{kind}{number}", fastmath=FAST, error_model="numpy")
+        @compile_as(f"{kind}{number}", fastmath=FAST, error_model="numpy")
         def choose(model, *arguments):
             if model == number:
                 return here(*arguments)
@@ -171,7 +171,7 @@ def _chosen(kind: str, functions: tuple[Formula, ...], number: int = 0) -> Formu
     return choose
 
 
-def in_turn(kind: str, functions: tuple[Formula, ...], number: int = 0) -> Formula:
+def chain_models(kind: str, functions: tuple[Formula, ...], number: int = 0) -> Formula:
     """One function that calls those of all models one after another, each with its model's number before the rest.
 
     Each of them does what belongs to cameras of its model, all that there is where the models are None.
@@ -179,15 +179,15 @@ def in_turn(kind: str, functions: tuple[Formula, ...], number: int = 0) -> Formu
     here = functions[number]
     if number == len(functions) - 1:
 
-        @compiled_as(f"{kind}{number}")
+        @compile_as(f"{kind}{number}")
         def last(models, *arguments):
             if models is not None:
                 here(number, models, *arguments)
 
         return last
-    others, usual = in_turn(kind, functions, number + 1), functions[USUAL]
+    others, usual = chain_models(kind, functions, number + 1), functions[USUAL]
 
-    @compiled_as(f"{kind}{number}")
+    @compile_as(f"{kind}{number}")
     def call(models, *arguments):
         if models is None:
             usual(number, models, *arguments)
@@ -201,7 +201,7 @@ def in_turn(kind: str, functions: tuple[Formula, ...], number: int = 0) -> Formu
 def _image(lens: CompiledLens, size: int) -> Formula:
     distort = lens.distort
 
-    @compiled_as(lens.name, fastmath=FAST)
+    @compile_as(lens.name, fastmath=FAST)
     def image(px, py, depth, radius_squared, k):
         squared = depth * depth
         per_depth = depth / (squared - radius_squared)
@@ -216,7 +216,7 @@ def _image(lens: CompiledLens, size: int) -> Formula:
 def _coefficients(lens: CompiledLens, size: int) -> Formula:
     by_coefficients = lens.by_coefficients
 
-    @compiled_as(lens.name, fastmath=FAST)
+    @compile_as(lens.name, fastmath=FAST)
     def fill(x, y, rr, k, along, down, at, rows):
         by_coefficients(x, y, rr, to_fixed_tuple(k, size), along, down, at, rows)
         for i in range(at + size, at + len(k)):
@@ -228,7 +228,7 @@ def _coefficients(lens: CompiledLens, size: int) -> Formula:
 def _inverse(lens: CompiledLens, size: int) -> Formula:
     inverse = lens.undistort
 
-    @compiled_as(lens.name)
+    @compile_as(lens.name)
     def undo(xd, yd, k):
         return inverse(xd, yd, to_fixed_tuple(k, size))
 

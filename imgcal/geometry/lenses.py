@@ -41,7 +41,7 @@ def lens_names(models: ModelNames, cameras: int) -> tuple[str, ...]:
     return (models,) * cameras if isinstance(models, str) else models
 
 
-def named_lenses(names: Sequence[str]) -> ModelNames:
+def lens_label(names: Sequence[str]) -> ModelNames:
     """Say it with one name where all cameras have the same lens: what is fastest."""
     return names[0] if len(set(names)) == 1 else tuple(names)
 

@@ -15,7 +15,7 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 from torch import Tensor
 
 from imgcal.geometry import kernels
-from imgcal.geometry.lens_kernels import CompiledLens, compiled_as, each_lens, in_turn
+from imgcal.geometry.lens_kernels import CompiledLens, chain_models, compile_as, each_lens
 from imgcal.geometry.lens_model import Formula
 from imgcal.geometry.lenses import DEFAULT, ModelNames, lens_codes
 from imgcal.geometry.projection import NEAREST_DEPTH, Projection
@@ -62,7 +62,7 @@ def project_cpu(
 def _projection(lens: CompiledLens, size: int) -> Formula:
     distort, blind = lens.distort, lens.blind_from
 
-    @compiled_as(lens.name, fastmath=kernels.FAST, error_model="numpy")
+    @compile_as(lens.name, fastmath=kernels.FAST, error_model="numpy")
     def project(
         number, models, points, radius_squared, rotation, translation, focal_length, principal_point, distortion,
         image_size, image,
@@ -101,7 +101,7 @@ def _projection(lens: CompiledLens, size: int) -> Formula:
     return project
 
 
-_project_all = in_turn("projection", each_lens(_projection))
+_project_all = chain_models("projection", each_lens(_projection))
 
 
 @njit(cache=True)
@@ -130,7 +130,7 @@ def undistort_cpu(xy_distorted: Tensor, distortion: Tensor, models: ModelNames =
 def _inverse(lens: CompiledLens, size: int) -> Formula:
     distort, blind, start = lens.distort, lens.blind_from, lens.start
 
-    @compiled_as(lens.name, fastmath=kernels.FAST, error_model="numpy")
+    @compile_as(lens.name, fastmath=kernels.FAST, error_model="numpy")
     def undistort(number, models, distorted, lenses, xy, good):
         rounding = 64 * np.finfo(np.float64).eps
         for b in range(distorted.shape[0]):
@@ -157,7 +157,7 @@ def _inverse(lens: CompiledLens, size: int) -> Formula:
     return undistort
 
 
-_undistort_all = in_turn("inverse", each_lens(_inverse))
+_undistort_all = chain_models("inverse", each_lens(_inverse))
 
 
 @njit(cache=True)

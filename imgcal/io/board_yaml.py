@@ -8,10 +8,10 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from imgcal.errors import InputError
-from imgcal.io.names import LONGEST_NAME, title_of
-from imgcal.io.validation import StrictModel, validated
+from imgcal.io.names import LONGEST_NAME, title_from_name
+from imgcal.io.validation import StrictModel, validate
 from imgcal.io.yaml_file import Flow, parse_foreign_yaml, yaml_text
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 from imgcal.types import Board, CalibrationObject, limits
 
 FORMAT = "imgcal-board/1"
@@ -104,18 +104,18 @@ def board_from_yaml(content: bytes, path: Path) -> CalibrationObject:
     values = parse_foreign_yaml(content, str(path))
     if not isinstance(values, dict) or values.get("format") != FORMAT:
         found = values.get("format") if isinstance(values, dict) else None
-        raise InputError(f"{path}: format: found {shortened(str(found))!r}, expected {FORMAT!r} (a printed board)")
+        raise InputError(f"{path}: format: found {shorten(str(found))!r}, expected {FORMAT!r} (a printed board)")
     kind = values.get("type")
     if kind not in _TYPES:
-        raise InputError(f"{path}: type: found {shortened(str(kind))!r}, expected one of {', '.join(_TYPES)}")
-    record = validated(values, _TYPES[kind], str(path))
+        raise InputError(f"{path}: type: found {shorten(str(kind))!r}, expected one of {', '.join(_TYPES)}")
+    record = validate(values, _TYPES[kind], str(path))
     try:
         board = record.board()
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     if len(board.points) > limits.MOST_FIDUCIALS or len(board.points) < 4:
         raise InputError(f"{path}: found {len(board.points)} points, expected 4 to {limits.MOST_FIDUCIALS}")
-    return CalibrationObject.of_board(board, record.name or title_of(path))
+    return CalibrationObject.of_board(board, record.name or title_from_name(path))
 
 
 def board_text(obj: CalibrationObject) -> str:

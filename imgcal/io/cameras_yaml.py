@@ -13,11 +13,11 @@ from pydantic import Field, model_validator
 
 from imgcal.geometry import RigidTransform
 from imgcal.io.atomic import write_text
-from imgcal.io.names import title_of
+from imgcal.io.names import title_from_name
 from imgcal.io.rig_schema import FORMAT as RIG_FORMAT
 from imgcal.io.rig_schema import CameraImages, Coefficient, Focal, Name, Pixel, check_names
 from imgcal.io.rig_yaml import load_rig
-from imgcal.io.validation import StrictModel, validated
+from imgcal.io.validation import StrictModel, validate
 from imgcal.io.yaml_file import Flow, read_yaml, yaml_text
 from imgcal.types import CameraRig, RigPrior, limits
 
@@ -86,7 +86,7 @@ def load_cameras(path: str | Path) -> CameraRig:
     """
     path = Path(path)
     if not path.is_file() or _starts_with(path, RIG_FORMAT):
-        return unplaced(load_rig(path))
+        return drop_poses(load_rig(path))
     content = read_yaml(path, _CamerasFile, FORMAT, ENTRY_NAMES)
     cameras = content.cameras
     sizes = torch.tensor([camera.image_size for camera in cameras])
@@ -99,12 +99,12 @@ def load_cameras(path: str | Path) -> CameraRig:
         cam_from_rig=RigidTransform.identity(len(cameras), dtype=torch.float64),
         image_size=sizes,
         camera_names=tuple(camera.name for camera in cameras),
-        name=content.name or title_of(path),
+        name=content.name or title_from_name(path),
     )
-    return unplaced(rig, content.focal_spread)
+    return drop_poses(rig, content.focal_spread)
 
 
-def unplaced(rig: CameraRig, focal_spread: float = FOCAL_SPREAD) -> CameraRig:
+def drop_poses(rig: CameraRig, focal_spread: float = FOCAL_SPREAD) -> CameraRig:
     """Forget the poses of a rig's cameras, and its uncertainty.
 
     Args:
@@ -113,7 +113,7 @@ def unplaced(rig: CameraRig, focal_spread: float = FOCAL_SPREAD) -> CameraRig:
 
     Examples:
         >>> from imgcal.io import load_rig
-        >>> cameras = unplaced(load_rig("T4"))
+        >>> cameras = drop_poses(load_rig("T4"))
         >>> float(cameras.positions.abs().max()), cameras.prior.focal_length
         (0.0, 0.15)
     """
@@ -145,7 +145,7 @@ def save_cameras(image_size: Mapping[str, tuple[int, int]], field_of_view_deg: f
             for name, size in image_size.items()
         ],
     }
-    validated(content, _CamerasFile, f"{path}: not written", ENTRY_NAMES)
+    validate(content, _CamerasFile, f"{path}: not written", ENTRY_NAMES)
     write_text(path, yaml_text(content))
 
 

@@ -22,9 +22,9 @@ from imgcal.io.frames import IMAGE_SUFFIXES, TIFF_SUFFIXES, VIDEO_SUFFIXES, Fram
 from imgcal.io.names import is_file_name, natural_key, nearest
 from imgcal.io.publication import is_unfinished
 from imgcal.io.resources import sample_path
-from imgcal.io.validation import StrictModel, validated
+from imgcal.io.validation import StrictModel, validate
 from imgcal.io.yaml_file import read_yaml, yaml_text
-from imgcal.messages import listed
+from imgcal.messages import list_names
 from imgcal.types import CameraRig, Detections
 
 FORMAT = "imgcal-capture/1"
@@ -151,7 +151,7 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None, videos_differ
     if not frames.is_dir() and is_unfinished(folder):
         raise InputError(f"{folder}: found a capture that was not finished, expected a complete one")
     if not frames.is_dir():
-        found = listed(path.name for path in _listing(folder)) or "an empty folder"
+        found = list_names(path.name for path in _listing(folder)) or "an empty folder"
         raise InputError(f"{folder}: found {found}, expected a capture that holds frames/<camera name>/")
     files: dict[str, dict[str, tuple[Path, int]]] = {}
     for path in _listing(frames):
@@ -169,7 +169,7 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None, videos_differ
     masks = folder / "masks"
     for path in _listing(masks) if masks.exists() else ():
         if path.stem not in names or path.suffix.lower() != ".png":
-            raise InputError(f"{path}: expected masks named <camera name>.png, cameras: {listed(names)}")
+            raise InputError(f"{path}: expected masks named <camera name>.png, cameras: {list_names(names)}")
     settings = folder / "capture.yaml"
     return Capture(
         folder=folder,
@@ -210,7 +210,7 @@ def save_capture_settings(folder: str | Path, bit_depth: int, note: str | None =
     if note is not None:
         content["note"] = note
     path = Path(folder) / "capture.yaml"
-    validated(content, _Settings, f"{path}: not written")
+    validate(content, _Settings, f"{path}: not written")
     write_text(path, yaml_text(content))
 
 
@@ -283,8 +283,8 @@ def _check_cameras(frames: Path, found: Iterable[str], rig: CameraRig) -> None:
     if unknown:
         hint = f"; put the snapshots into {frames / rig.camera_names[0]}" if rig.num_cameras == 1 else ""
         raise InputError(
-            f"{frames}: found {listed(unknown)}, expected the cameras of rig {rig.name}: "
-            f"{listed(rig.camera_names)}{nearest(unknown[0], rig.camera_names)}{hint}"
+            f"{frames}: found {list_names(unknown)}, expected the cameras of rig {rig.name}: "
+            f"{list_names(rig.camera_names)}{nearest(unknown[0], rig.camera_names)}{hint}"
         )
 
 

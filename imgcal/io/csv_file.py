@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from imgcal.errors import InputError
 from imgcal.io.names import check_regular, nearest
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 from imgcal.types import Range
 
 Numbers = NDArray[np.float64]
@@ -63,13 +63,13 @@ class Chunk:
             values = np.fromiter(map(float, column), dtype=np.float64, count=len(column))
         except ValueError:
             row = next(i for i, text in enumerate(column) if not _is_float(text))
-            self.fail(row, f"{name}: found {shortened(column[row])!r}, expected {expected}")
+            self.fail(row, f"{name}: found {shorten(column[row])!r}, expected {expected}")
         wrong = ~((values >= plausible.low) & (values <= plausible.high))
         if whole:
             wrong |= values != np.trunc(values)
         if wrong.any():
             row = int(wrong.argmax())
-            self.fail(row, f"{name}: found {shortened(column[row])}, expected {expected}")
+            self.fail(row, f"{name}: found {shorten(column[row])}, expected {expected}")
         return values
 
 
@@ -176,7 +176,7 @@ def _check_header(path: Path, header: list[str], required: Sequence[str], option
     known = (*required, *optional)
     for name in header:
         if name not in known:
-            raise InputError(f"{path}: unknown column {shortened(name)!r}{nearest(name, known)}; {expected}")
+            raise InputError(f"{path}: unknown column {shorten(name)!r}{nearest(name, known)}; {expected}")
         if header.count(name) > 1:
             raise InputError(f"{path}: found the column {name} more than once, {expected}")
     missing = [name for name in required if name not in header]

@@ -24,7 +24,7 @@ from imgcal.errors import InputError
 from imgcal.io.atomic import replacing
 from imgcal.io.csv_file import Chunk, fail_row, read_chunks
 from imgcal.io.names import is_file_name, nearest
-from imgcal.messages import listed, shortened
+from imgcal.messages import list_names, shorten
 from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections, limits
 
 REQUIRED = ("snapshot", "camera", "u", "v")
@@ -117,7 +117,7 @@ def save_detections(detections: Detections, path: str | Path, obj: CalibrationOb
     path = Path(path)
     for name in (*detections.camera_names, *detections.snapshot_names):
         if not is_file_name(name):
-            raise InputError(f"{path}: not written: found {shortened(name)!r}, expected a name that can be a file name")
+            raise InputError(f"{path}: not written: found {shorten(name)!r}, expected a name that can be a file name")
     labelled, known = detections.fiducial >= 0, np.isfinite(detections.radius)
     columns = {
         "snapshot": map(detections.snapshot_names.__getitem__, detections.snapshot.tolist()),
@@ -153,7 +153,7 @@ def _indices(chunk: Chunk, column: str, known: dict[str, int], allowed: tuple[st
     if allowed is None:
         for name in dict.fromkeys(names):
             if name not in known and not is_file_name(name):
-                found = repr(shortened(name)) if name else "an empty cell"
+                found = repr(shorten(name)) if name else "an empty cell"
                 chunk.fail(names.index(name), f"{column}: found {found}, expected a name that can be a file name")
             known.setdefault(name, len(known))
     else:
@@ -161,8 +161,8 @@ def _indices(chunk: Chunk, column: str, known: dict[str, int], allowed: tuple[st
         if unknown is not None:
             chunk.fail(
                 names.index(unknown),
-                f"camera: found {shortened(unknown)!r} (this file: {shortened(', '.join(dict.fromkeys(names)))}), "
-                f"expected a camera of the rig: {listed(allowed)}{nearest(unknown, allowed)}",
+                f"camera: found {shorten(unknown)!r} (this file: {shorten(', '.join(dict.fromkeys(names)))}), "
+                f"expected a camera of the rig: {list_names(allowed)}{nearest(unknown, allowed)}",
             )
     return np.fromiter(map(known.__getitem__, names), dtype=np.int64, count=len(names))
 
@@ -176,13 +176,13 @@ def _numbers(chunk: Chunk, fiducials: Fiducials | None) -> dict[str, NDArray[np.
         result["sigma"] = chunk.numbers("sigma", limits.SIGMA, f"a standard deviation > 0, {limits.SIGMA}")
     result["fiducial"] = np.full(count, -1.0)
     if "fiducial" in chunk.columns:
-        filled = _filled(chunk, "fiducial", "-1")
+        filled = _fill_column(chunk, "fiducial", "-1")
         if isinstance(fiducials, Sequence) and isinstance(fiducials[0], tuple):
             result["fiducial"] = _rows_of_several(filled, [key for key in fiducials if isinstance(key, tuple)])
         elif len({name for name in chunk.columns.get("object", ()) if name}) > 1:
             chunk.fail(0, "object: found labels of several objects, expected those of one; name all of them")
         elif isinstance(fiducials, Sequence):
-            result["fiducial"] = _rows_of(filled, fiducials)
+            result["fiducial"] = _replace_labels(filled, fiducials)
         else:
             last = limits.MOST_FIDUCIALS if fiducials is None else fiducials - 1
             result["fiducial"] = filled.numbers(
@@ -190,7 +190,9 @@ def _numbers(chunk: Chunk, fiducials: Fiducials | None) -> dict[str, NDArray[np.
             )
     result["radius"] = np.full(count, np.nan)
     if "radius" in chunk.columns:
-        radius = _filled(chunk, "radius", "0").numbers("radius", limits.BLOB_RADIUS, f"a radius, {limits.BLOB_RADIUS}")
+        radius = _fill_column(chunk, "radius", "0").numbers(
+            "radius", limits.BLOB_RADIUS, f"a radius, {limits.BLOB_RADIUS}"
+        )
         result["radius"] = np.where(radius > 0, radius, np.nan)
     result["flags"] = np.zeros(count)
     if "flags" in chunk.columns:
@@ -210,13 +212,13 @@ def _rows_of_several(chunk: Chunk, keys: Sequence[tuple[str, int]]) -> NDArray[n
     if -2 in rows:
         bad = rows.index(-2)
         if objects[bad] not in known:
-            found = f"found {shortened(objects[bad])!r}" if "object" in chunk.columns else "found no such column"
-            chunk.fail(bad, f"object: {found}, expected the object of each labelled blob: {listed(known)}")
+            found = f"found {shorten(objects[bad])!r}" if "object" in chunk.columns else "found no such column"
+            chunk.fail(bad, f"object: {found}, expected the object of each labelled blob: {list_names(known)}")
         chunk.fail(bad, f"fiducial: found {named[bad]}, expected a fiducial of object {objects[bad]}")
     return np.array(rows, dtype=np.float64)
 
 
-def _rows_of(chunk: Chunk, labels: Sequence[Any]) -> NDArray[np.float64]:
+def _replace_labels(chunk: Chunk, labels: Sequence[Any]) -> NDArray[np.float64]:
     """Replace what a table calls the fiducials by their rows in the object."""
     plausible = limits.Range(-1, 2**31 - 1, "")
     named = chunk.numbers("fiducial", plausible, "a number of the object's column `fiducial`", whole=True)
@@ -226,12 +228,12 @@ def _rows_of(chunk: Chunk, labels: Sequence[Any]) -> NDArray[np.float64]:
         chunk.fail(
             unknown[0],
             f"fiducial: found {int(named[unknown[0]])}, expected a number of the object's column `fiducial`: "
-            f"{listed([str(label) for label in labels])}",
+            f"{list_names([str(label) for label in labels])}",
         )
     return np.array([row[label] for label in named.astype(int).tolist()], dtype=np.float64)
 
 
-def _filled(chunk: Chunk, column: str, default: str) -> Chunk:
+def _fill_column(chunk: Chunk, column: str, default: str) -> Chunk:
     """Replace the empty cells of a column."""
     cells = tuple(cell or default for cell in chunk.columns[column])
     return Chunk(chunk.path, chunk.first_row, {**chunk.columns, column: cells})
@@ -243,7 +245,7 @@ def _check_inside(chunk: Chunk, part: dict[str, NDArray[Any]], rig: CameraRig) -
     outside = ((uv < -0.5 - MARGIN) | (uv > size - 0.5 + MARGIN)).any(axis=1)
     if outside.any():
         row = int(outside.argmax())
-        u, v = (shortened(chunk.columns[axis][row]) for axis in "uv")
+        u, v = (shorten(chunk.columns[axis][row]) for axis in "uv")
         camera, (width, height) = chunk.columns["camera"][row], size[row]
         chunk.fail(
             row,

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from imgcal.errors import InputError
 from imgcal.io.atomic import write_bytes
-from imgcal.io.image_headers import PNG_SIGNATURE, Size, check_pixels, is_of_kind, size_of, tiff_pages
+from imgcal.io.image_headers import PNG_SIGNATURE, Size, check_pixels, has_kind, image_size, tiff_pages
 from imgcal.io.names import check_regular
-from imgcal.io.silence import silenced
+from imgcal.io.silence import silence_stderr
 
 Frame = NDArray[np.uint8] | NDArray[np.uint16]  # (H, W) grey
 
@@ -75,13 +75,13 @@ def read_frame(path: str | Path, page: int = 0, size: Size | None = None) -> Fra
             pages = tiff_pages(path)
             if page < len(pages):
                 _require_size(path, pages[page], size)
-            with silenced():
+            with silence_stderr():
                 found, images = cv2.imreadmulti(str(path), start=page, count=1, flags=cv2.IMREAD_UNCHANGED)
             image = images[0] if found and images else None
         else:
             content = _content(path)
-            _require_size(path, size_of(path.suffix.lower(), content), size)
-            with silenced():
+            _require_size(path, image_size(path.suffix.lower(), content), size)
+            with silence_stderr():
                 image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
@@ -145,9 +145,9 @@ class Video:
                 start = file.read(8)
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-        if not is_of_kind(path.suffix.lower(), start):  # a list of other files, for example, would be followed
+        if not has_kind(path.suffix.lower(), start):  # a list of other files, for example, would be followed
             raise InputError(f"{path}: found a damaged or empty file, expected a video")
-        with silenced():
+        with silence_stderr():
             self._capture = cv2.VideoCapture(str(path))
             announced, rate, *size = (self._capture.get(name) for name in VIDEO_PROPERTIES)
         try:
@@ -176,7 +176,7 @@ class Video:
         if index < self._next:
             raise ValueError(f"{self.path}: frame {index} after frame {self._next - 1}; a video is read forwards")
         good, image = True, None
-        with silenced():
+        with silence_stderr():
             while good and self._next < index:
                 good = self._capture.grab()
                 self._next += 1
@@ -237,7 +237,7 @@ def _content(path: Path) -> bytes:
     suffix = path.suffix.lower()
     if not content:
         raise InputError(f"{path}: found an empty file, expected an image")
-    if not is_of_kind(suffix, content):
+    if not has_kind(suffix, content):
         raise InputError(f"{path}: found a file of another kind, expected a {suffix[1:].upper()} image")
     if suffix in JPEG_SUFFIXES and JPEG_END not in content[-END_OF_JPEG:]:
         raise InputError(f"{path}: found a truncated JPEG of {len(content)} bytes, expected its end")

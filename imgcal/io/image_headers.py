@@ -36,14 +36,14 @@ JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start-of-frame
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_SAMPLES = 256, 257, 277
 
 
-def is_of_kind(suffix: str, start: bytes) -> bool:
+def has_kind(suffix: str, start: bytes) -> bool:
     """Tell whether the first bytes of a file are those of its suffix, in lower case."""
     if suffix in (".mp4", ".mov"):
         return start[4:8] in MOVIE_ATOMS
     return start.startswith(SIGNATURES[suffix])
 
 
-def size_of(suffix: str, content: bytes) -> Size | None:
+def image_size(suffix: str, content: bytes) -> Size | None:
     """Find the size of a PNG, BMP, PGM or JPEG image; None when the header is damaged."""
     try:
         if suffix == ".png":
@@ -100,11 +100,11 @@ def _tiff_pages(path: Path, size: int, changed: int) -> tuple[Size, ...]:
         offset, pages = _unpack(file, offset_format, path), dict[int, Size]()
         while offset and offset not in pages:
             if offset > size:
-                raise _truncated(path)
+                raise _truncated_error(path)
             file.seek(offset)
             entries = _unpack(file, count_format, path)
             if entries * 12 > size or len(pages) == MOST_PAGES:
-                raise _truncated(path)
+                raise _truncated_error(path)
             pages[offset] = _page_size(path, file, entries, order, big)
             offset = _unpack(file, offset_format, path)
     return tuple(pages.values())
@@ -114,7 +114,7 @@ def _page_size(path: Path, file: BinaryIO, entries: int, order: str, big: bool) 
     entry = 20 if big else 12
     content = file.read(entries * entry)
     if len(content) < entries * entry:
-        raise _truncated(path)
+        raise _truncated_error(path)
     values = {TIFF_WIDTH: 0, TIFF_HEIGHT: 0, TIFF_SAMPLES: 1}
     for start in range(0, len(content), entry):
         tag, kind = struct.unpack_from(order + "HH", content, start)
@@ -130,11 +130,11 @@ def _page_size(path: Path, file: BinaryIO, entries: int, order: str, big: bool) 
 def _unpack(file: BinaryIO, number_format: str, path: Path) -> int:
     content = file.read(struct.calcsize(number_format))
     if len(content) < struct.calcsize(number_format):
-        raise _truncated(path)
+        raise _truncated_error(path)
     return int(struct.unpack(number_format, content)[0])
 
 
-def _truncated(path: Path) -> InputError:
+def _truncated_error(path: Path) -> InputError:
     return InputError(f"{path}: found a truncated TIFF of {path.stat().st_size} bytes, expected more")
 
 

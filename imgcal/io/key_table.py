@@ -13,8 +13,8 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from imgcal.io.validation import annotations_of, records_in
-from imgcal.messages import shortened
+from imgcal.io.validation import field_annotations, records_in
+from imgcal.messages import shorten
 
 # What a schema says of a type, and the words for it.
 NAMES = {"integer": "integer", "number": "number", "string": "text", "boolean": "true or false", "null": "null"}
@@ -32,23 +32,23 @@ class Key:
     meaning: str  # empty where the source says nothing
 
 
-def keys_of(record: type, prefix: str = "") -> Iterator[Key]:
+def list_keys(record: type, prefix: str = "") -> Iterator[Key]:
     """List the keys of a record, and of the records within it, in the order of their fields.
 
     Args:
         record: a `StrictModel` or a `StrictRecord`.
         prefix: of the paths, such as "training.".
     """
-    schema, meanings = TypeAdapter(record).json_schema(), comments_of(record)
+    schema, meanings = TypeAdapter(record).json_schema(), field_comments(record)
     required, shared = schema.get("required", ()), schema.get("$defs", {})
-    for name, annotation in annotations_of(record).items():
+    for name, annotation in field_annotations(record).items():
         inner = records_in(annotation)
         if len(inner) == 1:
-            yield from keys_of(inner[0], f"{prefix}{name}.")
+            yield from list_keys(inner[0], f"{prefix}{name}.")
             continue
         if inner:  # one of several, by the keys that are given: defaults are those of the kind
             for one in inner:
-                yield from (replace(key, default="") for key in keys_of(one, f"{prefix}{name}."))
+                yield from (replace(key, default="") for key in list_keys(one, f"{prefix}{name}."))
             continue
         found = schema["properties"][name]
         default = "" if name in required else _value(found.get("default"))
@@ -56,7 +56,7 @@ def keys_of(record: type, prefix: str = "") -> Iterator[Key]:
 
 
 @cache
-def comments_of(record: type) -> Mapping[str, str]:
+def field_comments(record: type) -> Mapping[str, str]:
     """Read the comments behind the fields of a class and of its bases, by the name of the field."""
     found: dict[str, str] = {}
     for one in reversed(record.__mro__):
@@ -115,7 +115,7 @@ def _value(default: Any) -> str:
         case None | True | False:
             return {None: "null", True: "true", False: "false"}[default]
         case str():
-            return shortened(default) or '""'
+            return shorten(default) or '""'
         case list() | tuple():
             return f"[{', '.join(map(_value, default))}]"
         case float():

@@ -35,7 +35,7 @@ def is_file_name(name: str) -> bool:
     return sound and 0 < len(name.encode()) <= LONGEST_NAME
 
 
-def title_of(path: Path) -> str:
+def title_from_name(path: Path) -> str:
     """Make a title from a file name, which need not be text."""
     name = "".join(c if c.isprintable() else "?" for c in path.stem)
     return name[:LONGEST_NAME]
@@ -68,7 +68,7 @@ def model_file(path: str | Path) -> Path:
 
 def model_name(path: Path) -> str:
     """Name a network by its file, or by the folder where a training run has put it."""
-    return title_of(path.absolute().parent if path.name == MODEL else path)
+    return title_from_name(path.absolute().parent if path.name == MODEL else path)
 
 
 def find_file(path: str | Path, kind: str, suffix: str, other: str | None = None) -> Path:

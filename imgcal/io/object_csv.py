@@ -20,9 +20,9 @@ from imgcal.errors import InputError
 from imgcal.io.atomic import write_text
 from imgcal.io.board_yaml import board_from_yaml, board_text
 from imgcal.io.csv_file import Chunk, read_chunks
-from imgcal.io.names import LONGEST_NAME, check_regular, find_file, title_of
+from imgcal.io.names import LONGEST_NAME, check_regular, find_file, title_from_name
 from imgcal.io.resources import data_path, shipped_names
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 from imgcal.types import CalibrationObject, limits
 from renderers.palette import palette
 
@@ -113,12 +113,12 @@ def _read(path: Path, content: bytes | None = None) -> CalibrationObject:
     names = tuple(name.strip() for name in chunk.columns.get("name", ()))
     for row, name in enumerate(names):
         if not _is_name(name) or name in names[:row]:
-            chunk.fail(row, f"name: found {shortened(name)!r}, expected {NAME}")
+            chunk.fail(row, f"name: found {shorten(name)!r}, expected {NAME}")
     return CalibrationObject(
         torch.from_numpy(points),
         palette(count).double(),
         radius,
-        title_of(path),
+        title_from_name(path),
         names,
         tolerance,
         labels=_labels(chunk),
@@ -160,7 +160,7 @@ def object_text(obj: CalibrationObject, where: str | Path = "object") -> str:
     names = obj.fiducial_names
     for row, name in enumerate(names):
         if not _is_name(name) or name in names[:row]:
-            raise InputError(f"{where}: not written: found the name {shortened(name)!r}, expected {NAME}")
+            raise InputError(f"{where}: not written: found the name {shorten(name)!r}, expected {NAME}")
     columns: list[list[str]] = [[f"{value!r}" for value in axis] for axis in obj.points.double().T.tolist()]
     header = ["x", "y", "z"]
     if obj.labels:

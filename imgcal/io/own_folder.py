@@ -47,7 +47,7 @@ def holding(folder: str | Path) -> Iterator[Path]:
     except OSError as error:
         raise InputError(f"{folder}: cannot be made: {error.strerror or error}") from error
     try:
-        with _locked(folder):
+        with _lock(folder):
             yield folder
     finally:
         for made in missing:
@@ -56,7 +56,7 @@ def holding(folder: str | Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def _lock(folder: Path) -> Iterator[None]:
     if fcntl is None:
         yield
         return

@@ -14,7 +14,7 @@ from imgcal.errors import InputError
 from imgcal.geometry import LENS_MODELS, LensModel
 from imgcal.io.names import LONGEST_NAME, is_file_name
 from imgcal.io.validation import StrictModel
-from imgcal.messages import listed, quoted
+from imgcal.messages import list_names, quote
 from imgcal.types import DriftRate, RigPrior, Volume, limits, parameter_names
 
 FORMAT = "imgcal-rig/1"
@@ -79,7 +79,7 @@ class CameraImages(StrictModel):
     def _has_images(self) -> Self:
         # The name is also a file name in a capture and a cell of a CSV file.
         if not is_file_name(self.name):
-            raise ValueError(f"found the camera name {quoted(self.name)!r}, expected a name that can be a file name")
+            raise ValueError(f"found the camera name {quote(self.name)!r}, expected a name that can be a file name")
         if math.prod(self.image_size) > limits.MOST_PIXELS:
             raise ValueError(f"image_size: found {self.image_size}, expected at most {limits.MOST_PIXELS:,} pixels")
         return self
@@ -102,7 +102,7 @@ class CameraEntry(CameraImages):
 
     def _check_lens(self) -> None:
         if self.model not in LENS_MODELS:
-            raise ValueError(f"model: found {quoted(self.model)!r}, expected one of {listed(LENS_MODELS)}")
+            raise ValueError(f"model: found {quote(self.model)!r}, expected one of {list_names(LENS_MODELS)}")
         model = LENS_MODELS[self.model]
         names, count = ", ".join(model.coefficients), len(model.coefficients)
         for key, values in (("distortion", self.distortion), ("std", self.std.distortion if self.std else None)):
@@ -202,13 +202,13 @@ class RigFile(StrictModel):
         check_names(names)
         given = [camera.name for camera in self.cameras if camera.std is not None]
         if given and len(given) < len(names):
-            raise ValueError(f"found `std` for {listed(given)} only, expected it for all cameras or none")
+            raise ValueError(f"found `std` for {list_names(given)} only, expected it for all cameras or none")
         if bool(given) != (self.covariance is not None):
             raise ValueError(
                 "expected `std` of the cameras and the block `covariance` together, found only one of them"
             )
         if self.covariance is not None:
-            _check_covariance(self.covariance, self.cameras, std_of(self))
+            _check_covariance(self.covariance, self.cameras, collect_std(self))
         return self
 
 
@@ -219,7 +219,7 @@ def check_names(names: list[str]) -> None:
         raise ValueError(f"found the camera name {twice} more than once, expected different names")
 
 
-def std_of(content: RigFile) -> Tensor:
+def collect_std(content: RigFile) -> Tensor:
     """Collect the standard deviations of all cameras: (C, K)."""
     rows = [[v for part in camera.std.model_dump().values() for v in part] for camera in content.cameras if camera.std]
     width = len(parameter_names([camera.model for camera in content.cameras]))
@@ -230,7 +230,7 @@ def _check_covariance(covariance: _Covariance, cameras: list[CameraEntry], std: 
     names, expected = [camera.name for camera in cameras], parameter_names([camera.model for camera in cameras])
     if covariance.reference_camera is not None and covariance.reference_camera not in names:
         found = covariance.reference_camera
-        raise ValueError(f"covariance: found reference_camera {found}, expected one of {listed(names)}")
+        raise ValueError(f"covariance: found reference_camera {found}, expected one of {list_names(names)}")
     if tuple(covariance.parameters) != expected:
         raise ValueError(f"covariance: found other parameters than {', '.join(expected)}, or another order")
     if covariance.matrix is None:

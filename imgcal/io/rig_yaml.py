@@ -14,16 +14,16 @@ from imgcal.errors import InputError
 from imgcal.geometry import (
     LENS_MODELS,
     RigidTransform,
+    lens_label,
     lens_width,
-    named_lenses,
     rotation_from_vector,
     vector_from_rotation,
 )
 from imgcal.io.atomic import write_text
-from imgcal.io.names import find_file, is_file_name, title_of
+from imgcal.io.names import find_file, is_file_name, title_from_name
 from imgcal.io.posterior_file import read_posterior, write_posterior
-from imgcal.io.rig_schema import ENTRY_NAMES, FORMAT, CameraEntry, RigFile, Std, std_of
-from imgcal.io.validation import validated
+from imgcal.io.rig_schema import ENTRY_NAMES, FORMAT, CameraEntry, RigFile, Std, collect_std
+from imgcal.io.validation import validate
 from imgcal.io.yaml_file import Flow, FlowMap, read_yaml, record_from_yaml, yaml_text
 from imgcal.types import CameraRig, DriftRate, RigPosterior, RigPrior, Volume, parameter_names
 
@@ -65,7 +65,7 @@ def load_rig(path: str | Path) -> CameraRig:
         ('O10', 10, 850.14)
     """
     content, path = _read(path)
-    rig = _rig_of(content, title_of(path))
+    rig = _parse_rig(content, title_from_name(path))
     if content.posterior is None or not is_file_name(content.posterior):
         return rig
     beside = path.with_name(content.posterior)
@@ -79,7 +79,7 @@ def rig_from_text(text: str, where: str) -> CameraRig:
         InputError: as `load_rig`.
     """
     content = record_from_yaml(text.encode(errors="replace"), where, RigFile, FORMAT, ENTRY_NAMES)
-    return _rig_of(content, where)
+    return _parse_rig(content, where)
 
 
 def load_rig_covariance(path: str | Path) -> RigCovariance | None:
@@ -89,7 +89,7 @@ def load_rig_covariance(path: str | Path) -> RigCovariance | None:
         return None
     reference_camera = content.covariance.reference_camera
     if content.covariance.matrix is None:
-        return RigCovariance(std_of(content), None, reference_camera)
+        return RigCovariance(collect_std(content), None, reference_camera)
     matrix = torch.tensor(content.covariance.matrix, dtype=torch.float64)
     return RigCovariance.from_matrix(matrix, len(content.cameras), reference_camera)
 
@@ -141,7 +141,7 @@ def rig_text(
     if rig.batch_shape:
         raise InputError(f"{where}: found a batch of rigs of shape {tuple(rig.batch_shape)}, expected one rig")
     if covariance is not None:
-        covariance = _narrowed(covariance, rig)
+        covariance = _narrow(covariance, rig)
     content: dict[str, Any] = {"format": FORMAT, "name": rig.name}
     if rig.working_distance is not None:
         content["working_distance"] = rig.working_distance
@@ -154,7 +154,7 @@ def rig_text(
         content["volume"] = _volume_entry(rig.volume)
     if covariance is not None:
         content["covariance"] = _covariance_entry(covariance, rig, full, where)
-    validated(content, RigFile, f"{where}: not written", ENTRY_NAMES)
+    validate(content, RigFile, f"{where}: not written", ENTRY_NAMES)
     return yaml_text(content)
 
 
@@ -163,10 +163,10 @@ def _read(path: str | Path) -> tuple[RigFile, Path]:
     return read_yaml(path, RigFile, FORMAT, ENTRY_NAMES), path
 
 
-def _rig_of(content: RigFile, name: str) -> CameraRig:
+def _parse_rig(content: RigFile, name: str) -> CameraRig:
     """The rig of a file; `name` is used if the file has none."""
     cameras = content.cameras
-    models = named_lenses([camera.model for camera in cameras])
+    models = lens_label([camera.model for camera in cameras])
     width = lens_width(models)
 
     def column(values: list[list[float]]) -> Tensor:
@@ -222,7 +222,7 @@ def _volume_entry(volume: Volume) -> dict[str, Any]:
     return {"points": [Flow(point) for point in volume.points]}
 
 
-def _narrowed(covariance: RigCovariance, rig: CameraRig) -> RigCovariance:
+def _narrow(covariance: RigCovariance, rig: CameraRig) -> RigCovariance:
     """Leave out coefficients that no camera has: some of a wider rig."""
     cameras, kept = rig.num_cameras, len(parameter_names(rig.lens_models))
     matrix = covariance.matrix

@@ -13,7 +13,7 @@ _kept = -1  # standard error meanwhile
 
 
 @contextlib.contextmanager
-def silenced() -> Iterator[None]:
+def silence_stderr() -> Iterator[None]:
     """Redirect file descriptor 2 to nowhere: libpng, libjpeg and FFmpeg write there regardless of settings."""
     global _within, _kept
     with _lock:

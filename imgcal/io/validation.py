@@ -13,7 +13,7 @@ from pydantic_core import CoreSchema
 
 from imgcal.errors import InputError
 from imgcal.io.names import nearest
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 
 MOST_PROBLEMS = 1000  # that are looked at one by one
 STRICT = ConfigDict(extra="forbid", strict=True, frozen=True)
@@ -40,7 +40,7 @@ class StrictRecord:
         Raises:
             InputError: one line with the field, what was found and what was expected.
         """
-        content, model = dict(vars(self)), _model_of(type(self))  # type: ignore[arg-type]
+        content, model = dict(vars(self)), _make_model(type(self))  # type: ignore[arg-type]
         try:
             checked = model.model_validate(content)
         except ValidationError as error:
@@ -62,7 +62,7 @@ class StrictRecord:
 Model = TypeVar("Model", bound=StrictModel)
 
 
-def validated(
+def validate(
     content: dict[str, Any], model: type[Model], where: str, entry_names: Mapping[str, str] | None = None
 ) -> Model:
     """Validate plain values, read or about to be written.
@@ -83,7 +83,7 @@ def validated(
 
 
 @cache
-def _model_of(record: type[StrictRecord]) -> type[BaseModel]:
+def _make_model(record: type[StrictRecord]) -> type[BaseModel]:
     """A model with the fields of a dataclass."""
     hints = get_type_hints(record, include_extras=True)
     own: dict[str, Any] = {field.name: (hints[field.name], ...) for field in fields(record)}  # type: ignore[arg-type]
@@ -104,7 +104,7 @@ def _summary(error: ValidationError, content: Any, model: type, entry_names: Map
     context = first.get("ctx", {})
     match first["type"]:
         case "extra_forbidden" | "unexpected_keyword_argument":
-            key = shortened(str(location[-1]))
+            key = shorten(str(location[-1]))
             known = _keys(model, location[:-1])
             before = _place(location[:-1], content, entry_names)
             return f"{before}unknown key `{key}`{nearest(key, known) or ', expected one of ' + ', '.join(known)}{more}"
@@ -132,11 +132,11 @@ def _place(location: tuple[str | int, ...], content: Any, entry_names: Mapping[s
             content = None
         if isinstance(step, int) and previous in entry_names:
             name = content.get("name") if isinstance(content, dict) else None
-            words[-1] = f"{entry_names[previous]} {shortened(name) if isinstance(name, str) else f'number {step + 1}'}"
+            words[-1] = f"{entry_names[previous]} {shorten(name) if isinstance(name, str) else f'number {step + 1}'}"
         elif isinstance(step, int):
             words[-1] += f"[{step}]"
         else:
-            words.append(shortened(step))
+            words.append(shorten(step))
         previous = str(step)
     return "".join(word + ": " for word in words)
 
@@ -146,12 +146,12 @@ def _keys(record: type, location: tuple[str | int, ...]) -> list[str]:
     records = [record]
     for step in location:
         if isinstance(step, str):
-            annotations = [annotations_of(one)[step] for one in records if step in annotations_of(one)]
+            annotations = [field_annotations(one)[step] for one in records if step in field_annotations(one)]
             records = [inner for annotation in annotations for inner in records_in(annotation)]
-    return [key for one in records for key in annotations_of(one)]
+    return [key for one in records for key in field_annotations(one)]
 
 
-def annotations_of(record: type) -> dict[str, Any]:
+def field_annotations(record: type) -> dict[str, Any]:
     """Name the fields of a record, with what each may be."""
     if issubclass(record, BaseModel):
         return {name: field.annotation for name, field in record.model_fields.items()}

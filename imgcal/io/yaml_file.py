@@ -12,9 +12,9 @@ import yaml
 
 from imgcal.errors import InputError
 from imgcal.io.names import check_regular
-from imgcal.io.validation import Model, validated
+from imgcal.io.validation import Model, validate
 from imgcal.io.yaml_values import read_values
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 
 MOST_BYTES = 2**26
 INSTEAD = {
@@ -55,7 +55,7 @@ def record_from_yaml(
     content: bytes, where: str, model: type[Model], file_format: str, entry_names: Mapping[str, str] | None = None
 ) -> Model:
     """Do the work of `read_yaml` on the text of a file; errors begin with `where`."""
-    return validated(_formatted(content, where, file_format), model, where, entry_names)
+    return validate(_check_format(content, where, file_format), model, where, entry_names)
 
 
 def read_yaml_mapping(path: Path, file_format: str) -> dict[str, Any]:
@@ -64,7 +64,7 @@ def read_yaml_mapping(path: Path, file_format: str) -> dict[str, Any]:
     Raises:
         InputError: one line with the file, what was found and what was expected.
     """
-    return _formatted(_content(path), str(path), file_format)
+    return _check_format(_content(path), str(path), file_format)
 
 
 def is_prose(text: str) -> bool:
@@ -93,10 +93,10 @@ def _has_sentence(line: str) -> bool:
 def looks_like(text: str) -> str:
     """Guess what an unreadable text is, by its first line."""
     first = next((line.strip() for line in text.splitlines() if line.strip()), "")
-    return f"text for people (it begins `{shortened(first)}`)"
+    return f"text for people (it begins `{shorten(first)}`)"
 
 
-def _formatted(content: bytes, where: str, file_format: str) -> dict[str, Any]:
+def _check_format(content: bytes, where: str, file_format: str) -> dict[str, Any]:
     try:
         values = _parse(content, where)
     except InputError:

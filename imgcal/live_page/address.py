@@ -9,7 +9,7 @@ import socket
 from dataclasses import dataclass
 
 from imgcal.errors import InputError
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 
 THIS_MACHINE, PORT = "127.0.0.1", 8765
 TOKEN_BYTES, LEAST_TOKEN = 24, 16
@@ -70,7 +70,7 @@ def parse_address(text: str | None) -> Address:
     match = re.fullmatch(r"(?:(?P<only>\d{1,5})|(?P<host>\[[0-9a-fA-F:.]+\]|[\w.-]*)(?::(?P<port>\d{1,5}))?)", given)
     port = int((match["only"] or match["port"] or PORT) if match else PORT)
     if match is None or port > 65535:
-        raise InputError(f"address: found {shortened(given)!r}, expected HOST:PORT, such as 127.0.0.1:{PORT}")
+        raise InputError(f"address: found {shorten(given)!r}, expected HOST:PORT, such as 127.0.0.1:{PORT}")
     return Address((match["host"] or THIS_MACHINE).strip("[]"), port)
 
 
@@ -84,7 +84,7 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def checked_token(token: str | None) -> str:
+def check_token(token: str | None) -> str:
     """Make a token, or check one that was given.
 
     Raises:

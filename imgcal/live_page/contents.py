@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 import imgcal
 from imgcal.estimation import WorkingVolume
+from imgcal.live_page.acknowledgements import Acknowledgements
 from imgcal.live_page.address import Address
-from imgcal.live_page.arrangement import arrangement
 from imgcal.live_page.commands import Action
-from imgcal.live_page.notes import Notes
+from imgcal.live_page.rig_drawing import arrangement
 from imgcal.online import Event, RigState
 from imgcal.types import CalibrationObject, CameraRig
 
@@ -53,7 +53,7 @@ def greeting(
         "volume": (volume.low.double().numpy(), volume.high.double().numpy()),
         "image_size": rig.image_size.numpy(),
         "arrangement": arrangement(rig, volume),
-        "notes": Notes(),
+        "notes": Acknowledgements(),
     }
 
 

@@ -95,7 +95,7 @@ class Demonstration:
     def step(self, seconds: float) -> RigState | None:
         """Run the commands that are waiting, and take a snapshot; None while paused."""
         for command in self.page.commands():
-            self._obey(command)
+            self._apply_command(command)
         if self._learnt >= SETTLED:
             for name in self._bumps:
                 self.simulated.bump(self.simulated.rig.camera_names.index(name), BUMP_DEG)
@@ -110,7 +110,7 @@ class Demonstration:
         self.page.publish(state, self.simulated.frames(PICTURE_WIDTH) if due else None)
         return state
 
-    def _obey(self, command: Command) -> None:
+    def _apply_command(self, command: Command) -> None:
         names = list(self.simulated.rig.camera_names)
         match command.name, command.camera:
             case "bump", str(name):

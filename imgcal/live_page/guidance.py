@@ -14,7 +14,7 @@ from torch import Tensor
 from imgcal.estimation import Gauge, WorkingVolume, pixel_jacobian, uncertainty_over
 from imgcal.geometry import cross_matrix
 from imgcal.io import DEFAULT_SIGMA
-from imgcal.live_page.text import rounded
+from imgcal.live_page.text import round_values
 from imgcal.monitoring import RigBelief
 from imgcal.types import CameraRig
 
@@ -29,10 +29,10 @@ MOST_POINTS = 8  # fiducials that a try takes
 def compare(content: dict[str, Any]) -> tuple[CameraRig, NDArray[np.float64]]:
     """Read a rig (`contents.rig_message`): the rig, and its change (C, 15) against the factory, as most see it."""
     rig, factory = pickle.loads(content["pickled"])
-    return rig, Gauge.of_most(rig, factory).difference(rig, factory).numpy()
+    return rig, Gauge.from_majority(rig, factory).difference(rig, factory).numpy()
 
 
-def look(
+def compute_guidance(
     content: dict[str, Any], points_object: NDArray[np.float64], volume: WorkingVolume
 ) -> tuple[dict[str, Any], CameraRig, Tensor]:
     """Compute what the page says of the volume.
@@ -52,7 +52,7 @@ def look(
     """
     belief, factory, turn = pickle.loads(content["pickled"])
     rig, covariance = belief.rig, belief.covariance()
-    std = Gauge.of_most(rig, factory).spread(rig, covariance)
+    std = Gauge.from_majority(rig, factory).spread(rig, covariance)
     few = rig.num_cameras <= FEW_CAMERAS
     grid = volume.grid(FINE if few else COARSE)
     points = grid.flatten(0, -2)
@@ -67,14 +67,14 @@ def look(
     known = mm[mm.isfinite()]
     best = int(gain.argmax())
     advice = {
-        "low": rounded(volume.low.numpy()),
-        "high": rounded(volume.high.numpy()),
-        "mm": rounded(mm.view(grid.shape[:-1]).numpy(), 3),
+        "low": round_values(volume.low.numpy()),
+        "high": round_values(volume.high.numpy()),
+        "mm": round_values(mm.view(grid.shape[:-1]).numpy(), 3),
         "count": seen.sum(0).view(grid.shape[:-1]).tolist(),
         "median": _value(known.median()) if len(known) else None,
         "p95": _value(known.quantile(0.95)) if len(known) else None,
-        "places": rounded(places.numpy(), 4),
-        "gain": rounded(gain.numpy(), 3),
+        "places": round_values(places.numpy(), 4),
+        "gain": round_values(gain.numpy(), 3),
         "best": best if float(gain[best]) > 0 else None,
     }
     return advice, rig, std

@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 import imgcal
 from imgcal.errors import InputError
 from imgcal.extras import missing
-from imgcal.live_page.address import Address, checked_token
+from imgcal.live_page.acknowledgements import Acknowledgements
+from imgcal.live_page.address import Address, check_token
 from imgcal.live_page.commands import Action, Command
 from imgcal.live_page.contents import (
     belief_message,
@@ -40,10 +41,9 @@ from imgcal.live_page.contents import (
     rig_message,
     state_message,
 )
-from imgcal.live_page.notes import Notes
 from imgcal.live_page.viewing_volume import viewing_volume
-from imgcal.live_page.wire import framed
-from imgcal.messages import shortened
+from imgcal.live_page.wire import frame_message
+from imgcal.messages import shorten
 from imgcal.online import Event, RigState
 from imgcal.types import CalibrationObject, CameraRig
 
@@ -105,7 +105,7 @@ class LivePage:
             raise InputError("live page: not available on Windows; run it in WSL")
         if library := missing("uvicorn"):
             raise ModuleNotFoundError(f"No module named {library!r}", name=library)
-        self._token = checked_token(token)
+        self._token = check_token(token)
         self._listening = address.listen()
         self.address = Address(address.host, self._listening.getsockname()[1])
         self._greeting = greeting(rig, obj, viewing_volume(rig), self.address, self._token, actions, title)
@@ -113,7 +113,7 @@ class LivePage:
         self._latest: RigState | None = None
         self._pictured: tuple[RigState, Mapping[str, Frame | None]] | None = None  # the latest that came with frames
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
-        self._notes: Notes = self._greeting["notes"]
+        self._notes: Acknowledgements = self._greeting["notes"]
         self._actions = {action.name: action for action in actions}
         self._problem, self._problems = problem, set[str]()
         self._news = threading.Condition()
@@ -216,7 +216,7 @@ class LivePage:
         theirs.close()
         self._pipe = ours
         with self._news:
-            greeting = framed("greeting", self._greeting)  # with what people were told and did so far
+            greeting = frame_message("greeting", self._greeting)  # with what people were told and did so far
             self._answers.clear()  # whom they were for has gone
         threading.Thread(target=self._listen, args=(ours,), name="live page commands", daemon=True).start()
         ours.sendall(greeting)
@@ -237,20 +237,20 @@ class LivePage:
         """Receive the server's lines of JSON, which it has checked, until it ends."""
         with contextlib.suppress(OSError, ValueError), pipe.makefile("r", encoding="utf-8") as lines:
             for line in lines:
-                self._heard(json.loads(line))
+                self._receive(json.loads(line))
         with self._news:
             self._ended = pipe
             self._news.notify()
 
-    def _heard(self, content: dict[str, Any]) -> None:
+    def _receive(self, content: dict[str, Any]) -> None:
         if "viewers" in content:
             self._viewers = int(content["viewers"])
         elif "problem" in content:
-            self._failed(content["problem"], content["why"])
+            self._fail(content["problem"], content["why"])
         else:
-            self._asked(content.pop("number"), Command(**content))
+            self._receive_command(content.pop("number"), Command(**content))
 
-    def _asked(self, number: int, command: Command) -> None:
+    def _receive_command(self, number: int, command: Command) -> None:
         """Take a command, and answer whether the loop will get it; a page shows only accepted commands as done."""
         taken = command.event is not None  # that is the page's own affair
         try:
@@ -258,10 +258,10 @@ class LivePage:
             taken = True
         except queue.Full:
             if not taken:
-                self._failed("commands", f"{MOST_COMMANDS} are waiting and none is fetched")
+                self._fail("commands", f"{MOST_COMMANDS} are waiting and none is fetched")
         with self._news:
             if taken:
-                self._notes.obey(command, self._actions)
+                self._notes.apply_command(command, self._actions)
             self._answers.append({"number": number, "taken": taken})
             self._news.notify()
 
@@ -273,7 +273,7 @@ class LivePage:
                 self._news.wait_for(self._is_news, timeout=1 / STATES_A_SECOND)
                 latest, self._latest = self._latest, None
                 pictured, ended = self._pictured, self._ended is self._pipe
-                events = self._noted()
+                events = self._note_events()
                 answers = [self._answers.popleft() for _ in range(len(self._answers))]
             last = latest or last
             begun = time.monotonic()
@@ -291,16 +291,16 @@ class LivePage:
                 courier = _Courier(self._rig, self._obj)
             time.sleep(max(0.0, 1 / STATES_A_SECOND - (time.monotonic() - begun)))
 
-    def _noted(self) -> list[dict[str, Any]]:
+    def _note_events(self) -> list[dict[str, Any]]:
         """Record the waiting events."""
         found: list[dict[str, Any]] = []
         while self._events:
             try:
                 content = event_message(self._events.popleft())
-                self._notes.take(content)
+                self._notes.add_event(content)
                 found.append(content)
             except Exception as error:
-                self._failed("event", repr(error))
+                self._fail("event", repr(error))
         return found
 
     def _is_news(self) -> bool:
@@ -312,17 +312,17 @@ class LivePage:
         assert self._pipe is not None
         for kind, make in messages:
             try:
-                message = framed(kind, make())
+                message = frame_message(kind, make())
             except Exception as error:
-                self._failed(kind, repr(error))
+                self._fail(kind, repr(error))
                 continue
             self._pipe.sendall(message)
 
-    def _failed(self, kind: str, why: str) -> None:
+    def _fail(self, kind: str, why: str) -> None:
         if kind not in self._problems:
             self._problems.add(kind)
             with contextlib.suppress(Exception):  # a failing callback must not end the page
-                self._problem(f"live page: {kind}: {shortened(why)}")
+                self._problem(f"live page: {kind}: {shorten(why)}")
 
     def _restart(self) -> None:
         with self._news:

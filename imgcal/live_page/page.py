@@ -10,7 +10,7 @@ from html import escape
 from importlib.resources import files
 from typing import Any
 
-from imgcal.live_page.text import as_json
+from imgcal.live_page.text import to_json
 
 SCRIPTS = ("words", "scene", "timelines", "cameras", "pictures", "volume", "events", "controls", "main")
 """Files of the script, in the order in which they stand in the page: later ones use earlier ones."""
@@ -42,7 +42,7 @@ def _page(title: str, data: dict[str, Any], connections: str) -> Page:
     )
     text = _asset("page.html")
     parts = {
-        "POLICY": escape(policy), "TITLE": escape(title), "STYLE": style, "DATA": as_json(data), "SCRIPT": script
+        "POLICY": escape(policy), "TITLE": escape(title), "STYLE": style, "DATA": to_json(data), "SCRIPT": script
     }  # fmt: skip
     for name, part in parts.items():
         before, mark, after = text.partition(f"<!--{name}-->")

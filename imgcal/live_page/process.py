@@ -13,12 +13,12 @@ from typing import Any
 
 import uvicorn
 
-from imgcal.live_page.board import Board
 from imgcal.live_page.connections import MOST_CONNECTIONS, Connection
+from imgcal.live_page.page_state import PageState
 from imgcal.live_page.security import Gate
 from imgcal.live_page.server import Application
 from imgcal.live_page.wire import read_message
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 
 POLITE = 5  # how much rather the loop runs than this
 GUIDANCE_SECONDS = 3.0  # rest between two computations, and twice as long as the last one took
@@ -45,7 +45,7 @@ async def _serve(listening: socket.socket, pipe: socket.socket) -> None:
         _, greeting = await read_message(reader)
     except asyncio.IncompleteReadError:
         return
-    board = Board(greeting)
+    board = PageState(greeting)
 
     def tell(content: dict[str, Any]) -> None:
         if not writer.is_closing():  # the loop may have ended
@@ -68,11 +68,11 @@ async def _serve(listening: socket.socket, pipe: socket.socket) -> None:
                 if kind in ("rig", "belief"):
                     guide.learn(kind, content, application)
                 elif kind == "answer":
-                    application.answered(**content)
+                    application.accept_answer(**content)
                 else:
-                    application.spread(board.take(kind, content))
+                    application.spread(board.update(kind, content))
             except Exception as error:  # what one message holds does not end the page
-                tell({"problem": kind, "why": shortened(repr(error))})
+                tell({"problem": kind, "why": shorten(repr(error))})
     application.close()
     server.should_exit = True
     with contextlib.suppress(asyncio.TimeoutError):
@@ -86,7 +86,7 @@ class Guide:
     def __init__(self, greeting: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> None:
         """Start from the greeting of the loop's process, with a function that sends it messages."""
         self._greeting, self._tell = greeting, tell
-        self._pool = ThreadPoolExecutor(2, initializer=_of_one_thread)
+        self._pool = ThreadPoolExecutor(2, initializer=_use_one_thread)
         self._waiting: dict[str, dict[str, Any]] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._rig: Any = None  # the latest
@@ -101,43 +101,43 @@ class Guide:
 
     async def _compare(self, application: Application) -> None:
         while "rig" in self._waiting:
-            found = await self._computed("rig", self._compared)
+            found = await self._compute("rig", self._compare_change)
             if found is not None:
-                application.spread(application.board.take_change(*found))
+                application.spread(application.board.update_change(*found))
 
     async def _look(self, application: Application) -> None:
         loop = asyncio.get_running_loop()
         while "belief" in self._waiting:
             begun = loop.time()
-            found = await self._computed("belief", self._looked)
+            found = await self._compute("belief", self._compute_guidance)
             if found is not None:
-                application.spread(application.board.take_advice(*found))
+                application.spread(application.board.update_advice(*found))
             await asyncio.sleep(max(GUIDANCE_SECONDS, 2 * (loop.time() - begun)))
 
-    async def _computed(self, kind: str, work: Callable[[dict[str, Any]], Any]) -> Any:
+    async def _compute(self, kind: str, work: Callable[[dict[str, Any]], Any]) -> Any:
         """Compute the results of the latest input of a kind in a thread; None = there are none."""
         try:
             return await asyncio.get_running_loop().run_in_executor(self._pool, work, self._waiting.pop(kind))
         except Exception as error:  # the next one may do
-            self._tell({"problem": kind, "why": shortened(repr(error))})
+            self._tell({"problem": kind, "why": shorten(repr(error))})
             return None
 
-    def _compared(self, content: dict[str, Any]) -> Any:
-        from imgcal.live_page.arrangement import arrangement
+    def _compare_change(self, content: dict[str, Any]) -> Any:
         from imgcal.live_page.guidance import compare
+        from imgcal.live_page.rig_drawing import arrangement
 
         self._rig, change = compare(content)
         layout = arrangement(self._rig, self._volume())
         return content["time"], layout, change, self._rig.focal_length.numpy()
 
-    def _looked(self, content: dict[str, Any]) -> Any:
+    def _compute_guidance(self, content: dict[str, Any]) -> Any:
         from torch.linalg import LinAlgError
 
         from imgcal.errors import RefusedError
-        from imgcal.live_page.guidance import look
+        from imgcal.live_page.guidance import compute_guidance
 
         try:
-            advice, rig, std = look(content, self._greeting["points"], self._volume())
+            advice, rig, std = compute_guidance(content, self._greeting["points"], self._volume())
         except (RefusedError, LinAlgError):  # nothing can be said yet
             return None
         self._known = rig, std
@@ -160,7 +160,7 @@ class Guide:
         return rig_text(rig, covariance=None if std is None else RigCovariance(std))
 
 
-def _of_one_thread() -> None:
+def _use_one_thread() -> None:
     import torch
 
     torch.set_num_threads(1)

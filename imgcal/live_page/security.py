@@ -124,7 +124,7 @@ class Allowance:
         self._burst, self._each_second = burst, each_second
         self._left, self._at = float(burst), time.monotonic()
 
-    def take(self) -> bool:
+    def try_take(self) -> bool:
         """Take one, if there is one."""
         now = time.monotonic()
         self._left = min(self._left + (now - self._at) * self._each_second, self._burst)

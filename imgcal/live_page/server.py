@@ -8,9 +8,9 @@ from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from imgcal.live_page.board import Board
 from imgcal.live_page.commands import Command, read_command
 from imgcal.live_page.page import live_page, report_page
+from imgcal.live_page.page_state import PageState
 from imgcal.live_page.security import HEADERS, Allowance, Gate, Refusal
 
 MOST_VIEWERS = 64
@@ -41,7 +41,7 @@ class Viewer:
         self.pending |= messages
         self.news.set()
 
-    def take(self) -> bytes:
+    def drain(self) -> bytes:
         """Take all that is pending."""
         self.news.clear()
         taken, self.pending = self.pending, {}
@@ -52,7 +52,7 @@ class Application:
     """An ASGI application; everything that a request can reach is in this file."""
 
     def __init__(
-        self, board: Board, gate: Gate, rig_yaml: Callable[[], str | None], tell: Callable[[dict[str, Any]], None]
+        self, board: PageState, gate: Gate, rig_yaml: Callable[[], str | None], tell: Callable[[dict[str, Any]], None]
     ) -> None:
         """Make it.
 
@@ -92,22 +92,22 @@ class Application:
         if path == "/" and method == "GET" and scope["query_string"]:
             refused = self.gate.refusal("GET", path, headers)
             if refused is None or refused.status == 401:
-                await _answer(send, self._admitted(scope["query_string"].decode("latin-1")))
+                await _answer(send, self._admit(scope["query_string"].decode("latin-1")))
                 return
         refused = self.gate.refusal(method, path, headers)
         if refused is not None:
-            await _answer(send, _refused(refused))
+            await _answer(send, _refusal_answer(refused))
         elif path == "/stream" and method == "GET":
             await self._stream(receive, send)
         elif path == "/command":
             await _answer(send, await self._command(method, headers, receive))
         else:
-            await _answer(send, self._page(path) if method != "POST" else _refused(Refusal(405, "expected GET")))
+            await _answer(send, self._page(path) if method != "POST" else _refusal_answer(Refusal(405, "expected GET")))
 
-    def _admitted(self, query: str) -> Answer:
+    def _admit(self, query: str) -> Answer:
         """Exchange the token in the address for a cookie, and redirect to the address without it."""
         if not self.gate.token_of_query(query):
-            return _refused(Refusal(401, "expected the token that was printed where imgcal was started"))
+            return _refusal_answer(Refusal(401, "expected the token that was printed where imgcal was started"))
         cookie = f"{self.gate.cookie}={self.gate.token}; Path=/; HttpOnly; SameSite=Strict"
         return 303, "text/plain", b"", {"Location": "/", "Set-Cookie": cookie}
 
@@ -118,42 +118,42 @@ class Application:
         if path == "/favicon.ico":
             return 204, "image/x-icon", b"", {}
         if path not in ("/rig.yaml", "/report.html"):
-            return _refused(Refusal(404, "there is nothing of that name"))
-        if not self._downloads.take():
-            return _refused(Refusal(429, "too many downloads at once"))
+            return _refusal_answer(Refusal(404, "there is nothing of that name"))
+        if not self._downloads.try_take():
+            return _refusal_answer(Refusal(429, "too many downloads at once"))
         if path == "/report.html":
             page = report_page(self.board.greeting["title"], self.board.contents())
             attached = {"Content-Disposition": 'attachment; filename="report.html"'}
             return 200, "text/html; charset=utf-8", page.text.encode(), attached
         text = self._rig_yaml()
         if text is None:
-            return _refused(Refusal(503, "no snapshot has come yet"))
+            return _refusal_answer(Refusal(503, "no snapshot has come yet"))
         return 200, "application/yaml", text.encode(), {"Content-Disposition": 'attachment; filename="rig.yaml"'}
 
     async def _command(self, method: str, headers: Mapping[str, list[str]], receive: Receive) -> Answer:
         if method != "POST":
-            return _refused(Refusal(405, "expected POST"))
+            return _refusal_answer(Refusal(405, "expected POST"))
         if headers.get("content-type") != [JSON]:
-            return _refused(Refusal(415, f"expected {JSON}"))
-        if not self._commands.take():
-            return _refused(Refusal(429, "too many commands at once"))
+            return _refusal_answer(Refusal(415, f"expected {JSON}"))
+        if not self._commands.try_take():
+            return _refusal_answer(Refusal(429, "too many commands at once"))
         try:
             body = await asyncio.wait_for(_body(receive), BODY_SECONDS)
             given = json.loads(body)
             command = read_command(given, self._cameras, self._actions, self.board.notes.count)
         except _TooLargeError:
-            return _refused(Refusal(413, f"expected at most {MOST_BODY} bytes"))
+            return _refusal_answer(Refusal(413, f"expected at most {MOST_BODY} bytes"))
         except (ValueError, RecursionError, TimeoutError) as error:
             reason = str(error) if type(error) is ValueError else "expected a command as JSON"
-            return _refused(Refusal(400, reason))
+            return _refusal_answer(Refusal(400, reason))
         try:
-            if await self._asked_for(command):
+            if await self._request(command):
                 return 200, JSON, b"{}", {}
-            return _refused(Refusal(503, "the program that runs the rig takes no commands now"))
+            return _refusal_answer(Refusal(503, "the program that runs the rig takes no commands now"))
         except TimeoutError:
-            return _refused(Refusal(504, "the program that runs the rig has not answered yet"))
+            return _refusal_answer(Refusal(504, "the program that runs the rig has not answered yet"))
 
-    async def _asked_for(self, command: Command) -> bool:
+    async def _request(self, command: Command) -> bool:
         """Pass a command on to the loop's process, and wait for its answer.
 
         Raises:
@@ -167,18 +167,18 @@ class Application:
         self._tell(asdict(command) | {"number": self._count})
         return await asyncio.wait_for(answer, ANSWER_SECONDS)
 
-    def answered(self, number: int, taken: bool) -> None:
+    def accept_answer(self, number: int, taken: bool) -> None:
         """Take the answer of the loop's process to a command, and show the command as done, however late."""
         command, answer = self._asked.pop(number)
         if taken:
-            self.spread(self.board.obey(command))
+            self.spread(self.board.apply_command(command))
         if not answer.done():  # who asked may have gone
             answer.set_result(taken)
 
     async def _stream(self, receive: Receive, send: Send) -> None:
         """Send what is new, for as long as the viewer takes it."""
         if len(self.viewers) >= MOST_VIEWERS:
-            await _answer(send, _refused(Refusal(503, f"{MOST_VIEWERS} viewers are here already")))
+            await _answer(send, _refusal_answer(Refusal(503, f"{MOST_VIEWERS} viewers are here already")))
             return
         viewer = Viewer()
         viewer.add(self.board.everything())
@@ -193,7 +193,7 @@ class Application:
                 waiting = asyncio.ensure_future(viewer.news.wait())
                 await asyncio.wait((waiting, gone), timeout=ALIVE_SECONDS, return_when=asyncio.FIRST_COMPLETED)
                 waiting.cancel()
-                chunk, more = viewer.take() or b": still here\n\n", not self._closing
+                chunk, more = viewer.drain() or b": still here\n\n", not self._closing
                 message = {"type": "http.response.body", "body": chunk, "more_body": more}
                 await asyncio.wait_for(send(message), STUCK_SECONDS)
         except TimeoutError:
@@ -231,7 +231,7 @@ async def _answer(send: Send, answer: Answer) -> None:
     await send({"type": "http.response.body", "body": body})
 
 
-def _refused(refusal: Refusal) -> Answer:
+def _refusal_answer(refusal: Refusal) -> Answer:
     return refusal.status, "text/plain; charset=utf-8", f"{refusal.reason}\n".encode(), {}
 
 

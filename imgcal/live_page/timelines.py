@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.live_page.text import rounded
+from imgcal.live_page.text import round_values
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ class Timelines:
         return {name: _columns(points) for name, points in self._spans.items()}
 
 
-def change_of(change: Array, focal_length: Array) -> Array:
+def camera_changes(change: Array, focal_length: Array) -> Array:
     """Turn (deg), way (mm) and change of the focal length (%) of each camera, of its change (C, 15): (C, 3)."""
     return np.stack(
         (
@@ -51,7 +51,7 @@ def change_of(change: Array, focal_length: Array) -> Array:
     )
 
 
-def sigmas_of(std: Array, focal_length: Array) -> Array:
+def camera_sigmas(std: Array, focal_length: Array) -> Array:
     """Standard deviations of the four series, of one direction each: (C, 4), nan for the residual."""
     return np.stack(
         (
@@ -68,4 +68,4 @@ def _columns(points: deque[tuple[float, Array, Array]]) -> dict[str, Any]:
     if not points:
         return {"time": [], "value": [], "sigma": []}
     value, sigma = (np.stack([p[i] for p in points], axis=-1) for i in (1, 2))  # (C, 4, T)
-    return {"time": [round(p[0], 2) for p in points], "value": rounded(value), "sigma": rounded(sigma)}
+    return {"time": [round(p[0], 2) for p in points], "value": round_values(value), "sigma": round_values(sigma)}

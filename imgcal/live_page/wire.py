@@ -13,11 +13,11 @@ from typing import Any
 HEADER = struct.Struct("<I")
 
 
-def framed(kind: str, content: dict[str, Any]) -> bytes:
+def frame_message(kind: str, content: dict[str, Any]) -> bytes:
     """Encode one message, its length first.
 
     Examples:
-        >>> len(framed("state", {})) > HEADER.size
+        >>> len(frame_message("state", {})) > HEADER.size
         True
     """
     body = pickle.dumps((kind, content), protocol=pickle.HIGHEST_PROTOCOL)

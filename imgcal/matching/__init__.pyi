@@ -1,4 +1,4 @@
-from .cameras import each_camera
+from .camera_threads import each_camera
 from .matched_filter import MatchedFilter
 from .photometry import Measured, measure_markers
 

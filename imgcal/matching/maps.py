@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.detection import Frame
-from imgcal.matching.cameras import each_camera
+from imgcal.matching.camera_threads import each_camera
 from imgcal.matching.ranks import average, raise_ranks, rank_spots
 
 SIZES = (0.0, 1.2, 2.4)  # cells, standard deviations of the spots that are looked for; 0 = as reduced
@@ -45,7 +45,7 @@ class Maps:
         """Keep the given cameras."""
         return Maps(self.surprise[cameras], self.factor, self.size[cameras], self.corner[cameras])
 
-    def pooled(self, factor: int) -> Maps:
+    def pool(self, factor: int) -> Maps:
         """Make larger cells, each as surprising as the most surprising one within it or next to it."""
         step = factor // self.factor
         if step <= 1:
@@ -56,13 +56,13 @@ class Maps:
         rows = padded.reshape(count, -1, step, padded.shape[2]).max(2)
         most = rows.reshape(count, rows.shape[1], -1, step).max(3)
         size = -(-self.size // step)
-        return Maps(_ranked(most, size), self.factor * step, size, self.corner // step)
+        return Maps(_rank(most, size), self.factor * step, size, self.corner // step)
 
-    def dilated(self) -> Maps:
+    def dilate(self) -> Maps:
         """Let every cell be as surprising as its most surprising neighbour."""
         kernel = np.ones((3, 3), np.uint8)
         most = np.stack([cv2.dilate(one, kernel) for one in self.surprise])
-        return Maps(_ranked(most, self.size), self.factor, self.size, self.corner)
+        return Maps(_rank(most, self.size), self.factor, self.size, self.corner)
 
 
 def surprise_maps(
@@ -112,7 +112,7 @@ def surprise_maps(
     return Maps(surprise, factor, size, windows[:, ::2] // factor), response
 
 
-def _ranked(values: NDArray[Any], size: NDArray[np.int64]) -> NDArray[np.float32]:
+def _rank(values: NDArray[Any], size: NDArray[np.int64]) -> NDArray[np.float32]:
     """Rank the values (C, H, W) of each camera among those of its map."""
     ranked = np.zeros_like(values)
     there = np.flatnonzero(size.prod(1)).tolist()

@@ -64,7 +64,7 @@ def _linear(values, shapes, residual, doubt, count):
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _gathered(grey, n, half, uv, pixels):
+def _gather(grey, n, half, uv, pixels):
     """List the pixels around marker n: their values, and their places from its middle.
 
     Returns:
@@ -103,7 +103,7 @@ def _take_away(box, m, half, size, amplitude, whitening, profile, uv, values):
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _shaped(size, whitening, profile, pixels, count):
+def _shape(size, whitening, profile, pixels, count):
     """Fill rings and brightness of pixels, and how much the brightness grows from one ring to the next."""
     along_u, along_v, place, brightness, step = pixels[1], pixels[2], pixels[3], pixels[4], pixels[5]
     ring = 1 / (RINGS * size)
@@ -121,7 +121,7 @@ def _shaped(size, whitening, profile, pixels, count):
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _summed(pixels, count, size, whitening, ground, amplitude, doubt, normal, right):
+def _sum(pixels, count, size, whitening, ground, amplitude, doubt, normal, right):
     """Fill the normal equations of (ground, amplitude, u, v).
 
     Returns:
@@ -174,7 +174,7 @@ def _summed(pixels, count, size, whitening, ground, amplitude, doubt, normal, ri
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _pulled(pixels, count, size, whitening, ground, amplitude, doubt, pulls):
+def _pull(pixels, count, size, whitening, ground, amplitude, doubt, pulls):
     """Fill what each octant contributes to the right side of the normal equations."""
     values, along_u, along_v, place = pixels[0], pixels[1], pixels[2], pixels[3]
     brightness, step, residual = pixels[4], pixels[5], pixels[6]
@@ -210,12 +210,12 @@ def _variance(normal, pulls, variance, axis, row):
 
 
 @njit(cache=True, nogil=True)
-def _improved(size, shape, misfit, last, count, pixels, place, told, work):
+def _improve(size, shape, misfit, last, count, pixels, place, told, work):
     """Move a marker (2,) to where its pixels fit better; fill what is told of it (5,), see `fit_markers`."""
     whitening, profile = shape
     values, brightness, residual = pixels[0], pixels[4], pixels[6]
     normal, right, row, pulls = work
-    _shaped(size, whitening, profile, pixels, count)
+    _shape(size, whitening, profile, pixels, count)
     nothing = np.float32(0)
     ground, amplitude = _linear(values, brightness, residual, nothing, count)
     for k in range(count):
@@ -225,7 +225,7 @@ def _improved(size, shape, misfit, last, count, pixels, place, told, work):
     doubt = np.float32(1 / (allowed * allowed))
     ground, amplitude = _linear(values, brightness, residual, doubt, count)
     amplitude = max(amplitude, nothing)
-    total, squares, core, middle = _summed(pixels, count, size, whitening, ground, amplitude, doubt, normal, right)
+    total, squares, core, middle = _sum(pixels, count, size, whitening, ground, amplitude, doubt, normal, right)
     told[0], told[3], told[4] = amplitude, middle / max(core, 1), spread * spread
     told[1], told[2] = np.inf, np.inf
     if not kernels.cholesky(normal):
@@ -235,7 +235,7 @@ def _improved(size, shape, misfit, last, count, pixels, place, told, work):
     place[1] += min(max(right[3], -FARTHEST), FARTHEST)
     if last:
         variance = max(squares / max(total - 4, 1.0), LEAST_NOISE * LEAST_NOISE)
-        _pulled(pixels, count, size, whitening, ground, amplitude, doubt, pulls)
+        _pull(pixels, count, size, whitening, ground, amplitude, doubt, pulls)
         told[2] = 0.5 * (_variance(normal, pulls, variance, 2, row) + _variance(normal, pulls, variance, 3, row))
         row[:] = 0.0
         row[1] = 1.0
@@ -272,7 +272,7 @@ def fit_markers(grey, inside, half, scale, close, shape, iterations, told, uv, f
         for n in range(len(uv)):
             if not inside[n]:
                 continue
-            box = _gathered(grey, n, half, uv, pixels)
+            box = _gather(grey, n, half, uv, pixels)
             count = max(box[1] - box[0], 0) * max(box[3] - box[2], 0)
             if count < 8:
                 found[n, 0] = 0.0
@@ -281,4 +281,4 @@ def fit_markers(grey, inside, half, scale, close, shape, iterations, told, uv, f
                 if close[n, m] and found[m, 0] > 0:
                     _take_away(box, m, half, scale[m], found[m, 0], whitening, profile, uv, pixels[0])
             last = told and iteration == len(MISFIT) - 1
-            _improved(scale[n], shape, MISFIT[iteration], last, count, pixels, uv[n], found[n], work)
+            _improve(scale[n], shape, MISFIT[iteration], last, count, pixels, uv[n], found[n], work)

@@ -20,7 +20,7 @@ TAPS = 4  # px that a blur with a standard deviation of one reaches
 @njit(cache=True, nogil=True)
 def median(values, count):
     """Median of the first `count` values, which are reordered."""
-    upper = kernels.ranked(values, count, count // 2)
+    upper = kernels.select_rank(values, count, count // 2)
     if count % 2:
         return upper
     lower = values[0]
@@ -30,7 +30,7 @@ def median(values, count):
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _blurred(line, blurred):
+def _blur(line, blurred):
     """Blur a row of values with a standard deviation of one; the outer ones continue."""
     weights = np.empty(2 * TAPS + 1)
     total = 0.0
@@ -126,12 +126,12 @@ def _moments(mean, covariance):
     half = side // 2
     smooth, columns = np.empty((side, side)), np.empty((side, side))  # column by column
     for i in range(side):
-        _blurred(mean[i], smooth[i])
+        _blur(mean[i], smooth[i])
     for j in range(side):
         for i in range(side):
             columns[j, i] = smooth[i, j]
     for j in range(side):
-        _blurred(columns[j], smooth[j])
+        _blur(columns[j], smooth[j])
     top = 0.0
     core = max(1.5, 0.25 * half) ** 2
     for j in range(side):
@@ -198,7 +198,7 @@ def common_shape(patches, whitening, profile):
                 numbers[ring] += 1
     for ring in range(most + 1):
         sums[ring] /= max(numbers[ring], 1.0)
-    _blurred(sums, numbers)
+    _blur(sums, numbers)
     for ring in range(most - 1, -1, -1):
         numbers[ring] = max(numbers[ring], numbers[ring + 1])  # it does not grow with the radius
     peak = numbers[0] - numbers[most]

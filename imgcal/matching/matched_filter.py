@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from imgcal.association import Proposal, Snapshot, lattice_shifts, near_turns, rows_of
+from imgcal.association import Proposal, Snapshot, lattice_shifts, near_symmetries, proposal_rows
 from imgcal.detection import Frame
 from imgcal.geometry import RigidTransform, geodesic_angle
 from imgcal.matching.maps import Maps, surprise_maps
-from imgcal.matching.poses import Matcher, Ranked, Scene, anywhere, around, distinct_turns
-from imgcal.matching.refinement import Fitted, fitted
+from imgcal.matching.poses import Matcher, Ranked, Scene, anywhere, distinct_turns, turns_around
+from imgcal.matching.refinement import Fitted, fit_and_measure
 from imgcal.types import CalibrationObject
 
 FINEST = 4  # px to a cell
@@ -50,11 +50,11 @@ class MatchedFilter:
         if near is not None:
             return near
         view = View.of(scene, snapshot)
-        found = view.known(snapshot)
+        found = view.search_known(snapshot)
         if found is None:
             if not _searchable(scene.obj):
-                return Proposal.declined(snapshot, "its fiducials are too many and too close to search for it anywhere")
-            found = view.searched()
+                return Proposal.decline(snapshot, "its fiducials are too many and too close to search for it anywhere")
+            found = view.search_anywhere()
         return view.proposal(found, snapshot)
 
 
@@ -76,56 +76,56 @@ class View:
         names, dark = snapshot.rig.camera_names, snapshot.detection.polarity == "dark"
         frames, masks = [snapshot.frames.get(name) for name in names], [snapshot.masks.get(name) for name in names]
         fine, response = surprise_maps(frames, FINEST, dark, masks, windows)
-        close = Matcher.on(scene, fine.dilated(), _reach(scene))
-        return cls(scene, frames, dark, fine, response, fine.pooled(_coarsest(scene)), close)
+        close = Matcher.on(scene, fine.dilate(), _reach(scene))
+        return cls(scene, frames, dark, fine, response, fine.pool(_coarsest(scene)), close)
 
     def proposal(self, found: Ranked, snapshot: Snapshot) -> Proposal:
         """Fit and measure the best pose, and its rivals where it does not stand out by far."""
         scene = self.scene
-        margin, rivals = margin_of(found, self.close)
-        result = self._fitted(found.best(1)) if margin > 0 else None
+        margin, rivals = pose_margin(found, self.close)
+        result = self._fit(found.best(1)) if margin > 0 else None
         if result is None:
-            return Proposal.declined(snapshot, "no pose of the object stands out in the images", margin)
+            return Proposal.decline(snapshot, "no pose of the object stands out in the images", margin)
         if margin < CLEAR:
             # With rig and pose fitted, places are compared to a cell: chance agreements gain nothing from that.
             against = rivals.scores.total.tolist()
             for k in range(min(MOST_RIVALS, len(against))):
-                rival = self._fitted(rivals.select(np.array([k])))
+                rival = self._fit(rivals.select(np.array([k])))
                 if rival is None:
                     continue
                 # One that comes to the same places when it is fitted was none.
                 other = bool(differs(rival.predicted[None], result.predicted, scene.obj)[0])
                 against[k] = max(against[k], rival.log_odds(scene, self.fine)) if other else 0.0
             margin = max(margin, result.log_odds(scene, self.fine) - max([0.0, *against]))
-        rows = rows_of(result.uv, result.sigma, result.seen, result.radius, snapshot.blobs)
+        rows = proposal_rows(result.uv, result.sigma, result.seen, result.radius, snapshot.blobs)
         return Proposal(rows, result.rig_from_object, margin)
 
-    def _fitted(self, pose: Ranked) -> Fitted | None:
-        return fitted(self.scene, pose, self.fine, self.response, self.frames, self.dark)
+    def _fit(self, pose: Ranked) -> Fitted | None:
+        return fit_and_measure(self.scene, pose, self.fine, self.response, self.frames, self.dark)
 
-    def known(self, snapshot: Snapshot) -> Ranked | None:
+    def search_known(self, snapshot: Snapshot) -> Ranked | None:
         """Look at the known poses, or the origin, and around them; None = the object is not there for sure."""
         scene, close, found = self.scene, self.close, None
         matcher = Matcher.on(scene, self.coarse, close.reach)
-        known = [pose for pose in _known_poses(snapshot) if _in_view(pose, snapshot)]
+        known = [pose for pose in _known_poses(snapshot) if _is_in_view(pose, snapshot)]
         for turns_too in (False, True):
             for pose in known:
                 if turns_too and not _searchable(scene.obj):
                     continue
-                start = around(pose, scene.obj) if turns_too else pose[None]
+                start = turns_around(pose, scene.obj) if turns_too else pose[None]
                 near = matcher.climb(matcher.rank(start).best(CLIMBING))
                 near = close.climb(close.rank(near.poses), FINE_CLIMBS)
                 found = near if found is None else found + near
-                if margin_of(found, close)[0] > CLEAR:
+                if pose_margin(found, close)[0] > CLEAR:
                     return found
         return None if _searchable(scene.obj) else found
 
-    def searched(self) -> Ranked:
+    def search_anywhere(self) -> Ranked:
         """Look anywhere: from the image of one camera after the other, until a pose stands out."""
         scene, close, coarse = self.scene, self.close, self.coarse
         turns = distinct_turns(scene.obj, TURNS)
         reach = 4 * 2**0.5 * scene.drift + PARALLAX
-        alone = Matcher.on(scene, coarse.pooled(2 * coarse.factor), reach)
+        alone = Matcher.on(scene, coarse.pool(2 * coarse.factor), reach)
         matcher = Matcher.on(scene, coarse, reach)
         found: Ranked | None = None
         for camera in np.argsort(-_promise(coarse)).tolist():
@@ -133,20 +133,20 @@ class View:
             fresh = matcher.climb(matcher.rank(poses).best(CLIMBING))
             fresh = close.climb(close.rank(fresh.poses), FINE_CLIMBS)
             found = fresh if found is None else (found + fresh).best(2 * CLIMBING)
-            if margin_of(found, close)[0] > CLEAR:
+            if pose_margin(found, close)[0] > CLEAR:
                 break
         assert found is not None
         return found
 
 
-def margin_of(found: Ranked, matcher: Matcher) -> tuple[float, Ranked]:
+def pose_margin(found: Ranked, matcher: Matcher) -> tuple[float, Ranked]:
     """Compare the best pose with the best distinct ones, be they found or made by moving the object onto itself.
 
     Returns:
         Log odds against the best of these, and these, the best first.
     """
     obj, best = matcher.scene.obj, found.best(1)
-    motions = lattice_shifts(obj) + near_turns(obj, 0.1 * obj.size)
+    motions = lattice_shifts(obj) + near_symmetries(obj, 0.1 * obj.size)
     if motions:
         rotation = torch.from_numpy(np.stack([motion.rotation for motion in motions]))
         translation = torch.from_numpy(np.stack([motion.translation for motion in motions]))
@@ -199,7 +199,7 @@ def _around(scene: Scene, snapshot: Snapshot) -> Proposal | None:
     if windows is None:
         return None
     view = View.of(scene, snapshot, windows)
-    found = view.known(snapshot)
+    found = view.search_known(snapshot)
     proposal = None if found is None else view.proposal(found, snapshot)
     return proposal if proposal is not None and proposal.margin > CLEAR else None
 
@@ -215,10 +215,12 @@ def _windows(scene: Scene, snapshot: Snapshot) -> NDArray[np.int64] | None:
     Returns:
         None where nothing is known, or where it is known too vaguely for windows to be much smaller than frames.
     """
-    known = [pose for pose in snapshot.candidates if _in_view(pose, snapshot)]
+    known = [pose for pose in snapshot.candidates if _is_in_view(pose, snapshot)]
     if not known:
         return None
-    poses = RigidTransform.cat([around(pose, scene.obj) if _searchable(scene.obj) else pose[None] for pose in known])
+    poses = RigidTransform.cat(
+        [turns_around(pose, scene.obj) if _searchable(scene.obj) else pose[None] for pose in known]
+    )
     points = poses.apply(scene.obj.points.to(scene.rig.focal_length))
     projection = scene.rig.expand(len(points)).project_values(points, scene.obj.radius)
     size, reach = scene.rig.image_size.numpy(), _reach(scene)[:, None]
@@ -256,7 +258,7 @@ def _known_poses(snapshot: Snapshot) -> list[RigidTransform]:
     return list(snapshot.candidates) or [RigidTransform.identity(dtype=torch.float64)]
 
 
-def _in_view(pose: RigidTransform, snapshot: Snapshot) -> bool:
+def _is_in_view(pose: RigidTransform, snapshot: Snapshot) -> bool:
     """Tell whether some camera would see the object there."""
     points = pose.apply(snapshot.obj.points.to(snapshot.rig.focal_length))
     return bool(snapshot.rig.expand(1).project_values(points[None]).visible.any())
@@ -268,7 +270,7 @@ def _distance(snapshot: Snapshot) -> float:
     if not snapshot.candidates and rig.working_distance is not None:
         return rig.working_distance
     for pose in _known_poses(snapshot):
-        if _in_view(pose, snapshot):
+        if _is_in_view(pose, snapshot):
             centre = pose.apply(obj.points.mean(0, keepdim=True))[0]
             return float((rig.positions - centre).norm(dim=-1).median())
     # As large as a fifth of the image.

@@ -92,26 +92,26 @@ class Matcher:
         """Turn and move each pose to where it fits best: (K,) in their order."""
         turns = _axes(found.poses.rotation)
         for step in steps:
-            found = found.or_better(self.rank(moved(found, self.scene)))
+            found = found.or_better(self.rank(move_object(found, self.scene)))
             count = len(found.poses.rotation)
             tried = found.poses[torch.arange(count).repeat(len(turns))]
-            scored = self.rank(turned(tried, step * turns.repeat_interleave(count, 0), self.scene.obj))
+            scored = self.rank(turn_object(tried, step * turns.repeat_interleave(count, 0), self.scene.obj))
             best = scored.scores.total.reshape(len(turns), count).argmax(0)
             found = found.or_better(scored.select(best * count + np.arange(count)))
-        return found.or_better(self.rank(moved(found, self.scene)))
+        return found.or_better(self.rank(move_object(found, self.scene)))
 
 
-def around(pose: RigidTransform, obj: CalibrationObject) -> RigidTransform:
+def turns_around(pose: RigidTransform, obj: CalibrationObject) -> RigidTransform:
     """Turn a pose about the object's centre in all directions, the smallest turns first: (K,)."""
     steps = np.arange(-NEAR, NEAR + 1e-9, STEP)
     vectors = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
     size = np.linalg.norm(vectors, axis=1)
     vectors = vectors[np.argsort(size, kind="stable")][: int((size <= NEAR).sum())]
     vectors = np.concatenate((np.zeros((1, 3)), vectors))
-    return turned(pose, torch.from_numpy(vectors).to(pose.rotation), obj)
+    return turn_object(pose, torch.from_numpy(vectors).to(pose.rotation), obj)
 
 
-def turned(poses: RigidTransform, vectors: Tensor, obj: CalibrationObject) -> RigidTransform:
+def turn_object(poses: RigidTransform, vectors: Tensor, obj: CalibrationObject) -> RigidTransform:
     """Turn the object in poses (K,) about its centre by rotation vectors (K, 3) or (3,), in the object's axes."""
     rotation = poses.rotation @ rotation_from_vector(vectors)
     centre = obj.points.mean(0).to(rotation)
@@ -119,7 +119,7 @@ def turned(poses: RigidTransform, vectors: Tensor, obj: CalibrationObject) -> Ri
     return RigidTransform(rotation, place - rotation @ centre)
 
 
-def moved(found: Ranked, scene: Scene) -> RigidTransform:
+def move_object(found: Ranked, scene: Scene) -> RigidTransform:
     """Move the object to where most cameras see it, as far as drift does not explain the shifts of their images."""
     rotation = found.poses.rotation
     centre = scene.obj.points.mean(0).to(rotation)

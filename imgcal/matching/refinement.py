@@ -13,7 +13,7 @@ from imgcal.association import lattice_shifts
 from imgcal.detection import Frame
 from imgcal.estimation import Estimate, EstimationOptions, estimate
 from imgcal.geometry import RigidTransform
-from imgcal.matching.cameras import each_camera
+from imgcal.matching.camera_threads import each_camera
 from imgcal.matching.correlation import BLIND, gain_at, gains
 from imgcal.matching.maps import SIZES, Maps
 from imgcal.matching.marker_fit import MISFIT, NEAR
@@ -55,7 +55,7 @@ class Fitted:
         return float(np.log(BLIND + (1 - BLIND) * np.exp(there - cost)).sum())
 
 
-def fitted(
+def fit_and_measure(
     scene: Scene,
     found: Ranked,
     maps: Maps,
@@ -80,14 +80,14 @@ def fitted(
     fit = _fit_peaks(scene, pose, maps, predicted, (reach, 2), sure)
     uv = np.full(predicted.shape, np.nan)
     for gate, iterations in zip(GATES, ITERATIONS, strict=True):
-        fit = _in_step(scene, fit, maps)
+        fit = _align_lattice(scene, fit, maps)
         if fit is None:
             return None
         pose, predicted = fit.rig_from_object[0], predictions(fit.rig, scene, fit.rig_from_object[0])
         # What was measured where the fitted rig has it need not be found again.
         there = np.linalg.norm(uv - predicted, axis=-1, keepdims=True) < gate
         expected = np.where(there, uv, predicted)
-        markers = _measured(scene, fit, expected, maps, response, frames, dark, iterations)
+        markers = _measure(scene, fit, expected, maps, response, frames, dark, iterations)
         uv, sigma = np.stack([m.uv for m in markers]), np.stack([m.sigma for m in markers])
         off = np.linalg.norm(np.nan_to_num(uv) - predicted, axis=-1)
         near = off < np.hypot(gate, OUTLIER * np.minimum(sigma, 3.0))
@@ -159,7 +159,7 @@ def _fit_peaks(
     return fit
 
 
-def _in_step(scene: Scene, fit: Estimate | None, maps: Maps) -> Estimate | None:
+def _align_lattice(scene: Scene, fit: Estimate | None, maps: Maps) -> Estimate | None:
     """Shift the pattern by steps of its lattice in each camera in which more of it shows then, and fit again.
 
     A camera whose image was shifted by one dot shows all but the edge; with rig and pose fitted, the edge is seen.
@@ -198,7 +198,7 @@ def _fit(
     return fit if bool(fit.rig_from_object.translation.isfinite().all()) else None
 
 
-def _measured(
+def _measure(
     scene: Scene,
     fit: Estimate,
     expected: NDArray[np.float64],

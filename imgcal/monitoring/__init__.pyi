@@ -1,13 +1,13 @@
 from .case import SHAPE, ClockSlip, ObjectChange
-from .change_test import CHANGES, ChangeTest, change_of_errors, pixel_changes, spread_of
-from .clock_slip import image_of
+from .change_test import CHANGES, ChangeTest, camera_change_errors, change_std, pixel_changes
+from .clock_slip import project_fiducials
 from .cusum import Cusum, cusum_threshold
 from .measurement_update import absorb
 from .object_motion import ObjectMotion
 from .pending_change import Change
-from .posterior import belief_of, calibration_of, posterior_of
+from .posterior import belief_from_posterior, calibration_posterior, make_posterior
 from .recent_snapshots import RecentSnapshots
-from .rig_belief import MeasurementUpdate, RigBelief, age_belief, widened
+from .rig_belief import MeasurementUpdate, RigBelief, age_belief, widen
 from .rig_filter import RigFilter
 from .rig_monitor import MonitorUpdate, RigMonitor
 from .shaking import shared_shifts
@@ -31,14 +31,14 @@ __all__ = [
     "SnapshotInformation",
     "absorb",
     "age_belief",
-    "belief_of",
-    "calibration_of",
-    "change_of_errors",
+    "belief_from_posterior",
+    "calibration_posterior",
+    "camera_change_errors",
+    "change_std",
     "cusum_threshold",
-    "image_of",
+    "make_posterior",
     "pixel_changes",
-    "posterior_of",
+    "project_fiducials",
     "shared_shifts",
-    "spread_of",
-    "widened",
+    "widen",
 ]

@@ -46,7 +46,7 @@ def find_alarm(
         least_shifts: for each camera the pixels by which a change must shift its image.
     """
     ages = {age for age, every in SLOW_TESTS.items() if age <= len(recent) and count % every == 0}
-    screened = recent.screened()
+    screened = recent.screen()
     if screened.max() >= SCREEN_CHI2:
         ages.add(int(SCREENED_AGES[int(screened.max(1).argmax())]))
     for age in sorted(ages):
@@ -103,7 +103,7 @@ def changed_cameras(
     least = least_shifts or [0.0] * len(test.pixels)
     free, evidence = dict(known), dict[int, float]()
     while len(free) < len(test.pixels):
-        given = test.given(free) if free else test
+        given = test.condition_on(free) if free else test
         scores = given.scores()
         others = {
             camera: max(float(score[camera]) for score in scores.values())

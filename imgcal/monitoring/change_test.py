@@ -66,7 +66,7 @@ def pixel_changes(rig: CameraRig) -> Tensor:
     return change
 
 
-def spread_of(changes: Mapping[int, str | None], pixels: Tensor, jump: float = LARGE) -> Tensor:
+def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = LARGE) -> Tensor:
     """Standard deviations (C, K) of changes of some kinds by camera, None = of all; zero where nothing changes.
 
     Args:
@@ -82,7 +82,7 @@ def spread_of(changes: Mapping[int, str | None], pixels: Tensor, jump: float = L
     return std
 
 
-def change_of_errors(rig: CameraRig, unit: Tensor) -> Tensor:
+def camera_change_errors(rig: CameraRig, unit: Tensor) -> Tensor:
     """Error in units by a change of a camera's own parameters: (C, K, K); a turn about its centre shifts nothing."""
     return torch.linalg.inv(step_by_error(rig)) / unit[:, :, None]
 
@@ -112,7 +112,7 @@ class ChangeTest:
             information: (D, D) of what was known before, aged to the time of the later snapshots.
             brought: (D, D) information of the later snapshots.
             pull: (D,) of the later snapshots, where what was known before put the rig.
-            change: (C, K, K) see `change_of_errors`.
+            change: (C, K, K) see `camera_change_errors`.
             pixels: (C, K) see `pixel_changes`.
             lasting: (C,) px, see `NoiseCorrelation.model_error`.
 
@@ -172,7 +172,7 @@ class ChangeTest:
             found.append(0.5 * pull.square().sum() - factor.diagonal().log().sum() - math.log(len(JUMPS)))
         return float(torch.logsumexp(torch.stack(found), 0))
 
-    def given(self, changes: Mapping[int, str | None]) -> ChangeTest:
+    def condition_on(self, changes: Mapping[int, str | None]) -> ChangeTest:
         """Test for others where some cameras may have changed."""
         scaled, factor, pull = self._free(changes, LARGE)
         taken = torch.linalg.solve_triangular(factor, scaled, upper=False)
@@ -192,7 +192,7 @@ class ChangeTest:
             Covariance with all pulls (R, K C), Cholesky factor (R, R) of their own, the jump included, and the
             whitened pull (R,).
         """
-        std = spread_of(changes, self.pixels, jump).flatten()
+        std = change_std(changes, self.pixels, jump).flatten()
         rows = std.nonzero()[:, 0]
         scaled = std[rows, None] * self.learnt[rows]
         own = scaled[:, rows] * std[rows]

@@ -21,7 +21,7 @@ from imgcal.monitoring.case import Case, ClockSlip, Explained, Explanation, Find
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.object_motion import ObjectMotion
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
-from imgcal.monitoring.unsynchronized import drop_cameras
+from imgcal.monitoring.unsynchronized_cameras import drop_cameras
 from imgcal.types import Observations
 
 # What is known of a slip before anything is seen.
@@ -45,7 +45,7 @@ VAGUE_SLIP_SECONDS = 5e-4
 """Seconds, one standard deviation, above which a slip is not believed of a camera of which hardly anything is known."""
 
 
-class ClockSlipped(Explanation):
+class ClockSlipExplanation(Explanation):
     """The clocks of the suspected cameras, or of the surest alone, have slipped."""
 
     name = "clock slip"
@@ -102,7 +102,7 @@ def _slip(case: Case, start: Start, cameras: Sequence[int]) -> Variant:
     return Variant(start.before, corrected, start.log_prior + log_prior, find=lambda _: Finding(slips=slips))
 
 
-def image_of(belief: RigBelief, rig_from_object: RigidTransform, camera: int) -> Tensor:
+def project_fiducials(belief: RigBelief, rig_from_object: RigidTransform, camera: int) -> Tensor:
     """Where a camera sees the fiducials of an object in poses (S,): (S, N, 2) pixels."""
     alone = belief.rig.select([camera]).expand(len(rig_from_object.translation))
     return alone.project_values(belief.points_at(rig_from_object), belief.obj.radius).uv[:, 0]
@@ -121,7 +121,7 @@ class _Late:
 
     def image(self, camera: int, late: float) -> Tensor:
         """Where a camera sees the fiducials, so much later: (S, N, 2) pixels."""
-        return image_of(self.there.belief, self.motion.at(self.seconds + late), camera)
+        return project_fiducials(self.there.belief, self.motion.interpolate(self.seconds + late), camera)
 
     def rough_slip(self, camera: int) -> float:
         """How late (s) a camera exposes if it is where it was."""

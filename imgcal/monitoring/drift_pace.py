@@ -21,9 +21,9 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation import error_between
-from imgcal.monitoring.change_test import CHANGES, MODEL_ERROR, ChangeTest, change_of_errors, pixel_changes
+from imgcal.monitoring.change_test import CHANGES, MODEL_ERROR, ChangeTest, camera_change_errors, pixel_changes
 from imgcal.monitoring.recent_snapshots import RecentSnapshots
-from imgcal.monitoring.rig_belief import RigBelief, age_belief, widened
+from imgcal.monitoring.rig_belief import RigBelief, age_belief, widen
 from imgcal.monitoring.rig_filter import RigFilter
 from imgcal.types import DriftRate
 
@@ -74,7 +74,7 @@ class Stretch:
         """Test for changes meanwhile; what the rig wandered, at a rate, is none."""
         before = self.before
         known = age_belief(before, self.seconds, rate).information
-        change = change_of_errors(before.rig, before.unit)
+        change = camera_change_errors(before.rig, before.unit)
         return ChangeTest.of(known, self.brought, self.pull, change, pixel_changes(before.rig), self.lasting)
 
 
@@ -120,7 +120,7 @@ class DriftPaces:
         model = self._model(test, walk)
         leader = int(self._ratios(model).amax((0, 2, 3)).argmax())
         rest = self._of(
-            test.given({leader: None}), walk, stretch.seconds
+            test.condition_on({leader: None}), walk, stretch.seconds
         )  # of one that creeps, all others see something
         others = torch.arange(len(self.squared)) != leader
         self.information[0, others], self.pull[0, others] = rest[0][others], rest[1][others]
@@ -204,7 +204,7 @@ class DriftLearning:
             follows.pace = self.paces.of_parameters(follows.pace.shape[1])
             recent.walk = follows.walk
             if bool(lacking.any()):
-                follows.belief = widened(follows.belief, lacking)
+                follows.belief = widen(follows.belief, lacking)
             self.stretch = Stretch.after(follows.belief, follows.waited, recent.lasting)
 
 

@@ -17,14 +17,14 @@ from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions
 from imgcal.monitoring.case import Case, Explained, Explanation, Finding, Snapshot, Start, Variant, mean_evidence
 from imgcal.monitoring.change_test import JUMPS
-from imgcal.monitoring.clock_slip import ClockSlipped
+from imgcal.monitoring.clock_slip import ClockSlipExplanation
+from imgcal.monitoring.lens_warming import Warmed
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.object_change import ObjectChanged
 from imgcal.monitoring.pending_change import free_cameras
 from imgcal.monitoring.rig_belief import RigBelief
 from imgcal.monitoring.shaking import Shaking, shake_cameras
-from imgcal.monitoring.unsynchronized import LEAST_SNAPSHOTS, Unsynchronized, unsynchronized_evidence
-from imgcal.monitoring.warming import Warmed
+from imgcal.monitoring.unsynchronized_cameras import LEAST_SNAPSHOTS, Unsynchronized, unsynchronized_evidence
 
 PASSING = (2.0, 5.0)
 """Times their usual size that errors may have which pass."""
@@ -91,7 +91,7 @@ class PassingError(Explanation):
 EXPLANATIONS: tuple[Explanation, ...] = (
     Steady(),
     Moved(),
-    ClockSlipped(),
+    ClockSlipExplanation(),
     Unsynchronized(),
     Shaking(),
     ObjectChanged(),
@@ -235,7 +235,7 @@ def doubtful_cameras(
     if not found:
         return (), False
     verdict = weigh(Case(before, snapshots, pauses, len(snapshots), options, found))
-    blamed = (Moved.name, ClockSlipped.name, Unsynchronized.name)
+    blamed = (Moved.name, ClockSlipExplanation.name, Unsynchronized.name)
     rivals = set(verdict.explained) - set(blamed)
     if verdict.evidence(*blamed) < verdict.evidence(*rivals) + LEAD:
         return (), False

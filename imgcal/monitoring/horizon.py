@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from imgcal.estimation import displaced, error_between
+from imgcal.estimation import displace, error_between
 from imgcal.monitoring.rig_belief import RigBelief, cholesky_factor
 
 EXTRINSICS = 6
@@ -107,7 +107,7 @@ class Horizon:
             weighted[:wide] += relative.mT @ last.information @ last.value
         factor = cholesky_factor(information)
         error = torch.cholesky_solve(weighted[:, None], factor)[:wide, 0].view(prior.unit.shape)
-        return replace(prior, rig=displaced(prior.rig, error * prior.unit), factor=factor)
+        return replace(prior, rig=displace(prior.rig, error * prior.unit), factor=factor)
 
     def _with_object(self, cameras: RigBelief, first: RigBelief) -> RigBelief:
         """What is known of cameras by one belief, and of the object by another."""

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.estimation import EstimationOptions, lm_cpu
+from imgcal.estimation import EstimationOptions, levenberg_marquardt_cpu
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring import measurement_update_cpu
 from imgcal.monitoring.measurement_update_cpu import DAMPED, MOST_DAMPING, SLACK, STALLED, WHY_NOT
@@ -53,7 +53,7 @@ def absorb(
     constants, unit, shake = belief.constants, belief.unit, observations.shake
     given, shown = rig_from_object, None
     if isinstance(belief.obj, UnknownLights):
-        observations, rig_from_object, shown = _shown_lights(observations, rig_from_object)
+        observations, rig_from_object, shown = _select_lights(observations, rig_from_object)
     seen = observations.seen.numpy()
     uv = np.where(seen[..., None], observations.uv.numpy(), 0.0).astype(np.float64, copy=False)
     uv = np.ascontiguousarray(uv.swapaxes(-1, -2))
@@ -65,7 +65,7 @@ def absorb(
         centre, rotation = centre.reshape(len(seen), -1, 3), rotation[: len(seen)]
         shared = (*(None if part is None else part[: seen.shape[2]] for part in shared[:2]), shared[2])
     shaken = np.empty((0, 0)) if shake is None else np.ascontiguousarray(shake.double().numpy())
-    loss = (lm_cpu.LOSS_CODES[options.loss], float(options.threshold))
+    loss = (levenberg_marquardt_cpu.LOSS_CODES[options.loss], float(options.threshold))
     found = measurement_update_cpu.absorb(
         shared,
         (uv, (1 / sigma).astype(np.float64, copy=False), shaken),
@@ -77,12 +77,12 @@ def absorb(
     if found.status:
         raise RefusedError(f"estimation: {WHY_NOT[found.status]}")
     own, factor = torch.from_numpy(found.own), torch.from_numpy(found.factor)
-    now = RigBelief(_rig_of(found.rig, belief.rig), belief.obj, own, factor, unit)
+    now = RigBelief(_make_rig(found.rig, belief.rig), belief.obj, own, factor, unit)
     carried = found.carried
     if carried.shape[1] < 6:  # of a single light
         carried = np.concatenate((carried, np.zeros((len(carried), 6 - carried.shape[1], carried.shape[2]))), 1)
     brought = SnapshotInformation(
-        _rig_of(found.from_rig, belief.rig), torch.from_numpy(found.from_own), unit,
+        _make_rig(found.from_rig, belief.rig), torch.from_numpy(found.from_own), unit,
         *(torch.from_numpy(part) for part in (found.camera, found.border, carried, found.pull)),
     )  # fmt: skip
     # What the properties would make of it, at hand.
@@ -107,7 +107,7 @@ def absorb(
     return MeasurementUpdate(now, poses, residual, 2 * found.cost, dof, evidence, belief, brought)
 
 
-def _rig_of(values: RigArrays, like: CameraRig) -> CameraRig:
+def _make_rig(values: RigArrays, like: CameraRig) -> CameraRig:
     """The rig that has these values; `replace` would take longer than a projection."""
     translation = -(values.rotation @ values.position[..., None])[..., 0]
     rig = object.__new__(CameraRig)
@@ -155,7 +155,7 @@ class _Shown:
         return every
 
 
-def _shown_lights(
+def _select_lights(
     observations: Observations, rig_from_object: RigidTransform
 ) -> tuple[Observations, RigidTransform, _Shown]:
     """Keep the lights that two cameras see: (S, C, M) and (S, M), M as many as the fullest snapshot has.

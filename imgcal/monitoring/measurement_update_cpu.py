@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.estimation import blocks_of, linearize_lights, linearize_rig
+from imgcal.estimation import linearize_lights, linearize_rig, select_blocks
 from imgcal.geometry import kernels
 from imgcal.monitoring.rig_arrays import RigArrays
 from imgcal.monitoring.rig_error_cpu import times_basis, write_basis, write_error
@@ -157,7 +157,7 @@ def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brou
             for j in range(wide):
                 value -= prior[i, j] * distance[b, j]
             right[i] = step[i] = value
-        if not _factorized(gathered, damping, factor):
+        if not _factorize(gathered, damping, factor):
             return best, 2, cost
         kernels.cholesky_solve(factor, step)
         gain = 0.0
@@ -171,7 +171,7 @@ def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brou
             done = gain <= enough and damping <= light
             best, cost, fresh = t, trial, True
             if done:
-                if damping > 0 and not _factorized(gathered, 0.0, factor):
+                if damping > 0 and not _factorize(gathered, 0.0, factor):
                     return best, 2, cost
                 for i in range(wide):
                     for j in range(i):
@@ -200,7 +200,7 @@ def _half_square(centre, half):
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _factorized(matrix, damping, factor):
+def _factorize(matrix, damping, factor):
     """Write the lower Cholesky factor of a matrix (D, D) whose diagonal grows by a share; False where there is none."""
     for i in range(len(matrix)):
         for j in range(i + 1):
@@ -227,7 +227,7 @@ def _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, b,
             unit, own_std,
         )  # fmt: skip
         state = (offset, turned[b, s : s + 1], centre[b, s : s + 1], own[b])
-        cost += _linearize(given, state, state[2], blocks_of(row, s), loss, threshold, shake[s : s + 1])
+        cost += _linearize(given, state, state[2], select_blocks(row, s), loss, threshold, shake[s : s + 1])
         for i in range(len(own0)):
             cost -= 0.5 * own[b, i] ** 2
     write_error(rotation[b], position[b], focal[b], principal[b], distortion[b], known_rig, unit, distance[b])

@@ -174,6 +174,6 @@ class Misfit:
         return int(self.risen.found[0]) if risen[0] and len(self.usual) >= LEAST_USUAL else 0
 
 
-def never_fitted(result: MeasurementUpdate, count: int) -> bool:
+def has_never_fitted(result: MeasurementUpdate, count: int) -> bool:
     """Tell whether the first snapshots, absorbed together, fit so badly that the object may never have been as said."""
     return count in FIRST_ASKED and result.chi2 - result.dof >= FIRST_SIGMAS * math.sqrt(2 * result.dof)

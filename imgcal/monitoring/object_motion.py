@@ -26,7 +26,7 @@ class ObjectMotion:
     Examples:
         >>> poses = RigidTransform(torch.eye(3).expand(4, 3, 3), torch.tensor([[0.0, 0.0, 9.0 * s] for s in range(4)]))
         >>> motion = ObjectMotion.of(poses, torch.arange(4) / 60)
-        >>> motion.at(torch.tensor([1.5 / 60, 4 / 60])).translation[:, 2].round(decimals=1)
+        >>> motion.interpolate(torch.tensor([1.5 / 60, 4 / 60])).translation[:, 2].round(decimals=1)
         tensor([13.5000, 36.0000], dtype=torch.float64)
     """
 
@@ -62,7 +62,7 @@ class ObjectMotion:
         """Numbers (M,) of the moments that are nearest to some times (M,) s."""
         return (seconds.double()[:, None] - self.seconds).abs().argmin(1)
 
-    def at(self, seconds: Tensor) -> RigidTransform:
+    def interpolate(self, seconds: Tensor) -> RigidTransform:
         """Where the object is at some times (M,) s: (M,), each by the motion at the nearest moment."""
         near = self.nearest(seconds)
         passed = (seconds.double() - self.seconds[near])[:, None]

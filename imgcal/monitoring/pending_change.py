@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from imgcal.estimation import displaced, error_between
-from imgcal.monitoring.change_test import CHANGES, LARGE, ChangeTest, change_of_errors, pixel_changes, spread_of
-from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belief, widened
+from imgcal.estimation import displace, error_between
+from imgcal.monitoring.change_test import CHANGES, LARGE, ChangeTest, camera_change_errors, change_std, pixel_changes
+from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belief, widen
 from imgcal.monitoring.rig_filter import YOUNG_SECONDS
 from imgcal.types import CameraRig
 
@@ -64,7 +64,7 @@ class PendingChange:
         Cameras that changed are compared by their own parameters, so that a large change of one kind is of no other.
         """
         at = _distance(belief.rig, belief.object_offset, self.origin)
-        change, step = change_of_errors(belief.rig, belief.unit), self.origin.rig.local(belief.rig)
+        change, step = camera_change_errors(belief.rig, belief.unit), self.origin.rig.local(belief.rig)
         width = belief.rig.num_parameters
         for camera in self.kinds:
             at[camera * width : (camera + 1) * width] = -(change[camera] @ step[camera])
@@ -105,7 +105,7 @@ class PendingChange:
         before = self.before
         known = age_belief(before, self.seconds, walk).information
         pull = self.weighted - self.brought @ self.distance(before)
-        change = change_of_errors(before.rig, before.unit)
+        change = camera_change_errors(before.rig, before.unit)
         return ChangeTest.of(known, self.brought, pull, change, pixel_changes(before.rig))
 
     def decide(self, test: ChangeTest, camera: int, last: bool) -> tuple[str | None, str | None] | None:
@@ -145,14 +145,14 @@ class PendingChange:
                 continue
             kinds[camera], kind = found
             size = (math.nan, math.nan) if kind is None else self.size(test, camera, kind)
-            scores = test.given(self.others(camera)).scores()
+            scores = test.condition_on(self.others(camera)).scores()
             evidence = max(float(scores[name][camera]) for name in ([kind] if kind else CHANGES))
             decided.append(Change(camera, change.since, kind or "unknown", *size, decided=True, evidence=evidence))
         return tuple(decided), kinds
 
     def size(self, test: ChangeTest, camera: int, kind: str) -> tuple[float, float]:
         """How far a camera went, were it of this kind alone, and the standard deviation of that."""
-        change, covariance = test.given(self.others(camera)).jump(camera, kind)
+        change, covariance = test.condition_on(self.others(camera)).jump(camera, kind)
         size = float(change.norm())
         along = change / max(size, 1e-30)
         return size, float((along @ covariance @ along).clamp_min(0).sqrt())
@@ -168,21 +168,21 @@ class PendingChange:
         step = torch.zeros_like(self.before.unit)
         for camera, kind in self.kinds.items():
             if kind is not None:
-                step[camera, CHANGES[kind]] = test.given(self.others(camera)).jump(camera, kind)[0]
+                step[camera, CHANGES[kind]] = test.condition_on(self.others(camera)).jump(camera, kind)[0]
         first = free_cameras(replace(self.before, rig=self.before.rig.retract(step)), self.kinds)
         information = first.information + self.brought
         factor = torch.linalg.cholesky(information)
         pull = first.information @ self.distance(first) + self.weighted
         error = torch.cholesky_solve(pull[:, None], factor)[:, 0]
         origin, wide = self.origin, first.unit.numel()
-        rig = displaced(origin.rig, error[:wide].view(first.unit.shape) * first.unit)
+        rig = displace(origin.rig, error[:wide].view(first.unit.shape) * first.unit)
         belief = replace(first, rig=rig, object_offset=origin.object_offset + error[wide:], factor=factor)
         return first, belief, information
 
 
 def free_cameras(belief: RigBelief, changes: Mapping[int, str | None], jump: float = LARGE) -> RigBelief:
     """Let cameras have changed in some way, None = in all ways, by so many pixels."""
-    return widened(belief, spread_of(changes, pixel_changes(belief.rig), jump).square())
+    return widen(belief, change_std(changes, pixel_changes(belief.rig), jump).square())
 
 
 def _distance(rig: CameraRig, object_offset: Tensor, origin: RigBelief) -> Tensor:

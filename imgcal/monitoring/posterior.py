@@ -1,4 +1,6 @@
-"""From a calibration to what a running rig begins with: `posterior_of`, and back to a belief: `belief_of`."""
+"""From a calibration to what a running rig begins with: `make_posterior`, and back to a belief:
+`belief_from_posterior`.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ NEAR = 1e-3
 """Millimetres between fiducials that are the same ones, written with rounded digits."""
 
 
-def posterior_of(estimate: Estimate, obj: CalibrationObject) -> RigPosterior:
+def make_posterior(estimate: Estimate, obj: CalibrationObject) -> RigPosterior:
     """Keep all that an estimate knows of a rig and of an object's shape, the poses let free.
 
     Args:
@@ -42,7 +44,7 @@ def posterior_of(estimate: Estimate, obj: CalibrationObject) -> RigPosterior:
     return RigPosterior(rig, obj.points.double(), tolerance, scale, own, factor, unit, snapshots)
 
 
-def belief_of(posterior: RigPosterior, obj: CalibrationObject) -> RigBelief:
+def belief_from_posterior(posterior: RigPosterior, obj: CalibrationObject) -> RigBelief:
     """Believe what a calibration has found; of another object than it saw, only what it says of the cameras.
 
     Args:
@@ -72,7 +74,7 @@ def _about_cameras(posterior: RigPosterior, obj: CalibrationObject) -> RigBelief
     return replace(prior, factor=cholesky_factor(information), unit=posterior.unit)
 
 
-def calibration_of(rig: CameraRig) -> RigPosterior | None:
+def calibration_posterior(rig: CameraRig) -> RigPosterior | None:
     """The posterior of the calibration that made a rig; None = none did, or its values have been changed since.
 
     Raises:

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.estimation import displaced
+from imgcal.estimation import displace
 from imgcal.geometry import RigidTransform
-from imgcal.monitoring.change_test import CHANGES, MODEL_ERROR, ChangeTest, change_of_errors, pixel_changes
+from imgcal.monitoring.change_test import CHANGES, MODEL_ERROR, ChangeTest, camera_change_errors, pixel_changes
 from imgcal.monitoring.recent_screening import add_error, add_row, put, screen
 from imgcal.monitoring.rig_arrays import RigArrays
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, error_covariance
@@ -108,7 +108,7 @@ class RecentSnapshots:
         self._rig = RigArrays.of(rig)  # the last one of which the error was asked for ...
         self._at = np.zeros_like(self._weighted[0])  # ... and that error
         self._at[self._unit.size :] = object_offset.numpy()
-        self._change = change_of_errors(rig, torch.from_numpy(self._unit))
+        self._change = camera_change_errors(rig, torch.from_numpy(self._unit))
 
     def resume(self) -> None:
         """Put together what has been read.
@@ -158,7 +158,7 @@ class RecentSnapshots:
             before = self._error(result.before.arrays, result.before.object_offset)
             information = result.before.information
             self._bases.append(_Base(self._next, information, information @ before))
-            self._change = change_of_errors(result.before.rig, result.before.unit)
+            self._change = camera_change_errors(result.before.rig, result.before.unit)
         self._put(result.brought, 0, self._error(result.brought.arrays, result.brought.object_offset))
         self._seen.append(_Seen(observations, result.rig_from_object, seconds))
         self._follow(result.belief)
@@ -224,7 +224,7 @@ class RecentSnapshots:
         """Seconds before each of the latest `age` snapshots."""
         return [entry.seconds for entry in list(self._seen)[-age:]]
 
-    def screened(self) -> NDArray[np.float64]:
+    def screen(self) -> NDArray[np.float64]:
         """Score each camera since each of `SCREENED_AGES`: (ages, C); see `screen`."""
         scores = np.empty((len(SCREENED_AGES), len(self._change)))
         known = (self._at, self._change.numpy(), PARTS)
@@ -294,7 +294,7 @@ class RecentSnapshots:
         information, at = self._known(self._next - age)
         wide = self._unit.size
         error = (at - torch.from_numpy(self._at))[:wide].view(self._unit.shape)
-        rig = displaced(self._belief.rig, error * self._belief.unit)
+        rig = displace(self._belief.rig, error * self._belief.unit)
         return replace(self._belief, rig=rig, object_offset=at[wide:], factor=_cholesky(information))
 
     def information(self, count: int) -> tuple[Tensor, Tensor]:

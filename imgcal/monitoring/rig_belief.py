@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.estimation import Problem, lm_cpu, object_prior_std, step_by_error
+from imgcal.estimation import Problem, levenberg_marquardt_cpu, object_prior_std, step_by_error
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring.measurement_update_cpu import NOTHING_KNOWN, WHY_NOT
 from imgcal.monitoring.rig_arrays import RigArrays
@@ -46,7 +46,7 @@ class ObjectArrays:
         squared = None if obj.radius is None else obj.radius.double().square()
         none = obj.points.new_zeros(0)
         problem = Problem(none, none, obj.points - centroid, centroid, squared, rig, none)
-        return cls(lm_cpu.shared_given(problem), centroid.numpy(), own_std.numpy(), obj.pose_rank)
+        return cls(levenberg_marquardt_cpu.shared_arrays(problem), centroid.numpy(), own_std.numpy(), obj.pose_rank)
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class RigBelief:
         least = torch.full((rig.num_parameters,), LEAST_COEFFICIENT, dtype=torch.float64)
         least[: len(LEAST_STD)] = torch.tensor(LEAST_STD, dtype=torch.float64)
         unit = std.double().clamp_min(least)
-        step = whitened(step_by_error(rig), unit)
+        step = whiten(step_by_error(rig), unit)
         own, wide = 0 if obj.exact else 3 * obj.num_fiducials + 1, rig.num_cameras * rig.num_parameters
         information = torch.eye(wide + own, dtype=torch.float64)
         add_blocks(information, step.mT @ step - torch.eye(rig.num_parameters, dtype=torch.float64))
@@ -176,17 +176,17 @@ def age_belief(belief: RigBelief, seconds: float, rate: DriftRate | Tensor) -> R
         return belief
     walk = rate.std(belief.rig) if isinstance(rate, DriftRate) else rate
     variance = walk.square() * (seconds / 3600)
-    return widened(belief, variance) if variance.any() else belief
+    return widen(belief, variance) if variance.any() else belief
 
 
-def widened(belief: RigBelief, variance: Tensor) -> RigBelief:
+def widen(belief: RigBelief, variance: Tensor) -> RigBelief:
     """Know less of some parameters: add variances (C, K), in the units and order of `CameraRig.parameter_names`."""
     covariance = torch.cholesky_inverse(belief.factor)
     add_blocks(covariance, error_covariance(belief, variance))
     return replace(belief, factor=cholesky_factor(torch.cholesky_inverse(cholesky_factor(covariance))))
 
 
-def widened_along(belief: RigBelief, steps: Tensor) -> RigBelief:
+def widen_along(belief: RigBelief, steps: Tensor) -> RigBelief:
     """Know less along some changes of all cameras together, each by one standard deviation: steps (M, C, K)."""
     covariance = torch.cholesky_inverse(belief.factor)
     error = (_error_by_step(belief) @ steps[..., None]).flatten(1)
@@ -217,6 +217,6 @@ def cholesky_factor(matrix: Tensor) -> Tensor:
     return factor
 
 
-def whitened(step: Tensor, unit: Tensor) -> Tensor:
+def whiten(step: Tensor, unit: Tensor) -> Tensor:
     """Whitened offsets by errors in units, of the derivative of a step by an error: (C, K, K)."""
     return step * unit[:, None, :] / unit[:, :, None]

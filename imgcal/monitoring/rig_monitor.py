@@ -23,19 +23,19 @@ from imgcal.monitoring.change_search import (
     likeliest_camera,
 )
 from imgcal.monitoring.change_test import JUMPS, LARGE
-from imgcal.monitoring.clock_slip import image_of
+from imgcal.monitoring.clock_slip import project_fiducials
 from imgcal.monitoring.drift_pace import DriftLearning, DriftPaces
 from imgcal.monitoring.explanations import Diagnosis, Moved, Steady, Verdict, doubtful_cameras, weigh
+from imgcal.monitoring.lens_warming import Warmed
 from imgcal.monitoring.noise_correlation import NoiseCorrelation
-from imgcal.monitoring.object_change import MISFIT_LEAD, Misfit, ObjectChanged, never_fitted
+from imgcal.monitoring.object_change import MISFIT_LEAD, Misfit, ObjectChanged, has_never_fitted
 from imgcal.monitoring.pending_change import Change, PendingChange, free_cameras
 from imgcal.monitoring.quarantine import Quarantine
 from imgcal.monitoring.recent_snapshots import RecentSnapshots
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belief
 from imgcal.monitoring.rig_filter import RigFilter
 from imgcal.monitoring.shaking import ShakeLevel
-from imgcal.monitoring.unsynchronized import drop_cameras
-from imgcal.monitoring.warming import Warmed
+from imgcal.monitoring.unsynchronized_cameras import drop_cameras
 from imgcal.types import Observations
 
 FEW_SNAPSHOTS = 16
@@ -132,7 +132,7 @@ class RigMonitor:
         self.noise.pass_time(seconds)
         if self.filter.calibrated:
             self.noise.expect_usual()
-        observations = self.noise.weigh(self.shaking.of(observations))
+        observations = self.noise.weigh(self.shaking.apply_to(observations))
         new = [camera for camera in moved if camera not in self.quarantine.cameras]
         if new:
             self.quarantine.add(new, self._is_new())
@@ -147,7 +147,7 @@ class RigMonitor:
 
     def _follow_noise(self, observations: Observations, residual: Tensor) -> None:
         """Measure by a snapshot that nothing is wrong with how much cameras shake, and how long their errors last."""
-        self.shaking.take(observations, residual)
+        self.shaking.observe(observations, residual)
         before = self.noise.time
         self.noise.add(observations, residual)
         if self.noise.time is not before:
@@ -253,7 +253,7 @@ class RigMonitor:
             decided = self._decide_kinds(last=True)
             anew = self._learn_moved(case, dict.fromkeys(case.cameras), JUMPS[-1], sum(case.pauses[-case.count :]))
             return replace(anew, changes=(*found.changes, *decided, *anew.changes))
-        return replace(found, slips=self._slips_of(verdict))
+        return replace(found, slips=self._clock_slips(verdict))
 
     def _diagnose_alarm(self, age: int, changes: list[Change]) -> MonitorUpdate:
         """Find out what has happened before the latest snapshots, since which cameras seem to have changed.
@@ -323,9 +323,9 @@ class RigMonitor:
         change = finding.object_change
         if change is not None:
             change = replace(change, since=self.filter.count - count, odds=verdict.lead)
-        return MonitorUpdate(result, slips=self._slips_of(verdict), object_change=change)
+        return MonitorUpdate(result, slips=self._clock_slips(verdict), object_change=change)
 
-    def _slips_of(self, verdict: Verdict) -> tuple[ClockSlip, ...]:
+    def _clock_slips(self, verdict: Verdict) -> tuple[ClockSlip, ...]:
         """The slips of clocks that a verdict has found among the latest snapshots."""
         since = self.filter.count - len(verdict.best.snapshots)
         return tuple(replace(slip, since=since, odds=verdict.lead) for slip in verdict.best.finding.slips)
@@ -417,7 +417,7 @@ class RigMonitor:
         """Learn the object anew where it never was as its file says, and so the first snapshots do not fit."""
         count = self.filter.count
         first = not self.known_since and self._pending is None and len(self._recent) == count
-        if not first or not never_fitted(result, count):
+        if not first or not has_never_fitted(result, count):
             return None
         return self._adopt_object(self._prior, self._recent.snapshots(count), self._recent.pauses(count))
 
@@ -506,5 +506,5 @@ def _shift(belief: RigBelief, snapshot: Snapshot, camera: int) -> float:
     """Median distance (px) along both axes of what a camera sees in a snapshot from where it should be."""
     observations, pose = snapshot
     seen = observations.seen[0, camera]
-    off = (observations.uv[0, camera] - image_of(belief, pose, camera)[0])[seen]
+    off = (observations.uv[0, camera] - project_fiducials(belief, pose, camera)[0])[seen]
     return float(off.median(0).values.norm()) if len(off) else 0.0

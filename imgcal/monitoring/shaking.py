@@ -114,7 +114,7 @@ class ShakeLevel:
         """Begin with cameras that stand still."""
         self.shake = torch.zeros(self.cameras, dtype=torch.float64)
 
-    def of(self, observations: Observations) -> Observations:
+    def apply_to(self, observations: Observations) -> Observations:
         """Observations (1, C, N) with what is known of it."""
         return replace(observations, shake=self.shake[None]) if bool(self.shake.any()) else observations
 
@@ -123,7 +123,7 @@ class ShakeLevel:
         self.shake = shake
         self.latest.clear()
 
-    def take(self, observations: Observations, residual: Tensor) -> None:
+    def observe(self, observations: Observations, residual: Tensor) -> None:
         """Take what a snapshot without any suspicion has left: (1, C, N) and pixels (1, C, N, 2)."""
         (shift,), (variance,) = shared_shifts(observations, residual)
         both = np.concatenate((shift.T, variance[None]))

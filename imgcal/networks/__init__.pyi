@@ -6,7 +6,6 @@ from .checkpoint import (
     save_checkpoint,
     warm_start,
 )
-from .claims import Claims, claim
 from .config import (
     PRESETS,
     HueCentroids,
@@ -16,14 +15,15 @@ from .config import (
     PaperImages,
     PaperPoints,
     PooledImages,
-    without_pretrained,
+    drop_pretrained,
 )
-from .expectation import Expectation, cut_crops, cut_patches
+from .expected_positions import Expectation, cut_crops, cut_patches
 from .export import OPSET, TOLERANCE, Program, load_program, save_exported, save_onnx
 from .factory import build, build_network
-from .images import HueCentroidNetwork, ImageNetwork, Sightings
-from .infrared import Evidence, InfraredConfig, InfraredNetwork, Queries, normalized
+from .images import HueCentroidNetwork, ImageNetwork, Positions
+from .infrared import Evidence, InfraredConfig, InfraredNetwork, Queries, normalize_crops
 from .infrared_checkpoint import InfraredCheckpoint, MeasurerCheckpoint, load_infrared, load_measurer
+from .label_claims import Claims, claim
 from .locator import Located, PositionNetwork
 from .measurer import Measured, Measurer, MeasurerConfig
 from .network import Network
@@ -32,8 +32,8 @@ from .points import PaperPointNetwork, PointNetwork
 from .pooled_images import PaperImageNetwork, PooledImageNetwork
 from .randomness import drawing_from
 from .soft_positions import find_soft_positions
-from .subject import check_object, check_rig, check_says_rigs
 from .tiles import Tiles
+from .training_subject import check_object, check_rig, check_says_rigs
 
 __all__ = [
     "OPSET",
@@ -67,9 +67,9 @@ __all__ = [
     "PooledImageNetwork",
     "PooledImages",
     "PositionNetwork",
+    "Positions",
     "Program",
     "Queries",
-    "Sightings",
     "Tiles",
     "build",
     "build_network",
@@ -80,17 +80,17 @@ __all__ = [
     "cut_crops",
     "cut_patches",
     "drawing_from",
+    "drop_pretrained",
     "find_soft_positions",
     "load_checkpoint",
     "load_infrared",
     "load_measurer",
     "load_network",
     "load_program",
-    "normalized",
+    "normalize_crops",
     "read_subject",
     "save_checkpoint",
     "save_exported",
     "save_onnx",
     "warm_start",
-    "without_pretrained",
 ]

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from imgcal.errors import InputError
 from imgcal.io import nearest
-from imgcal.messages import quoted, shortened
+from imgcal.messages import quote, shorten
 from imgcal.networks.backbone_options import MOST_WEIGHTS, USUAL_SIZE, check_options
-from imgcal.networks.encoders import resized
+from imgcal.networks.encoders import resize_images
 
 
 class Backbone(nn.Module):
@@ -28,7 +28,7 @@ class Backbone(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Encode images (I, 3, H, W), of another size than the encoder's resized: (I, width)."""
-        features = self.model.forward_features(resized(images, self.size))
+        features = self.model.forward_features(resize_images(images, self.size))
         return self.model.forward_head(features, pre_logits=True)
 
 
@@ -45,7 +45,7 @@ def make_backbone(name: str, pretrained: bool, options: Mapping[str, Any]) -> nn
     """
     if not timm.is_model(name):
         known = nearest(name, timm.list_models()) if len(name) < 100 else ""
-        raise InputError(f"backbone: found `{shortened(name)}`, expected a timm model{known}")
+        raise InputError(f"backbone: found `{shorten(name)}`, expected a timm model{known}")
     try:
         check_options(options)
         _check_weights(name, options)
@@ -54,7 +54,7 @@ def make_backbone(name: str, pretrained: bool, options: Mapping[str, Any]) -> nn
         raise
     except TypeError as error:
         raise InputError(
-            f"backbone {name}: found options {quoted(repr(dict(options)))} that it does not take: {quoted(str(error))}"
+            f"backbone {name}: found options {quote(repr(dict(options)))} that it does not take: {quote(str(error))}"
         ) from error
     except (OSError, RuntimeError) as error:
         if not pretrained:
@@ -65,7 +65,7 @@ def make_backbone(name: str, pretrained: bool, options: Mapping[str, Any]) -> nn
         ) from error
     except Exception as error:  # timm asserts, divides and looks up what the options give it
         found = f"{type(error).__name__} {_first_line(error)}".strip()
-        raise InputError(f"backbone {name}: cannot be made of {quoted(repr(dict(options)))}: {found}") from error
+        raise InputError(f"backbone {name}: cannot be made of {quote(repr(dict(options)))}: {found}") from error
 
 
 def input_size(model: Any, otherwise: int = USUAL_SIZE) -> tuple[int, int]:
@@ -88,4 +88,4 @@ def _check_weights(name: str, options: Mapping[str, Any]) -> None:
 
 
 def _first_line(error: Exception) -> str:
-    return quoted((str(error).splitlines() or [""])[0])
+    return quote((str(error).splitlines() or [""])[0])

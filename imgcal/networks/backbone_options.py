@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from imgcal.io import nearest
-from imgcal.messages import listed, shortened
+from imgcal.messages import list_names, shorten
 
 MOST_WEIGHTS = 500_000_000  # of a whole network: 2 GB
 USUAL_SIZE = 224  # pixels, width and height of images for encoders that take any
@@ -43,14 +43,14 @@ def check_options(options: Mapping[str, Any]) -> None:
     """Raise ValueError at an option that is not known to be harmless, or at a value that no network has."""
     for name, value in options.items():
         if name not in ALLOWED:
-            hint = nearest(name, ALLOWED) or f", expected some of {listed(sorted(ALLOWED))}"
-            raise ValueError(f"options: found `{shortened(name)}`, which is not among those of a network's shape{hint}")
-        expected = _expected(name, value)
+            hint = nearest(name, ALLOWED) or f", expected some of {list_names(sorted(ALLOWED))}"
+            raise ValueError(f"options: found `{shorten(name)}`, which is not among those of a network's shape{hint}")
+        expected = _describe_expected(name, value)
         if expected:
-            raise ValueError(f"options: {name}: found {shortened(repr(value))}, expected {expected}")
+            raise ValueError(f"options: {name}: found {shorten(repr(value))}, expected {expected}")
 
 
-def _expected(name: str, value: Any) -> str:
+def _describe_expected(name: str, value: Any) -> str:
     """Describe the expected value; nothing if the value is right."""
     if name in WORDS:
         good = isinstance(value, str) and re.fullmatch(r"[a-z0-9_]{0,20}", value)

@@ -21,19 +21,19 @@ from imgcal.io import (
     read_texts,
     rig_from_text,
     rig_text,
-    title_of,
-    validated,
+    title_from_name,
+    validate,
     write_tensors,
 )
-from imgcal.messages import quoted, shortened
-from imgcal.networks.config import NetworkSpec, is_import_path, without_pretrained
+from imgcal.messages import quote, shorten
+from imgcal.networks.config import NetworkSpec, drop_pretrained, is_import_path
 from imgcal.networks.factory import build_network
 from imgcal.networks.infrared import InfraredNetwork
 from imgcal.networks.infrared_checkpoint import INFRARED, MEASURER, read_weights
 from imgcal.networks.measurer import Measurer
 from imgcal.networks.network import Network
 from imgcal.networks.refiner import IterativeRefiner
-from imgcal.networks.subject import check_object, check_rig, of_positions
+from imgcal.networks.training_subject import check_object, check_rig, is_position_training
 from imgcal.types import CalibrationObject, CameraRig
 
 FORMAT = "imgcal-network/1"
@@ -47,7 +47,7 @@ class Checkpoint:
     network: Network
     rig: CameraRig  # factory rig, float64, without batch axes
     obj: CalibrationObject  # float64
-    experiment: NetworkSpec  # what it was trained by; `imgcal.training.experiment_of` reads all of it
+    experiment: NetworkSpec  # what it was trained by; `imgcal.training.checkpoint_experiment` reads all of it
     metrics: Mapping[str, Any]  # results to keep with it; plain values
 
     @property
@@ -122,17 +122,17 @@ def load_checkpoint(
             encoder of somebody's that is not trusted; a trusted name that is no `package.module:Class`.
     """
     if wrong := [name for name in trusted if not is_import_path(name)]:
-        raise InputError(f"trusted: found {shortened(wrong[0])!r}, expected a class as package.module:Class")
+        raise InputError(f"trusted: found {shorten(wrong[0])!r}, expected a class as package.module:Class")
     texts = read_texts(path, FORMAT)
     spec, metrics = _read_records(path, texts)
     _check_code(path, spec, trusted)
-    trained_rig, trained_obj = _from_texts(path, texts)
+    trained_rig, trained_obj = _parse_texts(path, texts)
     if rig is not None:
         check_rig(path, trained_rig, rig)
     if obj is not None:
         check_object(path, trained_obj, obj)
     tensors, _ = read_tensors(path, FORMAT)
-    network = build_network(without_pretrained(spec), trained_rig, trained_obj, torch.Generator())
+    network = build_network(drop_pretrained(spec), trained_rig, trained_obj, torch.Generator())
     _fill(path, network, tensors)
     return Checkpoint(network.eval(), trained_rig, trained_obj, spec, metrics)
 
@@ -143,7 +143,7 @@ def read_subject(path: str | Path) -> tuple[CameraRig, CalibrationObject]:
     Raises:
         InputError: not such a file, damaged, another version, or a pickle.
     """
-    return _from_texts(path, read_texts(path, FORMAT))
+    return _parse_texts(path, read_texts(path, FORMAT))
 
 
 def warm_start(start: str | Path | Sequence[str | Path], network: nn.Module) -> tuple[str, ...]:
@@ -172,7 +172,7 @@ def _take_over(path: str | Path, network: nn.Module) -> tuple[str, ...]:
     own = dict(network.named_parameters())
     fitting = [name for name in own if name in tensors and tensors[name].shape == own[name].shape]
     spec = None if tag is not None else _read_records(path, texts)[0]
-    if spec is not None and of_positions(spec):
+    if spec is not None and is_position_training(spec):
         fitting = [name for name in fitting if name.startswith("positions.")]  # the rest has learnt nothing
     if not fitting:
         raise InputError(f"{path}: found no parameter that fits the network by name and shape, expected some")
@@ -181,7 +181,7 @@ def _take_over(path: str | Path, network: nn.Module) -> tuple[str, ...]:
             own[name].copy_(tensors[name])
     trunk = getattr(network, "trunk", None)
     if spec is not None and isinstance(trunk, IterativeRefiner) and any(name.startswith("trunk.") for name in fitting):
-        trunk.rescale(spec.drift.std(_from_texts(path, texts)[0]))
+        trunk.rescale(spec.drift.std(_parse_texts(path, texts)[0]))
     return tuple(name for name in own if name not in fitting)
 
 
@@ -194,8 +194,8 @@ def _check_code(path: str | Path, spec: NetworkSpec, trusted: Collection[str]) -
     backbone = getattr(spec.network.variant(), "backbone", "")
     if is_import_path(backbone) and backbone not in trusted:
         raise InputError(
-            f"{path}: found the encoder {quoted(backbone)}, whose code would run; expected one of imgcal or timm. "
-            f"If you trust it: --trust {quoted(backbone)}, in Python load_checkpoint(..., trusted=(...,))"
+            f"{path}: found the encoder {quote(backbone)}, whose code would run; expected one of imgcal or timm. "
+            f"If you trust it: --trust {quote(backbone)}, in Python load_checkpoint(..., trusted=(...,))"
         )
 
 
@@ -215,7 +215,7 @@ def _fill(path: str | Path, network: nn.Module, tensors: dict[str, Tensor]) -> N
     weights = {name: tensor.to(own[name].dtype) for name, tensor in tensors.items()}
     broken = next((name for name, tensor in weights.items() if not bool(tensor.isfinite().all())), None)
     if broken is not None:
-        raise InputError(f"{path}: found weights that are not finite ({shortened(broken)}), expected a trained network")
+        raise InputError(f"{path}: found weights that are not finite ({shorten(broken)}), expected a trained network")
     network.load_state_dict(weights)
 
 
@@ -226,13 +226,13 @@ def _read_records(path: str | Path, texts: dict[str, str]) -> tuple[NetworkSpec,
             raise ValueError("no mapping")
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: found no readable experiment in it, expected one: the file is damaged") from error
-    return validated(content, NetworkSpec, f"{path}: experiment"), metrics
+    return validate(content, NetworkSpec, f"{path}: experiment"), metrics
 
 
-def _from_texts(path: str | Path, texts: dict[str, str]) -> tuple[CameraRig, CalibrationObject]:
+def _parse_texts(path: str | Path, texts: dict[str, str]) -> tuple[CameraRig, CalibrationObject]:
     """Read rig and object from the text of their files."""
     try:
-        name = title_of(Path(texts["object_name"]))
+        name = title_from_name(Path(texts["object_name"]))
         return rig_from_text(texts["rig"], "rig"), object_from_text(texts["object"], "object", name)
     except (KeyError, InputError) as error:
         raise InputError(f"{path}: found no readable rig and object in it, expected both: {error}") from error

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import ConfigDict, Field, model_validator
 
 from imgcal.io import StrictModel, nearest
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 from imgcal.networks.backbone_options import MOST_WEIGHTS, check_options
 from imgcal.synthesis import Drift, ImageOptions, PoseRange
 
@@ -20,7 +20,7 @@ Encoder = Literal["transformer", "cnn1d"]
 Attending = TypeVar("Attending", "PaperPoints", "TrunkConfig")
 
 
-def _with_whole_heads(config: Attending) -> Attending:
+def _make_heads_whole(config: Attending) -> Attending:
     if config.encoder == "transformer" and config.width % config.heads:
         raise ValueError(f"found width {config.width} and {config.heads} heads, expected a multiple of the heads")
     if 13 * config.width**2 * config.depth > MOST_WEIGHTS:  # of either encoder, about
@@ -40,7 +40,7 @@ class PaperPoints(StrictModel):
 
     @model_validator(mode="after")
     def _divisible(self) -> PaperPoints:
-        return _with_whole_heads(self)
+        return _make_heads_whole(self)
 
 
 class PaperImages(StrictModel):
@@ -71,7 +71,7 @@ class TrunkConfig(StrictModel):
 
     @model_validator(mode="after")
     def _divisible(self) -> TrunkConfig:
-        return _with_whole_heads(self)
+        return _make_heads_whole(self)
 
 
 class Points(StrictModel):
@@ -158,8 +158,8 @@ class NetworkConfig(StrictModel):
     @model_validator(mode="after")
     def _known(self) -> NetworkConfig:
         if self.preset not in PRESETS:
-            hint = nearest(self.preset, PRESETS) or one_of(PRESETS)
-            raise ValueError(f"found preset `{shortened(self.preset)}`{hint}")
+            hint = nearest(self.preset, PRESETS) or list_choices(PRESETS)
+            raise ValueError(f"found preset `{shorten(self.preset)}`{hint}")
         self.variant()
         return self
 
@@ -173,7 +173,7 @@ class NetworkConfig(StrictModel):
         values = preset.model_dump()
         if "backbone" in self.change and "options" in values:
             values["options"] = {}  # those of the preset are of its own encoder
-        return type(preset).model_validate(_merged(values, self.change, self.preset), strict=False)
+        return type(preset).model_validate(_merge(values, self.change, self.preset), strict=False)
 
 
 class NetworkSpec(StrictModel):
@@ -193,7 +193,7 @@ class NetworkSpec(StrictModel):
 Spec = TypeVar("Spec", bound=NetworkSpec)
 
 
-def without_pretrained(spec: Spec) -> Spec:
+def drop_pretrained(spec: Spec) -> Spec:
     """The same without published weights, for when other weights replace them."""
     if "pretrained" not in spec.network.change:
         return spec
@@ -201,17 +201,17 @@ def without_pretrained(spec: Spec) -> Spec:
     return spec.model_copy(update={"network": plain})
 
 
-def one_of(names: Iterable[str]) -> str:
+def list_choices(names: Iterable[str]) -> str:
     """Describe the allowed choices."""
     return ", expected one of " + ", ".join(names)
 
 
-def _merged(values: dict[str, Any], change: dict[str, Any], where: str) -> dict[str, Any]:
+def _merge(values: dict[str, Any], change: dict[str, Any], where: str) -> dict[str, Any]:
     merged = dict(values)
     for name, value in change.items():
         if name not in values:
-            hint = nearest(name, values) or one_of(values)
-            raise ValueError(f"found `{shortened(name)}` in the changes of {where}{hint}")
+            hint = nearest(name, values) or list_choices(values)
+            raise ValueError(f"found `{shorten(name)}` in the changes of {where}{hint}")
         inner = isinstance(values[name], dict) and isinstance(value, dict) and name != "options"
-        merged[name] = _merged(values[name], value, f"{where}: {name}") if inner else value
+        merged[name] = _merge(values[name], value, f"{where}: {name}") if inner else value
     return merged

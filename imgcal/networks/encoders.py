@@ -106,7 +106,7 @@ class VitEncoder(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Images (I, 3, H, W) -> (I, width, size / 4, size / 4); other sizes are resized."""
-        images = resized(images, (self.size, self.size))
+        images = resize_images(images, (self.size, self.size))
         tokens = self.patches(functional.pad(images, (0, -self.size % PATCH, 0, -self.size % PATCH))) + self.place
         encoded = self.blocks(tokens.flatten(2).mT).mT.unflatten(-1, tokens.shape[-2:])
         side = -(-self.size // STRIDE)
@@ -131,7 +131,7 @@ class Cells(nn.Module):
         return functional.pixel_shuffle(self.linear(tokens), self.factor)
 
 
-def resized(images: Tensor, size: tuple[int, int]) -> Tensor:
+def resize_images(images: Tensor, size: tuple[int, int]) -> Tensor:
     """Images (I, 3, H, W) of another size (height, width); the same where they have it."""
     if images.shape[-2:] == size:
         return images

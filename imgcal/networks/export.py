@@ -191,7 +191,7 @@ def save_exported(program: Program, path: Path) -> float:
     Raises:
         InputError: the file cannot be written.
     """
-    exported = _exported(program, fixed=False)
+    exported = _export(program, fixed=False)
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of weights that lie in one block
@@ -220,7 +220,7 @@ def save_onnx(program: Program, path: Path) -> float:
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")  # of the exporter, about itself
         torch.onnx.export(
-            _Held(_rewritten(_exported(program, fixed=True).module())), program.example,
+            _Held(_rewritten(_export(program, fixed=True).module())), program.example,
             buffer,  # type: ignore[arg-type]  # its stubs know paths alone
             input_names=list(program.inputs), output_names=list(program.outputs), opset_version=OPSET, dynamo=False,
         )  # fmt: skip
@@ -251,7 +251,7 @@ def difference(found: Sequence[NDArray[Any]], expected: Sequence[Tensor]) -> flo
     return worst
 
 
-def _exported(program: Program, fixed: bool) -> torch.export.ExportedProgram:
+def _export(program: Program, fixed: bool) -> torch.export.ExportedProgram:
     """Follow the network; its first axes may be of any length unless they are fixed."""
     example, shapes = program.example, None
     if not fixed:

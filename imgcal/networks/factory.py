@@ -60,10 +60,10 @@ def build(
         (3, torch.Size([2, 4, 2]))
     """
     with drawing_from(generator):
-        return _made(config, Parameterization(factory, obj, drift_std), images)
+        return _make(config, Parameterization(factory, obj, drift_std), images)
 
 
-def _made(config: NetworkConfig, parameterization: Parameterization, images: ImageOptions | None) -> Network:
+def _make(config: NetworkConfig, parameterization: Parameterization, images: ImageOptions | None) -> Network:
     """Make what a configuration says; see `build`."""
     # timm takes seconds to import: only for those who need it.
     from imgcal.networks.points import PaperPointNetwork, PointNetwork

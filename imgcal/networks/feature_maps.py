@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from imgcal.errors import InputError
-from imgcal.messages import quoted, shortened
+from imgcal.messages import quote, shorten
 from imgcal.networks.backbone_options import MOST_WEIGHTS, USUAL_SIZE
 from imgcal.networks.config import Images, is_import_path
 from imgcal.networks.encoders import STRIDE, CnnEncoder, VitEncoder
@@ -33,23 +33,23 @@ def make_encoder(config: Images, size: int | None) -> tuple[nn.Module, int, int]
     if name in ("cnn", "vit") or is_import_path(name):
         if config.pretrained:
             raise InputError(
-                f"backbone {shortened(name)}: found pretrained: true, but only timm models have pretrained weights"
+                f"backbone {shorten(name)}: found pretrained: true, but only timm models have pretrained weights"
             )
         drawn = size or USUAL_SIZE
         if name == "cnn":
-            return _counted(name, lambda: CnnEncoder(config.width, **options)), config.width, drawn
+            return _count_weights(name, lambda: CnnEncoder(config.width, **options)), config.width, drawn
         if name == "vit":
-            return _counted(name, lambda: VitEncoder(config.width, drawn, **options)), config.width, drawn
-        encoder_class = _imported(name)
-        encoder = _counted(name, lambda: encoder_class(**options))
-        return encoder, _checked_width(encoder, name, drawn), drawn
+            return _count_weights(name, lambda: VitEncoder(config.width, drawn, **options)), config.width, drawn
+        encoder_class = _import(name)
+        encoder = _count_weights(name, lambda: encoder_class(**options))
+        return encoder, _check_width(encoder, name, drawn), drawn
     from imgcal.networks.timm_encoder import TimmEncoder  # timm takes seconds to import: only for those who need it
 
     timms = TimmEncoder(name, config.pretrained, options, config.width)
     return timms, config.width, size or max(timms.size)
 
 
-def _imported(path: str) -> Callable[..., nn.Module]:
+def _import(path: str) -> Callable[..., nn.Module]:
     """Find the class that `package.module:Class` names.
 
     Raises:
@@ -59,13 +59,15 @@ def _imported(path: str) -> Callable[..., nn.Module]:
     try:
         found = getattr(importlib.import_module(module), name)
     except Exception as error:  # the module's own code runs
-        raise InputError(f"backbone: found `{shortened(path)}`, which cannot be imported: {_said(error)}") from error
+        raise InputError(
+            f"backbone: found `{shorten(path)}`, which cannot be imported: {_first_line(error)}"
+        ) from error
     if not (isinstance(found, type) and issubclass(found, nn.Module)):
-        raise InputError(f"backbone: found `{shortened(path)}`, expected a subclass of torch.nn.Module")
+        raise InputError(f"backbone: found `{shorten(path)}`, expected a subclass of torch.nn.Module")
     return found
 
 
-def _counted(name: str, make: Callable[[], nn.Module]) -> nn.Module:
+def _count_weights(name: str, make: Callable[[], nn.Module]) -> nn.Module:
     """Make an encoder whose weights were counted before they have memory."""
     try:
         with torch.device("meta"):
@@ -76,11 +78,11 @@ def _counted(name: str, make: Callable[[], nn.Module]) -> nn.Module:
     except InputError:
         raise
     except Exception as error:  # a class of the user's does what it likes with what the options give it
-        raise InputError(f"backbone {shortened(name)}: cannot be made of its options: {_said(error)}") from error
+        raise InputError(f"backbone {shorten(name)}: cannot be made of its options: {_first_line(error)}") from error
 
 
 @torch.no_grad()
-def _checked_width(encoder: nn.Module, name: str, size: int) -> int:
+def _check_width(encoder: nn.Module, name: str, size: int) -> int:
     """Number of features of an encoder's map, measured on one image.
 
     Raises:
@@ -91,19 +93,19 @@ def _checked_width(encoder: nn.Module, name: str, size: int) -> int:
         features = encoder.eval()(torch.zeros(1, 3, size, size))
     except Exception as error:
         raise InputError(
-            f"backbone {shortened(name)}: fails on images of shape (1, 3, {size}, {size}): {_said(error)}"
+            f"backbone {shorten(name)}: fails on images of shape (1, 3, {size}, {size}): {_first_line(error)}"
         ) from error
     encoder.train(was_training)
     cells = -(-size // STRIDE)
     if not isinstance(features, Tensor) or features.ndim != 4 or features.shape[2:] != (cells, cells):
         found = list(features.shape) if isinstance(features, Tensor) else type(features).__name__
         raise InputError(
-            f"backbone {shortened(name)}: of an image of {size} x {size} pixels found {found}, "
+            f"backbone {shorten(name)}: of an image of {size} x {size} pixels found {found}, "
             f"expected features of shape (1, F, {cells}, {cells}): a stride of {STRIDE}"
         )
     return int(features.shape[1])
 
 
-def _said(error: Exception) -> str:
+def _first_line(error: Exception) -> str:
     """The first line of an error raised by a foreign class, with its name."""
-    return quoted(f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}")
+    return quote(f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}")

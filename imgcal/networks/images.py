@@ -25,7 +25,7 @@ FAINT = 1e-3  # weight of what does not count: enough for a gradient to reach it
 
 
 @dataclass(frozen=True)
-class Sightings:
+class Positions:
     """Where a network sees fiducials, in pixels of the sensors."""
 
     uv: Tensor  # (B, C, N, 2)
@@ -67,7 +67,7 @@ class ImageNetwork(Network):
         """The image encoder: nothing else says where to look."""
         return self.positions.backbone
 
-    def sight(self, images: Tensor) -> Sightings:
+    def sight(self, images: Tensor) -> Positions:
         """Locate the fiducials in the images of rigs (B, C, 3, H, W), in pixels of the sensors."""
         batch = images.shape[:2]
         located: Located = self.positions(images.flatten(0, 1))
@@ -76,11 +76,11 @@ class ImageNetwork(Network):
             uv = resized_pixels(located.uv.unflatten(0, batch), scale[:, None])
             # Of Laplace's distribution; one number for both axes, as the points of a sensor have.
             sigma = 2**0.5 * located.log_scale.exp().unflatten(0, batch) * scale.prod(-1).sqrt()[:, None]
-            return Sightings(uv, sigma, located.confidence.unflatten(0, batch))
+            return Positions(uv, sigma, located.confidence.unflatten(0, batch))
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.images`; one prediction a pass."""
-        found = self.sight(images_of(views))
+        found = self.sight(stack_images(views))
         return self.trunk(found.uv, found.weight)
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
@@ -98,7 +98,7 @@ class HueCentroidNetwork(Network):
         super().__init__(parameterization, images or ImageOptions())
         self.trunk = IterativeRefiner(parameterization, **config.trunk.model_dump())
 
-    def sight(self, images: Tensor) -> Sightings:
+    def sight(self, images: Tensor) -> Positions:
         """Find the fiducials in the images of rigs (B, C, 3, H, W), in pixels of the sensors."""
         assert self.image_options is not None
         batch = images.shape[:2]
@@ -107,11 +107,11 @@ class HueCentroidNetwork(Network):
             uv, confidence = find_soft_positions(flat, self.parameterization.colours, self.image_options.dot)
             scale = self.parameterization.image_size.to(uv) / images.shape[-1]
             uv = resized_pixels(uv.unflatten(0, batch), scale[:, None])
-            return Sightings(uv, torch.zeros_like(uv[..., 0]), confidence.unflatten(0, batch))
+            return Positions(uv, torch.zeros_like(uv[..., 0]), confidence.unflatten(0, batch))
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.images`; one prediction a pass."""
-        found = self.sight(images_of(views))
+        found = self.sight(stack_images(views))
         return self.trunk(found.uv, found.weight)
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
@@ -119,7 +119,7 @@ class HueCentroidNetwork(Network):
         return {"trunk": self.trunk.parameters()}
 
 
-def images_of(views: Views) -> Tensor:
+def stack_images(views: Views) -> Tensor:
     """Images (B, C, 3, H, W).
 
     Raises:

@@ -93,7 +93,7 @@ class InfraredNetwork(nn.Module):
         """Look for each fiducial.
 
         Args:
-            crops: (P, S, S) grey, normalized by `normalized`.
+            crops: (P, S, S) grey, normalized by `normalize_crops`.
             queries: (P, N) fiducials.
             window: cells each way, where the places are known better than usual: `config.close_window`.
         """
@@ -182,7 +182,7 @@ def aligned_windows(features: Tensor, place: Tensor, window: int) -> tuple[Tenso
     return found.unflatten(2, (-1, window)).movedim(2, 1), cells
 
 
-def normalized(crops: Tensor) -> Tensor:
+def normalize_crops(crops: Tensor) -> Tensor:
     """Make crops (P, S, S) comparable: less their median, over their noise, compressed; NaN (no image) becomes 0.
 
     The noise is the median absolute difference of pixels two apart: background that changes slowly does not count.

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from imgcal.errors import InputError
-from imgcal.io import StrictModel, read_json, read_tensors, validated, write_tensors
+from imgcal.io import StrictModel, read_json, read_tensors, validate, write_tensors
 from imgcal.networks.infrared import InfraredConfig, InfraredNetwork
 from imgcal.networks.measurer import Measurer, MeasurerConfig
 from imgcal.networks.randomness import drawing_from
@@ -101,7 +101,7 @@ def _read(path: str | Path, tag: str, kind: type[Config]) -> tuple[Config, dict[
             raise ValueError("no mapping")
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: found no readable configuration in it, expected one: the file is damaged") from error
-    return validated(content, kind, f"{path}: config"), tensors, metrics
+    return validate(content, kind, f"{path}: config"), tensors, metrics
 
 
 def _fill(path: str | Path, network: nn.Module, tensors: dict[str, Tensor]) -> None:

@@ -74,7 +74,7 @@ def mlp(widths: Sequence[int]) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-def zeroed(head: nn.Sequential) -> nn.Sequential:
+def zero_last_layer(head: nn.Sequential) -> nn.Sequential:
     """Zero the last layer, so that an untrained head returns zero."""
     last = head[-1]
     if not isinstance(last, nn.Linear):

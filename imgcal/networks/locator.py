@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from imgcal.geometry import resized_pixels
-from imgcal.networks.layers import mlp, zeroed
+from imgcal.networks.layers import mlp, zero_last_layer
 
 WINDOW = 5  # cells around the maximum of a heatmap over which its centre is taken
 CROP = 9  # pixels of the image that are looked at around there
@@ -49,7 +49,7 @@ class Locator(nn.Module):
         self.identity = nn.Parameter(0.5 * torch.randn(fiducials, inner))
         self.look = nn.Linear(8, inner, bias=False)
         self.weigh = mlp((inner, inner // 2, 1))
-        self.correct = zeroed(mlp((3 * CROP**2 + inner, inner, 3)))
+        self.correct = zero_last_layer(mlp((3 * CROP**2 + inner, inner, 3)))
 
     def forward(self, features: Tensor, images: Tensor) -> Located:
         """Locate fiducials, by maps (I, width, h, w), in images (I, 3, H, W); float32."""

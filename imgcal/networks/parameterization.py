@@ -106,7 +106,7 @@ class Parameterization(nn.Module):
         tensors = {"points": self.points, "colours": self.colours, "radius": self.radius, "tolerance": self.tolerance}
         return replace(self._obj, **tensors)  # type: ignore[arg-type]
 
-    def normalized(self, uv: Tensor) -> Tensor:
+    def normalize(self, uv: Tensor) -> Tensor:
         """Pixels (B, C, N, 2) to numbers of about one, by the factory's intrinsics."""
         return (uv - self.principal_point[:, None]) / self.focal_length[:, None] * self.unit
 

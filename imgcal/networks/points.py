@@ -82,9 +82,9 @@ class PaperPointNetwork(Network):
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.uv`; fiducials that are not seen count as at the principal point."""
-        uv, seen = points_of(views)
+        uv, seen = stack_points(views)
         with torch.autocast(uv.device.type, enabled=False):
-            positions = torch.where(seen[..., None], self.parameterization.normalized(uv.float()), 0.0).flatten(-2)
+            positions = torch.where(seen[..., None], self.parameterization.normalize(uv.float()), 0.0).flatten(-2)
             embedded = self.embed(positions)  # bf16 would round a position to a pixel before it is looked at
         numbers = self.heads(self.layers(self.identity(embedded)))
         with torch.autocast(uv.device.type, enabled=False):
@@ -104,7 +104,7 @@ class PointNetwork(Network):
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.uv` and `views.seen`; one prediction a pass."""
-        uv, seen = points_of(views)
+        uv, seen = stack_points(views)
         return self.trunk(torch.where(seen[..., None], uv, 0.0), seen.to(uv.dtype))
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
@@ -112,7 +112,7 @@ class PointNetwork(Network):
         return {"trunk": self.trunk.parameters()}
 
 
-def points_of(views: Views) -> tuple[Tensor, Tensor]:
+def stack_points(views: Views) -> tuple[Tensor, Tensor]:
     """Positions (B, C, N, 2) and which are seen (B, C, N).
 
     Raises:

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from imgcal.networks.backbone import Backbone
 from imgcal.networks.config import PaperImages, PooledImages
-from imgcal.networks.images import images_of
+from imgcal.networks.images import stack_images
 from imgcal.networks.network import Network
 from imgcal.networks.parameterization import Parameterization
 from imgcal.networks.points import PaperHeads
@@ -53,7 +53,7 @@ class PaperImageNetwork(_PooledNetwork):
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.images`."""
-        images = images_of(views)
+        images = stack_images(views)
         pooled = self.backbone(images.flatten(0, 1))
         numbers = self.heads(self.bottleneck(pooled).unflatten(0, images.shape[:2]))
         with torch.autocast(images.device.type, enabled=False):
@@ -77,7 +77,7 @@ class PooledImageNetwork(_PooledNetwork):
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
         """Predict the rig from `views.images`; one prediction a pass."""
-        images = images_of(views)
+        images = stack_images(views)
         features = functional.gelu(self.bottleneck(self.backbone(images.flatten(0, 1))))
         fiducials = len(self.parameterization.colours)
         nothing = images.new_zeros((*images.shape[:2], fiducials), dtype=torch.float32)

@@ -13,7 +13,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from imgcal.networks.layers import conv1d, mlp, transformer, zeroed
+from imgcal.networks.layers import conv1d, mlp, transformer, zero_last_layer
 from imgcal.networks.parameterization import Parameterization, RigState
 from imgcal.types import Prediction
 
@@ -43,8 +43,8 @@ class UpdateBlock(nn.Module):
         self.camera_identity = nn.Parameter(0.5 * torch.randn(cameras, width))
         self.rig_token = nn.Parameter(0.5 * torch.randn(width))
         self.encoder = transformer(width, depth, heads) if encoder == "transformer" else conv1d(width, depth)
-        self.camera_head = zeroed(mlp((width + inputs, 2 * width, parameters)))
-        self.pose_head = zeroed(mlp((width, 2 * width, pose)))
+        self.camera_head = zero_last_layer(mlp((width + inputs, 2 * width, parameters)))
+        self.pose_head = zero_last_layer(mlp((width, 2 * width, pose)))
 
     def forward(self, inputs: Tensor, features: Tensor | None) -> tuple[Tensor, Tensor]:
         """(B, C, inputs), (B, C, features) -> (B, C, K), (B, pose)."""
@@ -85,7 +85,7 @@ class IterativeRefiner(nn.Module):
         later = (encoder, width, later_depth, heads)
         inputs = parts * fiducials + parameters
         self.later = UpdateBlock(inputs, features, cameras, (parameters, 6), *later) if passes > 1 else None
-        self.trust_head = zeroed(mlp((inputs, width, fiducials))) if trust else None
+        self.trust_head = zero_last_layer(mlp((inputs, width, fiducials))) if trust else None
 
     def forward(self, uv: Tensor, weight: Tensor, features: Tensor | None = None) -> tuple[Prediction, ...]:
         """Predict.
@@ -101,7 +101,7 @@ class IterativeRefiner(nn.Module):
         device = uv.device.type
         with torch.autocast(device, enabled=False):
             uv, weight = uv.float(), weight.float()
-            positions = self.parameterization.normalized(uv).clamp(-LIMIT, LIMIT) * weight[..., None]
+            positions = self.parameterization.normalize(uv).clamp(-LIMIT, LIMIT) * weight[..., None]
             inputs = torch.cat((positions.flatten(-2), weight), dim=-1)
         offsets, pose = self.first(inputs, features)
         with torch.autocast(device, enabled=False):
@@ -149,7 +149,7 @@ class IterativeRefiner(nn.Module):
             projected = self.parameterization.project(prediction).uv
         residual = (projected - uv) * weight[..., None]
         scaled = [torch.tanh(residual / scale) for scale in RESIDUAL_SCALES]
-        around = self.parameterization.normalized(projected)
+        around = self.parameterization.normalize(projected)
         parts = [(residual / 100).clamp(-LIMIT, LIMIT), *scaled, around.clamp(-LIMIT, LIMIT)]
         offsets = state.offsets.clamp(-LIMIT, LIMIT)
         return torch.cat((*(part.flatten(-2) for part in parts), weight, offsets), dim=-1)

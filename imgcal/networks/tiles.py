@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from imgcal.geometry import RigidTransform
-from imgcal.networks.expectation import USUAL_RADIUS, Expectation
+from imgcal.networks.expected_positions import USUAL_RADIUS, Expectation
 from imgcal.types import CalibrationObject, CameraRig, CropPlacement
 
 LEAST_RADIUS = 0.5  # crop pixels: of smaller markers there were none in training (`synthesis/crops.py`)
@@ -48,7 +48,7 @@ class Tiles:
         reduced = (seen.radius[0] / whole.placement.scale[:, None])[seen.visible[0]]
         if not len(reduced) or float(reduced.median()) >= LEAST_RADIUS:
             return whole
-        tiles = replace(cls.around(seen, size), usual=usual)
+        tiles = replace(cls.from_neighbours(seen, size), usual=usual)
         return tiles if float(tiles.there.sum(1).float().mean()) >= LEAST_NEIGHBOURS else whole
 
     @classmethod
@@ -59,7 +59,7 @@ class Tiles:
         return cls(placement, torch.arange(cameras), torch.arange(fiducials).expand(cameras, -1), every, every)
 
     @classmethod
-    def around(cls, expected: Expectation, size: int) -> Tiles:
+    def from_neighbours(cls, expected: Expectation, size: int) -> Tiles:
         """Cut what one pose (1, C, N) puts in view into tiles of neighbours, side by side in each image."""
         cells = [
             _side_by_side(uv[seen], radius[seen], size)[:2]
@@ -82,11 +82,11 @@ class Tiles:
         order = there.to(torch.int8).argsort(dim=1, descending=True, stable=True)[:, : int(there.sum(1).max())]
         return cls(placement, camera, order, there.gather(1, order), counts.gather(1, order), divided=True)
 
-    def only(self, cameras: Tensor) -> Tiles:
+    def select_cameras(self, cameras: Tensor) -> Tiles:
         """Look for nothing in other cameras than these, (C,) bool."""
         return replace(self, there=self.there & cameras[self.camera, None])
 
-    def of(self, expected: Expectation) -> Expectation:
+    def arrange_expected(self, expected: Expectation) -> Expectation:
         """Arrange what is expected (H, C, N) by tile: (H, T, n)."""
         if not self.divided:  # as it lies in memory: sums then round as they always did
             return expected
@@ -96,7 +96,7 @@ class Tiles:
         )
         return Expectation(uv, radius, depth, visible & self.there)
 
-    def joined(self, values: Tensor, cameras: int, fiducials: int) -> Tensor:
+    def join(self, values: Tensor, cameras: int, fiducials: int) -> Tensor:
         """Arrange values (T, n, ...) by camera: (C, N, ...), zero where no tile says anything."""
         if not self.divided:
             return values
@@ -106,7 +106,7 @@ class Tiles:
         ]
         return whole
 
-    def summed(self, values: Tensor, cameras: int) -> Tensor:
+    def sum_by_camera(self, values: Tensor, cameras: int) -> Tensor:
         """Add up what counts of values (T, n, ...) by camera: (C, ...)."""
         if not self.divided:
             return values.sum(1)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from imgcal.networks.backbone import input_size, make_backbone
-from imgcal.networks.encoders import STRIDE, Cells, Pyramid, resized
+from imgcal.networks.encoders import STRIDE, Cells, Pyramid, resize_images
 
 
 class TimmEncoder(nn.Module):
@@ -29,7 +29,7 @@ class TimmEncoder(nn.Module):
         wanted = resolve_data_config({}, model=plain)
         self.register_buffer("mean", torch.tensor(wanted["mean"]).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(wanted["std"]).view(3, 1, 1), persistent=False)
-        strided, levels = _strided(name, pretrained, options)
+        strided, levels = _make_strided(name, pretrained, options)
         self.model: Any = strided or plain
         self.levels = levels
         if strided is not None:
@@ -44,7 +44,7 @@ class TimmEncoder(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         """Images (I, 3, H, W) in [0, 1] -> (I, width, h / 4, w / 4) of the h x w pixels that the model takes."""
         height, width = self.size
-        normalized = (resized(images, self.size) - self.mean) / self.std
+        normalized = (resize_images(images, self.size) - self.mean) / self.std
         if self.levels:
             maps = self.model(normalized)
             maps = [_channels_first(self.model, maps[level]) for level in self.levels]
@@ -67,7 +67,7 @@ class TimmEncoder(nn.Module):
         return patches.mT.unflatten(-1, (side, -1))
 
 
-def _strided(name: str, pretrained: bool, options: Mapping[str, Any]) -> tuple[Any, list[int]]:
+def _make_strided(name: str, pretrained: bool, options: Mapping[str, Any]) -> tuple[Any, list[int]]:
     """Make a timm model that gives its maps, with the numbers of those from stride 4 on; nothing where it has one."""
     try:
         model: Any = timm.create_model(name, pretrained=pretrained, features_only=True, **options)

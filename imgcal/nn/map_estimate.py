@@ -10,7 +10,7 @@ from imgcal.estimation import (
     EstimationOptions,
     Problem,
     State,
-    encoded,
+    encode_options,
     initial_state,
     make_loss,
     make_problem,
@@ -22,7 +22,7 @@ from imgcal.estimation import (
     rig_at,
 )
 from imgcal.geometry import RigidTransform, pose_rank
-from imgcal.nn.held import HeldObject, HeldRig
+from imgcal.nn.buffers import ObjectBuffers, RigBuffers
 from imgcal.nn.pytrees import register
 from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 
@@ -92,11 +92,11 @@ class MapEstimate(nn.Module):
         options: EstimationOptions = EstimationOptions(),
     ) -> None:
         super().__init__()
-        self.factory, self.obj = HeldRig(factory), HeldObject(obj)
+        self.factory, self.obj = RigBuffers(factory), ObjectBuffers(obj)
         prior_std = (factory.prior or RigPrior()).std(factory) if prior_std is None else prior_std
         self.register_buffer("prior_std", prior_std.clone(), persistent=False)
         self.register_buffer("object_prior_std", None if obj.exact else object_prior_std(obj), persistent=False)
-        self.options, self._encoded = options, encoded(options)
+        self.options, self._encoded = options, encode_options(options)
         self._pose_rank = pose_rank(obj.points)
 
     def forward(

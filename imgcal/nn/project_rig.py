@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import nn
 
 from imgcal.geometry import Projection, RigidTransform
-from imgcal.nn.held import HeldObject
+from imgcal.nn.buffers import ObjectBuffers
 from imgcal.types import CalibrationObject, CameraRig
 
 
@@ -37,7 +37,7 @@ class ProjectRig(nn.Module):
 
     def __init__(self, obj: CalibrationObject) -> None:
         super().__init__()
-        self.obj = HeldObject(obj)
+        self.obj = ObjectBuffers(obj)
 
     def forward(self, rig: CameraRig, rig_from_object: RigidTransform | None = None) -> Projection:
         """Project."""

@@ -50,7 +50,7 @@ def register(cls: type[Value], constants: tuple[str, ...] = ()) -> type[Value]:
     def flatten(value: Value) -> tuple[list[Any], tuple[Any, ...]]:
         given = tuple(name for name in names if getattr(value, name) is not None)
         fixed = (getattr(value, name) for name in constants)
-        return [getattr(value, name) for name in given], (given, *map(_fixed, fixed))
+        return [getattr(value, name) for name in given], (given, *map(_wrap_constant, fixed))
 
     def flatten_with_keys(value: Value) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
         children, context = flatten(value)
@@ -71,14 +71,14 @@ def register(cls: type[Value], constants: tuple[str, ...] = ()) -> type[Value]:
         flatten,
         unflatten,
         serialized_type_name=f"imgcal.{cls.__name__}",
-        to_dumpable_context=lambda context: [_dumped(fixed) for fixed in context],
-        from_dumpable_context=lambda dumped: tuple(map(_loaded, dumped)),
+        to_dumpable_context=lambda context: [_dump(fixed) for fixed in context],
+        from_dumpable_context=lambda dumped: tuple(map(_load, dumped)),
         flatten_with_keys_fn=flatten_with_keys,
     )
     return cls
 
 
-def _fixed(value: Any) -> Any:
+def _wrap_constant(value: Any) -> Any:
     return Constant(value) if isinstance(value, Tensor) else value
 
 
@@ -91,7 +91,7 @@ _LOAD: dict[str, Callable[[Any], Any]] = {
 }
 
 
-def _dumped(value: Any) -> Any:
+def _dump(value: Any) -> Any:
     """Write a constant as JSON can hold it."""
     if isinstance(value, Constant):
         return ["Constant", {"values": value.tensor.tolist(), "device": str(value.tensor.device)}]
@@ -100,7 +100,7 @@ def _dumped(value: Any) -> Any:
     return ["tuple", list(value)] if isinstance(value, tuple) else ["", value]
 
 
-def _loaded(dumped: Any) -> Any:
+def _load(dumped: Any) -> Any:
     kind, value = dumped
     return _LOAD[kind](value) if kind else value
 

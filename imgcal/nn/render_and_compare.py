@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from torch import Tensor, nn
 
 from imgcal.geometry import RigidTransform
-from imgcal.nn.held import HeldObject, HeldRig
+from imgcal.nn.buffers import ObjectBuffers, RigBuffers
 from imgcal.nn.pytrees import register
-from imgcal.refinement import ImageRefinementOptions, encoded_image_options, refine_images_anywhere
+from imgcal.refinement import ImageRefinementOptions, encode_image_options, refine_images_anywhere
 from imgcal.types import CalibrationObject, CameraRig, Prediction, RigPrior
 
 
@@ -70,10 +70,10 @@ class RenderAndCompare(nn.Module):
         options: ImageRefinementOptions = ImageRefinementOptions(),
     ) -> None:
         super().__init__()
-        self.factory, self.obj = HeldRig(factory), HeldObject(obj)
+        self.factory, self.obj = RigBuffers(factory), ObjectBuffers(obj)
         prior_std = (factory.prior or RigPrior()).std(factory) if prior_std is None else prior_std
         self.register_buffer("prior_std", prior_std.clone(), persistent=False)
-        self._encoded = encoded_image_options(options)
+        self._encoded = encode_image_options(options)
 
     def forward(self, prediction: Prediction, images: Tensor, factory: CameraRig | None = None) -> RefinedImages:
         """Refine; another factory rig in the place of that which the module holds."""

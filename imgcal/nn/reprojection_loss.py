@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from imgcal.geometry import project_kornia
-from imgcal.nn.held import HeldObject
+from imgcal.nn.buffers import ObjectBuffers
 from imgcal.types import CalibrationObject, CameraRig, Prediction
 
 # Nearer points (mm) are projected at this depth, differences are cut at this size (pixels): what an untrained network
@@ -50,7 +50,7 @@ class ReprojectionLoss(nn.Module):
         super().__init__()
         if reduction not in ("mean", "sum", "none"):
             raise ValueError(f"reduction must be 'mean', 'sum' or 'none', found {reduction!r}")
-        self.obj, self.reduction = HeldObject(obj), reduction
+        self.obj, self.reduction = ObjectBuffers(obj), reduction
 
     def forward(self, prediction: Prediction, target: Prediction | Tensor, seen: Tensor | None = None) -> Tensor:
         """Compare."""

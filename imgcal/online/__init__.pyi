@@ -1,4 +1,4 @@
-from .clock import ClockOffsets
+from .clock_offsets import ClockOffsets
 from .events import EVENT_KINDS, ChangeKind, Event, EventKind
 from .foreign_object import ForeignObject
 from .image_quality import ImageQuality

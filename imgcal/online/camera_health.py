@@ -22,10 +22,10 @@ SAID: Mapping[CameraHealth, tuple[str, str]] = {
 """What is said of one camera, and of several."""
 
 
-def health_of(memory: KeeperMemory) -> dict[str, CameraHealth]:
+def camera_health(memory: KeeperMemory) -> dict[str, CameraHealth]:
     """How each camera is, by name."""
     found: dict[str, CameraHealth] = {}
-    doubted = {*memory.sightings.doubted, *memory.monitor.quarantine.cameras, *memory.monitor.undecided}
+    doubted = {*memory.sightings.doubtful_cameras, *memory.monitor.quarantine.cameras, *memory.monitor.undecided}
     if memory.in_vain >= VAIN:
         doubted |= set(range(memory.prior.num_cameras))  # nobody knows yet which of them are not where they were
     for camera, name in enumerate(memory.prior.camera_names):
@@ -55,11 +55,11 @@ def take_health(memory: KeeperMemory, event: Event) -> None:
         memory.told_health.pop(camera, None)
 
 
-def sentence_of(health: Mapping[str, CameraHealth], learnt: int) -> str:
+def describe_health(health: Mapping[str, CameraHealth], learnt: int) -> str:
     """Say how a rig is, of which so many snapshots have been learnt.
 
     Examples:
-        >>> sentence_of({"cam01": "ok", "cam02": "lost", "cam03": "lost"}, 9)
+        >>> describe_health({"cam01": "ok", "cam02": "lost", "cam03": "lost"}, 9)
         'cam02, cam03 are lost'
     """
     if not learnt:

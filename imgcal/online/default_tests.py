@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from imgcal.online.clock import ClockOffsets
+from imgcal.online.clock_offsets import ClockOffsets
 from imgcal.online.foreign_object import ForeignObject
 from imgcal.online.image_quality import ImageQuality
 from imgcal.online.sequential_test import SequentialTest

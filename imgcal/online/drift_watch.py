@@ -40,7 +40,7 @@ class DriftWatch:
     since: dict[int, float] = field(default_factory=dict)  # camera -> time of its reference
     unsettled: frozenset[int] = frozenset()  # at any time since the last look
 
-    def take(self, belief: RigBelief, unsettled: frozenset[int], time: float, number: int) -> list[Event]:
+    def observe(self, belief: RigBelief, unsettled: frozenset[int], time: float, number: int) -> list[Event]:
         """Say which cameras have drifted.
 
         Args:
@@ -58,7 +58,7 @@ class DriftWatch:
         if self.reference is None or self.std is None:
             self._begin(range(len(self.names)), belief, std, time)
             return []
-        change = Gauge.of_most(belief.rig, self.reference).difference(belief.rig, self.reference)
+        change = Gauge.from_majority(belief.rig, self.reference).difference(belief.rig, self.reference)
         events, anew = [], set(unsettled)
         for camera in range(len(self.names)):
             if camera in unsettled:
@@ -98,13 +98,13 @@ class DriftWatch:
         if self.reference is None or self.std is None:
             self.reference, self.std = belief.rig, std
         elif chosen:
-            now = Gauge.of_most(belief.rig, self.reference).laid(belief.rig, self.reference)
-            self.reference, self.std = with_cameras(self.reference, now, chosen), self.std.clone()
+            now = Gauge.from_majority(belief.rig, self.reference).align(belief.rig, self.reference)
+            self.reference, self.std = replace_cameras(self.reference, now, chosen), self.std.clone()
             self.std[chosen] = std[chosen]
         self.since |= dict.fromkeys(chosen, time)
 
 
-def with_cameras(rig: CameraRig, other: CameraRig, cameras: list[int]) -> CameraRig:
+def replace_cameras(rig: CameraRig, other: CameraRig, cameras: list[int]) -> CameraRig:
     """Replace cameras by those of another rig, both without batch axes."""
 
     def put(tensor: Tensor, source: Tensor) -> Tensor:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from imgcal.detection import Frame
 from imgcal.monitoring import Cusum, MeasurementUpdate
+from imgcal.online.camera_visibility import well_inside
 from imgcal.online.events import Event, EventKind
 from imgcal.online.rig_state import RigState
-from imgcal.online.sightings import well_inside
 
 Array = NDArray[np.float64]
 

@@ -17,22 +17,22 @@ from imgcal.detection import DetectionOptions, Frame
 from imgcal.errors import InputError, RefusedError
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring import MeasurementUpdate, MonitorUpdate, RigBelief
-from imgcal.online.camera_health import health_of, sentence_of, take_health
-from imgcal.online.clock import ClockOffsets, apart_event
+from imgcal.online.camera_health import camera_health, describe_health, take_health
+from imgcal.online.camera_visibility import VisibleObject
+from imgcal.online.clock_correction import clock_shifts, shift_blobs
+from imgcal.online.clock_offsets import ClockOffsets, unsynchronized_event
 from imgcal.online.default_tests import default_tests
 from imgcal.online.events import Event, snapshot_name
 from imgcal.online.keeper_file import KeeperFile, read_state, unusable
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.labelling import Labelling
-from imgcal.online.late_cameras import in_time, shifted
-from imgcal.online.learning import learnt_from
-from imgcal.online.object_doubts import object_event
+from imgcal.online.object_checks import object_event
 from imgcal.online.rig_state import RigState
 from imgcal.online.sequential_test import SequentialTest
-from imgcal.online.sightings import Look
-from imgcal.online.snapshot_labels import Labelled, labelled_snapshot
+from imgcal.online.snapshot_labels import Labelled, label_snapshot
+from imgcal.online.snapshot_update import learn_snapshot
 from imgcal.online.state_document import StateWriter
-from imgcal.pipeline import DetectorName, checked_frames
+from imgcal.pipeline import DetectorName, check_frames
 from imgcal.types import CalibrationObject, CameraRig, Detections, DriftRate, UnknownLights
 
 GREATEST_TIME = 2.0**37
@@ -88,7 +88,7 @@ class RigKeeper:
         if horizon is not None and isinstance(obj, UnknownLights):
             raise InputError("horizon: a rig known by unknown lights learns from all snapshots; leave the horizon out")
         self.options = _for_keeping(options)
-        self._memory = KeeperMemory.of(rig, obj, drift, self.options, horizon)
+        self._memory = KeeperMemory.from_factory(rig, obj, drift, self.options, horizon)
         usual = () if isinstance(obj, UnknownLights) else default_tests(rig.num_cameras)  # all of them ask for a body
         self.tests = tuple(usual if tests is None else tests)
         clocks = (test for test in self.tests if isinstance(test, ClockOffsets))
@@ -151,27 +151,27 @@ class RigKeeper:
         if not (math.isfinite(time) and 0 <= time <= GREATEST_TIME):
             raise InputError(f"time: found {time!r}, expected seconds since the epoch")
         memory = self._memory
-        source = source if isinstance(source, Detections) else checked_frames(source, self._labelling.rig)
+        source = source if isinstance(source, Detections) else check_frames(source, self._labelling.rig)
         detections = self._labelling.blobs(source, snapshot_name(memory.count))
         frames = None if isinstance(source, Detections) else source
         memory.count, memory.time = memory.count + 1, time
         labelled, found, refused = None, None, None
         shown, lag = replace(detections, fiducial=np.full(len(detections), -1, dtype=np.int64)), self._lag(detections)
         try:
-            labelled, shown, lag = self._labelled(detections, lag, frames)
-            found = learnt_from(memory, labelled.checked)
+            labelled, shown, lag = self._label(detections, lag, frames)
+            found = learn_snapshot(memory, labelled.checked)
             if memory.lights is None:
                 self._labelling.follow(memory.poses[-1][1][0])
         except RefusedError as reason:
             self._labelling.follows, refused = False, str(reason)
         events, memory.pending = memory.pending, []
         if found is not None:
-            events += self._told(found)
+            events += self._report_findings(found)
         state = self._state(shown, lag, None if found is None else found.update, refused)
         out = silent if frames is None else [name for name in memory.prior.camera_names if frames.get(name) is None]
-        return self._concluded(state, frames, frozenset(out), labelled, found, events)
+        return self._conclude(state, frames, frozenset(out), labelled, found, events)
 
-    def _labelled(
+    def _label(
         self, detections: Detections, lag: NDArray[np.float64], frames: Mapping[str, Frame | None] | None
     ) -> tuple[Labelled, Detections, NDArray[np.float64]]:
         """Label a snapshot whose blobs are shifted to where they would have been in time.
@@ -186,12 +186,12 @@ class RigKeeper:
             to be shifted.
 
         Raises:
-            RefusedError: see `labelled_snapshot`.
+            RefusedError: see `label_snapshot`.
         """
         memory, late = self._memory, self._clock.late
         rows = np.flatnonzero(detections.usable & np.isfinite(lag).all(1))
-        usable = shifted(detections.select(rows), lag[rows], late)
-        labelled = labelled_snapshot(memory, self._labelling, usable, detections.snapshot_names[0], frames)
+        usable = shift_blobs(detections.select(rows), lag[rows], late)
+        labelled = label_snapshot(memory, self._labelling, usable, detections.snapshot_names[0], frames)
         found = labelled.checked.blobs
         if len(found) != len(rows):  # those of a proposer
             return labelled, found, np.zeros((len(found), 2))
@@ -200,26 +200,26 @@ class RigKeeper:
         shown = replace(detections, fiducial=fiducial)
         if late.any():  # the object's pose is known now
             lag = self._lag(shown, (memory.time, labelled.checked.rig_from_object))
-            blobs = shifted(shown.select(rows), lag[rows], late)
+            blobs = shift_blobs(shown.select(rows), lag[rows], late)
             labelled = replace(labelled, checked=replace(labelled.checked, blobs=blobs))
         return labelled, shown, lag
 
     def _lag(self, blobs: Detections, *now: tuple[float, RigidTransform]) -> NDArray[np.float64]:
         """By how much blobs are off where they would have been in time: (M, 2) pixels."""
         memory = self._memory
-        return in_time(blobs, self._clock.late, memory.belief, [*memory.poses, *now], memory.time)
+        return clock_shifts(blobs, self._clock.late, memory.belief, [*memory.poses, *now], memory.time)
 
-    def _told(self, found: MonitorUpdate) -> list[Event]:
+    def _report_findings(self, found: MonitorUpdate) -> list[Event]:
         """Say what the monitor found with a snapshot that was learnt."""
         memory, events = self._memory, []
         for change in found.changes:
-            since = memory.since(change.since, change.camera)
+            since = memory.change_time(change.since, change.camera)
             told = memory.relearning.events.get(change.camera)
             if told is not None and told.change == "unknown" and told.since is not None:  # the same, told again
                 since = told.since
-            events.append(memory.relearning.told(change, since, memory.time, memory.count - 1, memory.before))
+            events.append(memory.relearning.report_change(change, since, memory.time, memory.count - 1, memory.before))
         if (of_object := found.object_change) is not None:
-            events.append(object_event(of_object, memory.since(of_object.since), memory.time, memory.count - 1))
+            events.append(object_event(of_object, memory.change_time(of_object.since), memory.time, memory.count - 1))
         return events
 
     def _state(
@@ -241,7 +241,7 @@ class RigKeeper:
             snapshot=memory.count - 1,
             belief=memory.belief,
             factory=memory.factory,
-            cameras=health_of(memory),
+            cameras=camera_health(memory),
             sentence="",
             refused=refused,
             detections=shown,
@@ -256,7 +256,7 @@ class RigKeeper:
             shake=memory.monitor.shaking.shake.numpy(),
         )
 
-    def _concluded(
+    def _conclude(
         self,
         state: RigState,
         frames: Mapping[str, Frame | None] | None,
@@ -269,25 +269,27 @@ class RigKeeper:
         memory, time, number = self._memory, state.time, state.snapshot
         names = memory.prior.camera_names
         for slip in () if found is None else found.slips:
-            events += self._clock.slipped(state, slip, memory.since(slip.since, slip.camera))
+            events += self._clock.adopt_slip(state, slip, memory.change_time(slip.since, slip.camera))
             state = replace(state, lag=self._lag(state.detections))
         for camera in () if found is None else found.unsynchronized:
-            events.append(apart_event(names[camera], memory.off.get(camera, time), time, number))
+            events.append(unsynchronized_event(names[camera], memory.off.get(camera, time), time, number))
         silent = (camera for camera, name in enumerate(names) if name in out)
         # A camera with moments of its own has not moved far.
         astray = frozenset() if labelled is None else labelled.astray - memory.monitor.quarantine.cameras
-        look = Look(time, number, state.detections, state.predicted, astray, frozenset(silent))
-        events += memory.sightings.take(state.rig, look)
-        events += memory.relearning.learnt(memory.belief, frozenset(memory.monitor.open), memory.settled, time, number)
+        look = VisibleObject(time, number, state.detections, state.predicted, astray, frozenset(silent))
+        events += memory.sightings.observe(state.rig, look)
+        events += memory.relearning.report_relearnt(
+            memory.belief, frozenset(memory.monitor.open), memory.settled, time, number
+        )
         if found is not None:
             unsettled = frozenset(memory.relearning.events) | frozenset(memory.sightings.lost) | frozenset(memory.off)
-            events += memory.drift_watch.take(memory.belief, unsettled, time, number)
+            events += memory.drift_watch.observe(memory.belief, unsettled, time, number)
         for test in self.tests:
             for event in test(state, frames, None if found is None else found.update):
                 events.append(event)
                 take_health(memory, event)
-        health = health_of(memory)
-        sentence = sentence_of(health, memory.monitor.filter.count)
+        health = camera_health(memory)
+        sentence = describe_health(health, memory.monitor.filter.count)
         if memory.lights is not None and memory.monitor.filter.count:
             sentence += f"; their scale is known to +- {100 * memory.belief.scale_std():.2g} %, by no light"
         lights = None if labelled is None else labelled.checked.lights
@@ -319,7 +321,7 @@ class RigKeeper:
             progress: what else is to be found in the file, in the same step: how far a source has been worked on.
         """
         memory = self._memory
-        health = health_of(memory)
+        health = camera_health(memory)
         writer = StateWriter()
         state = {
             "memory": writer.write(KeeperMemory, memory),
@@ -329,7 +331,7 @@ class RigKeeper:
         return KeeperFile(
             time=memory.time,
             snapshot=memory.count - 1,
-            sentence=sentence_of(health, memory.monitor.filter.count),
+            sentence=describe_health(health, memory.monitor.filter.count),
             cameras={name: str(state) for name, state in health.items()},
             rig=memory.belief.rig,
             factory=memory.factory,

@@ -10,7 +10,7 @@ from typing import Any
 
 from imgcal.errors import InputError
 from imgcal.io import object_text, rig_text, write_text
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 from imgcal.online.events import iso_time, snapshot_name
 from imgcal.online.state_document import StateReader, StateWriter
 from imgcal.types import CalibrationObject, CameraRig
@@ -83,15 +83,15 @@ def read_state(path: str | Path) -> tuple[dict[str, Any], StateReader]:
     try:
         values = json.loads(content.decode())
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not valid JSON: {shortened(str(error))}") from error
+        raise InputError(f"{path}: not valid JSON: {shorten(str(error))}") from error
     found = values.get("format") if isinstance(values, dict) else None
     if found != FORMAT and isinstance(found, str) and found.startswith(FORMAT[: FORMAT.index("/") + 1]):
         raise InputError(
             f"{path}: State files from {'earlier' if found < FORMAT else 'later'} versions cannot be resumed: found "
-            f'{shortened(found)}, expected {FORMAT}; the last rig stands in the file as "rig"'
+            f'{shorten(found)}, expected {FORMAT}; the last rig stands in the file as "rig"'
         )
     if found != FORMAT:
-        raise InputError(f'{path}: found format {shortened(repr(found))}, expected "{FORMAT}"')
+        raise InputError(f'{path}: found format {shorten(repr(found))}, expected "{FORMAT}"')
     state = values.get("state")
     if not isinstance(state, dict):
         raise InputError(f"{path}: found no state, expected that of a rig that is kept calibrated")
@@ -105,4 +105,4 @@ def read_state(path: str | Path) -> tuple[dict[str, Any], StateReader]:
 
 def unusable(path: str | Path, error: Exception) -> InputError:
     """Say that a file was changed since it was written."""
-    return InputError(f"{path}: the state was changed since it was written, or is damaged ({shortened(str(error))})")
+    return InputError(f"{path}: the state was changed since it was written, or is damaged ({shorten(str(error))})")

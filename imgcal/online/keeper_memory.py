@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 
 from imgcal.association import PipelineOptions, to_observations
 from imgcal.geometry import RigidTransform
-from imgcal.monitoring import RigBelief, RigFilter, RigMonitor, belief_of, calibration_of
+from imgcal.monitoring import RigBelief, RigFilter, RigMonitor, belief_from_posterior, calibration_posterior
+from imgcal.online.camera_search import Search, Surroundings
+from imgcal.online.camera_visibility import CameraVisibility
+from imgcal.online.clock_correction import POSES
 from imgcal.online.drift_watch import DriftWatch
 from imgcal.online.events import Event
-from imgcal.online.late_cameras import POSES
 from imgcal.online.light_tracks import LightTracks
 from imgcal.online.noise_level import NoiseLevel
-from imgcal.online.object_doubts import ObjectDoubts
+from imgcal.online.object_checks import ObjectChecks
 from imgcal.online.relearning import Relearning
 from imgcal.online.rig_state import CameraHealth
-from imgcal.online.search import Search, Surroundings
-from imgcal.online.sightings import Sightings
 from imgcal.online.state_document import NOT_SAVED, StateReader
 from imgcal.types import (
     CalibrationObject,
@@ -57,10 +57,10 @@ class KeeperMemory:
     prior: CameraRig  # what the filter began with
     monitor: RigMonitor
     noise: NoiseLevel
-    sightings: Sightings
+    sightings: CameraVisibility
     relearning: Relearning
     drift_watch: DriftWatch
-    doubts: ObjectDoubts
+    doubts: ObjectChecks
     search: Search
     looks: NDArray[np.int64]  # (C,) snapshots learnt from each camera where it stands
     before: RigBelief  # from before what is being decided
@@ -78,7 +78,7 @@ class KeeperMemory:
     time: float = 0.0
 
     @classmethod
-    def of(
+    def from_factory(
         cls,
         rig: CameraRig,
         obj: CalibrationObject,
@@ -96,14 +96,14 @@ class KeeperMemory:
         check_rig(rig)
         check_object(obj)
         rig = rig.to(torch.float64)
-        calibration, rig = None if horizon is not None else calibration_of(rig), replace(rig, posterior=None)
-        start = None if calibration is None else (belief_of(calibration, obj), calibration.snapshots)
+        calibration, rig = None if horizon is not None else calibration_posterior(rig), replace(rig, posterior=None)
+        start = None if calibration is None else (belief_from_posterior(calibration, obj), calibration.snapshots)
         monitor = RigMonitor(RigFilter(rig, obj, drift, options.estimation, start=start, horizon=horizon))
         memory = cls(
             options=options, factory=rig, obj=obj, drift=drift, horizon=horizon, prior=rig, monitor=monitor,
-            noise=NoiseLevel(rig, obj, options), sightings=Sightings(rig.camera_names),
+            noise=NoiseLevel(rig, obj, options), sightings=CameraVisibility(rig.camera_names),
             relearning=Relearning(rig.camera_names), drift_watch=DriftWatch(rig.camera_names),
-            doubts=ObjectDoubts(obj.num_fiducials), search=Search(rig.num_cameras),
+            doubts=ObjectChecks(obj.num_fiducials), search=Search(rig.num_cameras),
             looks=np.zeros(rig.num_cameras, dtype=np.int64), before=monitor.filter.belief,
             lights=LightTracks.of(obj.num_fiducials, rig.num_cameras) if isinstance(obj, UnknownLights) else None,
         )  # fmt: skip
@@ -113,9 +113,9 @@ class KeeperMemory:
             memory.noise.trust()
         return memory
 
-    def begin_anew(self) -> None:
+    def reset(self) -> None:
         """Forget everything but the factory calibration."""
-        fresh = KeeperMemory.of(self.prior, self.obj, self.drift, self.options, self.horizon)
+        fresh = KeeperMemory.from_factory(self.prior, self.obj, self.drift, self.options, self.horizon)
         for name in ("monitor", "doubts", "search", "relearning", "drift_watch", "looks", "off", "in_vain"):
             setattr(self, name, getattr(fresh, name))
         self.noise.restart()
@@ -129,7 +129,7 @@ class KeeperMemory:
         """What is known of the rig now."""
         return self.monitor.filter.belief
 
-    def passed(self, time: float) -> float:
+    def elapsed(self, time: float) -> float:
         """Seconds since the last snapshot that was learnt, as far as they count.
 
         In longer ones no more is forgotten: one kind of value may have wandered as far as the factory calibration may
@@ -182,10 +182,10 @@ class KeeperMemory:
         additive = torch.from_numpy(self.noise.additive)[:, None]
         return replace(seen, sigma=torch.hypot(seen.sigma, additive))
 
-    def since(self, number: int, camera: int | None = None) -> float:
+    def change_time(self, number: int, camera: int | None = None) -> float:
         """When it happened what the filter found since a snapshot of this number, to a camera or the object: s."""
         since = next((time for learnt, time in self.times if learnt >= number), self.time)
-        return since if camera is None else self.search.since(camera, min(since, self.off.get(camera, since)))
+        return since if camera is None else self.search.lost_since(camera, min(since, self.off.get(camera, since)))
 
     @classmethod
     def restored(cls, reader: StateReader, plain: dict[str, Any], options: PipelineOptions) -> KeeperMemory:
@@ -205,7 +205,7 @@ class KeeperMemory:
         horizon = reader.read(int | None, plain["horizon"], "horizon")
         if horizon is not None and horizon < 1:
             raise ValueError(f"horizon: found {horizon}")
-        memory = cls.of(rig, obj, drift, options, horizon)
+        memory = cls.from_factory(rig, obj, drift, options, horizon)
         reader.read_object(cls, plain, "memory", memory)
         beliefs = (memory.belief, memory.before)
         alike = all(belief.rig.camera_names == rig.camera_names for belief in beliefs)

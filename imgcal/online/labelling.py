@@ -16,7 +16,7 @@ from imgcal.association import PipelineOptions, Proposer, Sight, SnapshotIdentit
 from imgcal.detection import DetectionOptions, Frame, detect_snapshot, to_detections
 from imgcal.errors import InputError, RefusedError
 from imgcal.geometry import RigidTransform
-from imgcal.pipeline import DetectorName, checked_detections, checked_frames, proposer_of
+from imgcal.pipeline import DetectorName, check_detections, check_frames, choose_proposer
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 
 MOST_FOLLOWED = 64
@@ -38,7 +38,7 @@ class Labelling:
         >>> truth = simulate_truth(factory, obj, 1, torch.Generator().manual_seed(1), PhysicalDrift())
         >>> labelling = Labelling(factory, obj, PipelineOptions(), DetectionOptions(), "classical")
         >>> blobs = labelling.blobs(true_detections(truth), "first")
-        >>> labelled, snapshot = labelling.decided(blobs, "first", blobs.fiducial, None, None)
+        >>> labelled, snapshot = labelling.decide(blobs, "first", blobs.fiducial, None, None)
         >>> snapshot.status
         'coded'
         >>> labelling.close()
@@ -70,7 +70,7 @@ class Labelling:
         self._proposer: Proposer | None = None
         self._where_blobs_fail = True
         if detector != "classical":
-            self._proposer, self._where_blobs_fail = proposer_of(detector)
+            self._proposer, self._where_blobs_fail = choose_proposer(detector)
         self._pool = ThreadPoolExecutor(min(rig.num_cameras, os.cpu_count() or 1))
 
     def close(self) -> None:
@@ -92,8 +92,8 @@ class Labelling:
                 raise InputError(f"detections: found {len(source.snapshot_names)} snapshots, expected one")
             if len(np.unique(source.snapshot)) <= 1:  # its number in a longer table does not matter
                 source = replace(source, snapshot=np.zeros_like(source.snapshot))
-            return replace(checked_detections(source, self.rig, self.obj), snapshot_names=(name,))
-        given = checked_frames(source, self.rig)
+            return replace(check_detections(source, self.rig, self.obj), snapshot_names=(name,))
+        given = check_frames(source, self.rig)
         frames: dict[str, Frame | None] = {}
         for camera in self.rig.camera_names:
             frame = given.get(camera)
@@ -103,7 +103,7 @@ class Labelling:
         blobs = detect_snapshot(frames, self.detection, pool=self._pool, board=self.obj.board)
         return to_detections([blobs], self.rig.camera_names, (name,))
 
-    def decided(
+    def decide(
         self,
         usable: Detections,
         name: str,
@@ -127,10 +127,10 @@ class Labelling:
         prior, tracker = (self.rig.prior or RigPrior()).std(self.rig), self._tracker
         tracker.rig, tracker.prior_std = known or (self.rig, prior)
         if self._proposer is not None and frames is not None and not self._where_blobs_fail:
-            return self._looked(self._proposer, usable, name, frames)
+            return self._label_from_frames(self._proposer, usable, name, frames)
         snapshot, labels = tracker.decide(usable, name) if coded is None else tracker.accept(name, coded)
         if snapshot.status == "refused" and self._proposer is not None and frames is not None:
-            return self._looked(self._proposer, usable, name, frames)
+            return self._label_from_frames(self._proposer, usable, name, frames)
         again = known is not None and self._refused & (self._refused - 1) == 0
         if snapshot.status == "refused" and coded is None and again:
             # What was known may hold no more. Another try is dear: after 1, 2, 4, 8, ... refusals in a row.
@@ -142,7 +142,7 @@ class Labelling:
         self._refused = 0
         return replace(usable, fiducial=labels), snapshot
 
-    def _looked(
+    def _label_from_frames(
         self, proposer: Proposer, blobs: Detections, name: str, frames: Mapping[str, Frame | None]
     ) -> tuple[Detections, SnapshotIdentity]:
         """Label a snapshot by what a proposer sees in its frames."""

@@ -12,14 +12,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from imgcal.association import Lights, associate_lights, undistorted
+from imgcal.association import Lights, associate_lights, undistort
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
+from imgcal.online.camera_visibility import well_inside
 from imgcal.online.keeper_memory import KeeperMemory
-from imgcal.online.label_checks import MOST_APART, Checked
+from imgcal.online.label_consistency import MOST_APART, Checked
 from imgcal.online.light_points import FoundLights
 from imgcal.online.light_tracks import LightTracks
-from imgcal.online.sightings import well_inside
 from imgcal.types import CameraRig, Detections
 
 Array = NDArray[np.float64]
@@ -119,7 +119,7 @@ class _Scene:
         self.camera, self.count = blobs.camera, len(lights)
         self.straight = np.full((len(blobs), 2), np.nan)  # (M, 2) px without distortion; nan = no light
         usable = rows[blobs.usable[rows]]
-        self.straight[usable] = undistorted(blobs.uv[usable], blobs.camera[usable], rig)
+        self.straight[usable] = undistort(blobs.uv[usable], blobs.camera[usable], rig)
         self.straight[~np.isfinite(self.straight).all(1)] = np.nan
         self.label = np.full(len(blobs), -1, dtype=np.int64)  # (M,) number among the lights
         light, camera = np.nonzero(lights.row >= 0)

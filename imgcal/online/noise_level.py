@@ -55,7 +55,7 @@ class NoiseLevel:
         self._ratios: deque[NDArray[np.float64]] = deque(maxlen=EVERY)  # (C, N)
         self.first: list[tuple[Detections, RigidTransform]] = []  # snapshots that showed another noise, and poses
 
-    def take(
+    def observe(
         self, blobs: Detections, observations: Observations, result: MeasurementUpdate, steady: bool, count: int
     ) -> bool:
         """Take a snapshot that has been learnt.
@@ -76,7 +76,7 @@ class NoiseLevel:
             if self._asking:
                 identity = SnapshotIdentity(f"{count}", "by_tracking", NEAR, 1, result.rig_from_object[0])
                 self._early.append((blobs, identity))
-                again = count in ASKED and self._asked()
+                again = count in ASKED and self._estimate()
                 if count == ASKED[-1]:
                     self._asking = False
             if not self._asking:
@@ -85,7 +85,7 @@ class NoiseLevel:
             self._follow(observations, result, count)
         return again
 
-    def _asked(self) -> bool:
+    def _estimate(self) -> bool:
         """Ask the first snapshots together how large the noise is."""
         try:
             fit = fit_labelled(stack_labelled(self._early), self._rig, self._obj, self._options)

@@ -36,7 +36,7 @@ class Relearning:
     events: dict[int, Event] = field(default_factory=dict)  # camera -> what was told of it last
     before: dict[int, Tensor] = field(default_factory=dict)  # camera -> (K,) std before it moved
 
-    def told(self, change: Change, since: float, time: float, number: int, before: RigBelief) -> Event:
+    def report_change(self, change: Change, since: float, time: float, number: int, before: RigBelief) -> Event:
         """Tell of a change.
 
         Args:
@@ -61,7 +61,7 @@ class Relearning:
             self.before[change.camera] = relative_std(before)[change.camera]
         return event
 
-    def learnt(
+    def report_relearnt(
         self, belief: RigBelief, still_open: frozenset[int], settled: frozenset[int], time: float, number: int
     ) -> list[Event]:
         """Say which cameras are known again as well as before.
@@ -83,7 +83,7 @@ class Relearning:
             if camera in settled or bool(known.all()):
                 event = self.events.pop(camera)
                 del self.before[camera]
-                sigma = sigma_of(std[camera], event.change)
+                sigma = change_sigma(std[camera], event.change)
                 how_well = "" if sigma is None else f" to +- {sigma:.2g} {event.unit}"
                 told.append(
                     replace(
@@ -106,7 +106,7 @@ def relative_std(belief: RigBelief) -> Tensor:
     return spread.clamp_min(0).sqrt().view(belief.unit.shape)
 
 
-def sigma_of(std: Tensor, change: ChangeKind | None) -> float | None:
+def change_sigma(std: Tensor, change: ChangeKind | None) -> float | None:
     """Standard deviation of the worst direction of a kind of change, of a camera's (K,), in the unit of its event."""
     if change is None or change not in CHANGES:
         return None

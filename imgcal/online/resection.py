@@ -40,7 +40,7 @@ class Resected:
     camera: CameraRig  # alone, where it is now
 
 
-def resected(
+def resect_camera(
     blobs: Sequence[NDArray[np.float64]], points_rig: Tensor, camera: CameraRig, generator: np.random.Generator
 ) -> Resected | None:
     """Label the blobs of the last snapshot by the one place of the camera that explains all snapshots.
@@ -65,7 +65,7 @@ def resected(
     count = sum((found >= 0).sum(1) for found in labels)
     best = int(np.argmax(count))
     first = [found[best] for found in labels]
-    fitted = _fitted(camera, points_rig, blobs, first)
+    fitted = _fit(camera, points_rig, blobs, first)
     if fitted is None:
         return None
     inside = fitted.expand(len(points)).project(points_rig).visible[:, 0].sum(-1).numpy()
@@ -164,7 +164,7 @@ def _matches(
     return np.where(close & (back == np.arange(len(xy))), nearest, -1)
 
 
-def _fitted(
+def _fit(
     camera: CameraRig, points_rig: Tensor, blobs: Sequence[NDArray[np.float64]], labels: list[NDArray[np.int64]]
 ) -> CameraRig | None:
     """Move the camera to where its labels fit best; None with too few."""

@@ -87,7 +87,7 @@ class RigState:
     @cached_property
     def gauge(self) -> Gauge:
         """Which cameras are taken to have stood still since the factory calibration: what most agree on."""
-        return Gauge.of_most(self.rig, self.factory)
+        return Gauge.from_majority(self.rig, self.factory)
 
     @cached_property
     def moved(self) -> Tensor:

@@ -12,13 +12,13 @@ from imgcal.detection import Frame
 from imgcal.errors import RefusedError
 from imgcal.estimation import initial_pose
 from imgcal.geometry import RigidTransform
-from imgcal.online.following import near_prediction
 from imgcal.online.keeper_memory import KeeperMemory
-from imgcal.online.label_checks import Checked, check_labels
+from imgcal.online.label_consistency import Checked, check_labels
 from imgcal.online.labelling import LEAST_FOLLOWED, Labelling
-from imgcal.online.learning import ask_clocks, ask_object
 from imgcal.online.light_labels import label_lights
-from imgcal.online.object_doubts import object_event
+from imgcal.online.object_checks import object_event
+from imgcal.online.prediction_labels import near_prediction
+from imgcal.online.snapshot_update import test_clocks, test_object
 from imgcal.types import Detections
 
 PATIENCE = 64
@@ -33,7 +33,7 @@ class Labelled:
     astray: frozenset[int]  # cameras that see what may be the object, and cannot tell what
 
 
-def labelled_snapshot(
+def label_snapshot(
     memory: KeeperMemory,
     labelling: Labelling,
     usable: Detections,
@@ -55,53 +55,53 @@ def labelled_snapshot(
     if memory.lights is not None:
         return Labelled(*label_lights(memory, memory.lights, usable))
     coded = usable.fiducial.copy() if (usable.fiducial >= 0).any() else None
-    followed = None if coded is not None else _followed(memory, labelling, usable)
+    followed = None if coded is not None else _follow(memory, labelling, usable)
     if followed is not None:
         return followed
     there = memory.surroundings
     known = None if there is None else (there.rig, there.std)
-    blobs, snapshot = labelling.decided(usable, name, coded, None if coded is not None else frames, known)
+    blobs, snapshot = labelling.decide(usable, name, coded, None if coded is not None else frames, known)
     pose = snapshot.rig_from_object
     if pose is None:
         obj = memory.obj_now
         pose = initial_pose(to_observations(blobs, memory.prior, obj), memory.belief.rig, obj)[0]
-    checked = _checked(memory, blobs, pose.reshape(1))
-    if checked.usual > memory.most_usual and memory.doubts.due and ask_clocks(memory):
-        checked = _checked(memory, blobs, pose.reshape(1))
-    changed = checked.usual > memory.most_usual and memory.doubts.due and ask_object(memory, learnt=False)
+    checked = _check(memory, blobs, pose.reshape(1))
+    if checked.usual > memory.most_usual and memory.doubts.due and test_clocks(memory):
+        checked = _check(memory, blobs, pose.reshape(1))
+    changed = checked.usual > memory.most_usual and memory.doubts.due and test_object(memory, learnt=False)
     if changed and (change := changed.object_change) is not None:
-        memory.pending.append(object_event(change, memory.since(change.since), memory.time, memory.count - 1))
-        checked = _checked(memory, blobs, pose.reshape(1))
+        memory.pending.append(object_event(change, memory.change_time(change.since), memory.time, memory.count - 1))
+        checked = _check(memory, blobs, pose.reshape(1))
     if checked.usual > memory.most_usual:
-        memory.doubts.take_refused(checked, memory.time if memory.learnt is None else memory.learnt, memory.time)
+        memory.doubts.observe_refused(checked, memory.time if memory.learnt is None else memory.learnt, memory.time)
         memory.in_vain += 1
         if memory.in_vain >= PATIENCE:
-            memory.begin_anew()
+            memory.reset()
         raise RefusedError(
             f"estimation: labels are {checked.usual:.1f} px off in most cameras: labels are wrong, or the whole "
             "rig is another"
         )
-    return _searched(memory, checked)
+    return _search(memory, checked)
 
 
-def _followed(memory: KeeperMemory, labelling: Labelling, usable: Detections) -> Labelled | None:
+def _follow(memory: KeeperMemory, labelling: Labelling, usable: Detections) -> Labelled | None:
     """Label a snapshot by the last one's pose; None = it cannot be followed."""
     if not labelling.follows or labelling.slips or not memory.poses:
         return None
-    pose = _extrapolated(memory)
+    pose = _extrapolate(memory)
     named = replace(usable, fiducial=near_prediction(usable, memory.predicted(pose)))
     if (named.fiducial >= 0).sum() < LEAST_FOLLOWED * memory.labels:
         return None
     sought = frozenset(memory.search.sought)
     try:
-        found = _searched(memory, _checked(memory, named, pose))
+        found = _search(memory, _check(memory, named, pose))
     except RefusedError:
         return None
     few = found.checked.labels < LEAST_FOLLOWED * memory.labels
     return None if few or found.astray - sought or found.checked.usual > memory.most_usual else found
 
 
-def _extrapolated(memory: KeeperMemory) -> RigidTransform:
+def _extrapolate(memory: KeeperMemory) -> RigidTransform:
     """Where the object should be now: (1,)."""
     last_time, last = memory.poses[-1]
     first_time, first = memory.poses[-min(2, len(memory.poses))]
@@ -111,7 +111,7 @@ def _extrapolated(memory: KeeperMemory) -> RigidTransform:
     return RigidTransform(last.rotation, last.translation + share * (last.translation - first.translation))
 
 
-def _checked(memory: KeeperMemory, named: Detections, pose: RigidTransform) -> Checked:
+def _check(memory: KeeperMemory, named: Detections, pose: RigidTransform) -> Checked:
     """See which labels fit; cameras with moments of their own have no say in where the object is."""
     given = memory.belief.rig, memory.obj_now, pose, memory.options
     every = check_labels(named, *given)
@@ -125,10 +125,10 @@ def _checked(memory: KeeperMemory, named: Detections, pose: RigidTransform) -> C
     return replace(others, blobs=blobs, given=every.given, off=off, labels=labels)
 
 
-def _searched(memory: KeeperMemory, checked: Checked) -> Labelled:
+def _search(memory: KeeperMemory, checked: Checked) -> Labelled:
     """Look for the object in cameras that do not see it where it should be."""
     there = memory.surroundings
     if there is None:
         return Labelled(checked, frozenset())
-    doubted = memory.sightings.doubted | memory.sightings.lost.keys()
-    return Labelled(*memory.search.take(checked, there, memory.time, memory.count - 1, doubted))
+    doubted = memory.sightings.doubtful_cameras | memory.sightings.lost.keys()
+    return Labelled(*memory.search.label_lost_cameras(checked, there, memory.time, memory.count - 1, doubted))

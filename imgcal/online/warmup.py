@@ -49,11 +49,11 @@ def warm_up(all_lenses: bool = False) -> None:
         all_lenses: compile also what rigs need that have a camera of another lens than the usual one, whichever.
     """
     usual = load_rig(RIG).resized(torch.tensor(SIZE))
-    for rig in (usual, with_another_lens(usual)) if all_lenses else (usual,):
+    for rig in (usual, replace_lenses(usual)) if all_lenses else (usual,):
         _warm_up(rig)
 
 
-def with_another_lens(rig: CameraRig) -> CameraRig:
+def replace_lenses(rig: CameraRig) -> CameraRig:
     """The same cameras with the widest of the other lenses: what is compiled for one of these is compiled for all."""
     wide = lens_width(RATIONAL) - rig.distortion.shape[-1]
     return replace(rig, distortion=torch.nn.functional.pad(rig.distortion, (0, wide)), lens_model=RATIONAL)
@@ -63,17 +63,17 @@ def _warm_up(rig: CameraRig) -> None:
     obj, generator = load_object(OBJECT), _seeded()
     truth = simulate_truth(rig, obj, SNAPSHOTS, generator, DRIFT, POSES)
     for depth in (8, 16):
-        _from_frames(truth, rig, obj, SensorModel(bit_depth=depth), generator)
+        _compile_detection(truth, rig, obj, SensorModel(bit_depth=depth), generator)
     exact = true_detections(truth)
     with _whatever_comes():
         calibrate(exact, rig, obj)
         score(exact, rig, obj)
     with _whatever_comes():
         calibrate(true_detections(simulate_truth(rig, obj, MANY, generator, DRIFT, POSES)), rig, obj)
-    _of_a_plane(rig, generator)
-    _of_bloomed_lamps()
+    _compile_planar(rig, generator)
+    _compile_bloom()
     _of_unknown_markers(rig, generator)
-    _of_many_snapshots(truth, rig, obj)
+    _compile_folding(truth, rig, obj)
     seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
     for uv in (truth.uv, truth.uv.float()):  # of `imgcal render`, and of the networks
         render_views(uv, seen, rig.image_size, obj, ImageOptions(32, 1.5))
@@ -95,7 +95,7 @@ def _seeded() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
-def _from_frames(
+def _compile_detection(
     truth: Truth, rig: CameraRig, obj: CalibrationObject, sensor: SensorModel, generator: torch.Generator
 ) -> None:
     """Blobs are found, told apart and followed."""
@@ -110,7 +110,7 @@ def _from_frames(
                 keeper.update(shot, float(number))
 
 
-def _of_a_plane(rig: CameraRig, generator: torch.Generator) -> None:
+def _compile_planar(rig: CameraRig, generator: torch.Generator) -> None:
     """An object that is flat is told apart in another way."""
     points = torch.tensor([(x, y, 0.0) for x in (0, 40, 90) for y in (0, 30, 75)], dtype=torch.float64)
     plane = CalibrationObject(points, palette(len(points)).double())
@@ -120,7 +120,7 @@ def _of_a_plane(rig: CameraRig, generator: torch.Generator) -> None:
         calibrate(unlabelled, rig, plane)
 
 
-def _of_many_snapshots(truth: Truth, rig: CameraRig, obj: CalibrationObject) -> None:
+def _compile_folding(truth: Truth, rig: CameraRig, obj: CalibrationObject) -> None:
     """What is older than a second becomes part of what was known before."""
     seen = torch.ones(1, *truth.uv.shape[1:-1], dtype=torch.bool)
     there = Observations(truth.uv[:1], torch.full(seen.shape, 0.1, dtype=torch.float64), seen)
@@ -148,7 +148,7 @@ def _of_unknown_markers(rig: CameraRig, generator: torch.Generator) -> None:
                 keeper.update(seen.of_snapshots(number, number + 1), number / 60)
 
 
-def _of_bloomed_lamps() -> None:
+def _compile_bloom() -> None:
     """Blobs that are clipped and joined by their light are parted."""
     v, u = np.mgrid[:64, :96]
     light = sum(400 * np.exp(-((u - at) ** 2 + (v - 32) ** 2) / 72) for at in (38, 58))

@@ -1,19 +1,19 @@
 from .calibration import Calibration
-from .captured import detect_capture, masks_of, sight_of_capture
-from .doubtful import DoubtfulCamera
+from .camera_motion import MOVED, Motion, motion_since_factory
+from .capture_detection import capture_sight, detect_capture, read_masks
+from .clock_offset import LateCamera
+from .coverage import FIELDS, UNDETERMINED, Coverage, measure_coverage
+from .doubtful_cameras import DoubtfulCamera
 from .fitting import fit_labelled
 from .from_scratch import calibrate_from_scratch
 from .initialization import load_initializer
-from .knowledge import FIELDS, UNDETERMINED, Knowledge, knowledge_of
-from .lateness import LateCamera
-from .learned import LearnedProposer, load_proposer
-from .measuring import LearnedMeasurer
-from .motion import MOVED, Motion, motion_since_factory
+from .label_counts import DOUBTFUL, LabelCounts
+from .learned_measurer import LearnedMeasurer
+from .learned_proposer import LearnedProposer, load_proposer
+from .motion_check import EARLIER
 from .recalibration import calibrate
 from .scoring import RigScore, rms_length, score
-from .sources import DETECTORS, Detector, DetectorName, checked_detections, checked_frames, proposer_of
-from .steadiness import EARLIER
-from .tally import DOUBTFUL, Tally
+from .sources import DETECTORS, Detector, DetectorName, check_detections, check_frames, choose_proposer
 from .units import unit_doubt
 
 __all__ = [
@@ -24,30 +24,30 @@ __all__ = [
     "MOVED",
     "UNDETERMINED",
     "Calibration",
+    "Coverage",
     "Detector",
     "DetectorName",
     "DoubtfulCamera",
-    "Knowledge",
+    "LabelCounts",
     "LateCamera",
     "LearnedMeasurer",
     "LearnedProposer",
     "Motion",
     "RigScore",
-    "Tally",
     "calibrate",
     "calibrate_from_scratch",
-    "checked_detections",
-    "checked_frames",
+    "capture_sight",
+    "check_detections",
+    "check_frames",
+    "choose_proposer",
     "detect_capture",
     "fit_labelled",
-    "knowledge_of",
     "load_initializer",
     "load_proposer",
-    "masks_of",
+    "measure_coverage",
     "motion_since_factory",
-    "proposer_of",
+    "read_masks",
     "rms_length",
     "score",
-    "sight_of_capture",
     "unit_doubt",
 ]

@@ -9,7 +9,7 @@ import torch
 
 from imgcal.association import to_observations
 from imgcal.errors import RefusedError
-from imgcal.estimation import poses_alone
+from imgcal.estimation import single_camera_poses
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
 
@@ -26,7 +26,7 @@ def settle_turns(detections: Detections, rig: CameraRig, obj: CalibrationObject)
     """
     if obj.board is None or len(obj.board.turns) == 1 or rig.num_cameras == 1:
         return detections
-    cam_from_object, known = poses_alone(to_observations(detections, rig, obj), rig, obj)
+    cam_from_object, known = single_camera_poses(to_observations(detections, rig, obj), rig, obj)
     rotation = rig.cam_from_rig.rotation.double().mT @ cam_from_object.rotation.double()  # of the board in the rig
     fiducial = detections.fiducial.copy()
     angles = [angle for angle, _ in obj.board.turns]

@@ -20,16 +20,16 @@ from imgcal.estimation import (
     predicted_error,
 )
 from imgcal.geometry import RigidTransform
-from imgcal.monitoring import posterior_of
-from imgcal.pipeline.doubtful import DoubtfulCamera, doubtful_at_end
+from imgcal.monitoring import make_posterior
+from imgcal.pipeline.clock_offset import LEAST_BETTER, LateCamera, timing_motion
+from imgcal.pipeline.doubtful_cameras import DoubtfulCamera, doubtful_at_end
 from imgcal.pipeline.initialization import Initialization
-from imgcal.pipeline.lateness import LEAST_BETTER, LateCamera, timing_motion
+from imgcal.pipeline.label_counts import LabelCounts, count_labels
 from imgcal.pipeline.lights import FoundLights
-from imgcal.pipeline.object_checks import CERTAIN, displaced, lost_fiducials
+from imgcal.pipeline.object_checks import CERTAIN, find_displaced, find_lost_fiducials
 from imgcal.pipeline.repeats import Repeats
-from imgcal.pipeline.scale import KnownDistance, Scale, scale_of
+from imgcal.pipeline.scale import KnownDistance, Scale, find_scale
 from imgcal.pipeline.synchronization import Unsynchronized
-from imgcal.pipeline.tally import Tally, tally
 from imgcal.types import (
     BlobFlag,
     CalibrationObject,
@@ -123,7 +123,7 @@ class Calibration:
         Raises:
             RefusedError: the observations do not determine the poses.
         """
-        return posterior_of(self.estimate, self.obj)
+        return make_posterior(self.estimate, self.obj)
 
     @property
     def rig_from_object(self) -> RigidTransform:
@@ -196,14 +196,14 @@ class Calibration:
     @property
     def displaced(self) -> tuple[FiducialOffset, ...]:
         """Fiducials that are surely not in their places; what is known of lost ones rests on a few odd labels."""
-        return tuple(d for d in displaced(self.shape, self.obj) if d.fiducial not in self.lost)
+        return tuple(d for d in find_displaced(self.shape, self.obj) if d.fiducial not in self.lost)
 
     @cached_property
     def lost(self) -> tuple[int, ...]:
         """Fiducials that were hardly found where the others were."""
         points = self.rig_from_object.apply(self.points_object)
         visible = self.rig.expand(len(points)).project(points, self.obj.radius).visible
-        return lost_fiducials(self.observations.seen.numpy(), visible.numpy() & self.labelled.columns(self.obj))
+        return find_lost_fiducials(self.observations.seen.numpy(), visible.numpy() & self.labelled.columns(self.obj))
 
     @property
     def untimed(self) -> tuple[str, ...]:
@@ -221,10 +221,10 @@ class Calibration:
         return tuple(name for name, motion, is_shown in names if is_shown and motion < LEAST_BETTER)
 
     @cached_property
-    def tally(self) -> Tally:
+    def tally(self) -> LabelCounts:
         """What each camera saw in each snapshot, and how much of it is explained."""
         seen = self.observations.seen.numpy()
-        return tally(self.labelled, seen, self.rig_from_object, self.factory, self.object, self.estimate.rig)
+        return count_labels(self.labelled, seen, self.rig_from_object, self.factory, self.object, self.estimate.rig)
 
     @cached_property
     def doubtful(self) -> tuple[DoubtfulCamera, ...]:
@@ -260,7 +260,7 @@ class Calibration:
         """What the size of the rig rests on, and what an error of the object's file would add to the predicted one."""
         if self.distance is not None:
             return self.distance.scale
-        return scale_of(self.estimate, self.obj, self.scale_sigma, self.predicted_error.volume)
+        return find_scale(self.estimate, self.obj, self.scale_sigma, self.predicted_error.volume)
 
     @property
     def detectors(self) -> Mapping[str, int]:

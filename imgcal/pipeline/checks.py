@@ -12,7 +12,7 @@ from torch import Tensor
 from imgcal.association import PipelineOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate
-from imgcal.pipeline.tally import Tally
+from imgcal.pipeline.label_counts import LabelCounts
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
 LEAST_EXPLAINED = 0.5
@@ -34,7 +34,7 @@ def require_cameras(seen: NDArray[np.bool_], rig: CameraRig, options: PipelineOp
         )
 
 
-def require_views(counts: Tally, rig: CameraRig, least_share: float = LEAST_EXPLAINED) -> None:
+def require_views(counts: LabelCounts, rig: CameraRig, least_share: float = LEAST_EXPLAINED) -> None:
     """Refuse where a camera sees what may be the object, and hardly any of it where the rest of the rig expects it.
 
     Labels that were never given count as much against a camera as those that were given and did not fit.
@@ -110,8 +110,8 @@ def require_near_prior(
         name = rig.parameter_names_of(camera)[parameter]
         found = (
             f"camera {rig.camera_names[camera]}: {name.replace('_', ' ')} would differ from its factory value by "
-            f"{_with_unit(change[camera, parameter], name)}, with a tolerance (prior) of "
-            f"{_with_unit(std[camera, parameter], name)} and {options.largest_drift:g} times as much accepted"
+            f"{_format_value(change[camera, parameter], name)}, with a tolerance (prior) of "
+            f"{_format_value(std[camera, parameter], name)} and {options.largest_drift:g} times as much accepted"
         )
     elif kind and prior_scale[kind] > options.widest_prior:
         found = (
@@ -153,7 +153,7 @@ def require_most_labels(labels: NDArray[np.bool_], kept: NDArray[np.bool_], rig:
         )
 
 
-def _with_unit(value: float, name: str) -> str:
+def _format_value(value: float, name: str) -> str:
     """Write a value of a parameter as people read it."""
     if name.startswith("rotation"):
         return f"{math.degrees(value):.3g} deg"

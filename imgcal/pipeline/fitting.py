@@ -23,7 +23,6 @@ from imgcal.estimation import (
     make_loss,
     make_problem,
 )
-from imgcal.pipeline.arrangement import Arranged, arrange
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.checks import (
     require_cameras,
@@ -33,11 +32,12 @@ from imgcal.pipeline.checks import (
     require_same_residuals,
     require_views,
 )
-from imgcal.pipeline.initialization import Initialization, Initializer, residual_of
+from imgcal.pipeline.initialization import Initialization, Initializer, prediction_residual
+from imgcal.pipeline.label_counts import count_labels
+from imgcal.pipeline.labelled_capture import LabelledCapture, arrange_labels
+from imgcal.pipeline.motion_check import steady_part
 from imgcal.pipeline.object_checks import object_offsets
 from imgcal.pipeline.object_size import require_one_size
-from imgcal.pipeline.steadiness import steady_part
-from imgcal.pipeline.tally import tally
 from imgcal.types import (
     CalibrationObject,
     CameraRig,
@@ -74,11 +74,11 @@ def fit_steady(
     Raises:
         RefusedError: the data cannot decide.
     """
-    arranged = arrange(labelled, rig, obj)
+    arranged = arrange_labels(labelled, rig, obj)
     _require_any_view(arranged, rig, obj)
     steady = steady_part(arranged, given, rig, obj, options)
     fits = steady.fits if prior_std is None else ()  # those have the rig's prior
-    fit = _fitted(steady.arranged, rig, obj, options, _Known(initializer, prior_std=prior_std, fits=fits))
+    fit = _fit(steady.arranged, rig, obj, options, _Known(initializer, prior_std=prior_std, fits=fits))
     fit = replace(fit, moved=steady.moved)  # before its tally, which is kept with it
     require_views(fit.tally, rig)
     return fit
@@ -109,7 +109,7 @@ def fit_labelled(
         RefusedError: a camera saw nothing, the estimate has no minimum, or the residuals do not fit.
     """
     rig = rig.to(torch.float64)
-    return _fitted(arrange(labelled, rig, obj), rig, obj, options, _Known(initializer, latest, prior_std))
+    return _fit(arrange_labels(labelled, rig, obj), rig, obj, options, _Known(initializer, latest, prior_std))
 
 
 @dataclass(frozen=True)
@@ -122,16 +122,16 @@ class _Known:
     fits: tuple[Solution, ...] = ()  # of all labels, where they have been made already; see `SteadyPart`
 
 
-def _fitted(
-    given: Arranged, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions, known: _Known
+def _fit(
+    given: LabelledCapture, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions, known: _Known
 ) -> Calibration:
     """Do the work of `fit_labelled` for snapshots that all have a pose."""
     arranged = given
     while True:
         try:
-            return _fitted_once(arranged, rig, obj, options, known)
+            return _fit_once(arranged, rig, obj, options, known)
         except UndeterminedPosesError as error:
-            arranged, known = arranged.without(error.rows, rig, obj), replace(known, fits=())
+            arranged, known = arranged.drop_snapshots(error.rows, rig, obj), replace(known, fits=())
             left, count = len(arranged.labelled.used), len(given.labelled.used)
             if left < LEAST_KEPT * count:
                 raise RefusedError(
@@ -140,8 +140,8 @@ def _fitted(
                 ) from error
 
 
-def _fitted_once(
-    arranged: Arranged, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions, known: _Known
+def _fit_once(
+    arranged: LabelledCapture, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions, known: _Known
 ) -> Calibration:
     """Fit, unless without outliers some snapshots do not say where the object is."""
     labelled, observations, latest = arranged.labelled, arranged.observations, known.latest
@@ -156,7 +156,7 @@ def _fitted_once(
             command="give labels (a column `fiducial`), use an object without symmetry, or one without tolerances",
         )
     prior = (rig.prior or RigPrior()).std(rig) if known.prior_std is None else known.prior_std
-    problem = make_problem(observations, rig, _with_learnt(obj, latest), prior)
+    problem = make_problem(observations, rig, _adopt_tolerances(obj, latest), prior)
     guess = None if known.initializer is None else known.initializer.guess(observations, rig, obj)
     guess_used = guess is not None and _nearer(guess, Prediction(rig, arranged.poses), observations, obj)
     first = Start(initial_state(problem, arranged.poses, None), options.identity_error)
@@ -207,22 +207,24 @@ def _fitted_once(
     )
 
 
-def _with_learnt(obj: CalibrationObject, latest: Calibration | None) -> CalibrationObject:
+def _adopt_tolerances(obj: CalibrationObject, latest: Calibration | None) -> CalibrationObject:
     """The object with the tolerances that the latest result has found necessary."""
     learnt = None if latest is None else latest.estimate.problem.object_prior_std
     return obj if learnt is None else replace(obj, tolerance=learnt[0, :-1:3])
 
 
-def _require_any_view(arranged: Arranged, rig: CameraRig, obj: CalibrationObject) -> None:
+def _require_any_view(arranged: LabelledCapture, rig: CameraRig, obj: CalibrationObject) -> None:
     """Refuse where a camera sees the object, and identity could not label any of it: worse than seeing nothing."""
     labels = arranged.observations.seen.numpy()
-    require_views(tally(arranged.labelled, labels, arranged.poses, rig, obj), rig, least_share=0.0)
+    require_views(count_labels(arranged.labelled, labels, arranged.poses, rig, obj), rig, least_share=0.0)
 
 
 def _nearer(guess: Initialization, factory: Prediction, observations: Observations, obj: CalibrationObject) -> bool:
     """Tell whether the start that a guess gives, its mean rig, is nearer to the images than the factory calibration."""
     start = Prediction(guess.rig, guess.rig_from_object)
-    return bool(residual_of(start, observations, obj).norm() < residual_of(factory, observations, obj).norm())
+    return bool(
+        prediction_residual(start, observations, obj).norm() < prediction_residual(factory, observations, obj).norm()
+    )
 
 
 def finite(value: float) -> float | None:

@@ -20,20 +20,20 @@ from imgcal.association import (
     Progress,
     associate,
     identify,
-    is_few_and_flat,
-    labels_by_shape,
+    is_small_planar,
+    label_by_shape,
     to_observations,
 )
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import K3, ColdStart, cold_start, ordinary_lens
-from imgcal.messages import listed
+from imgcal.messages import list_names
 from imgcal.pipeline.board_turns import require_one_turn
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.lights_from_scratch import calibrate_lights_from_scratch
-from imgcal.pipeline.recalibration import fit_as_timed, late_cameras, require_same_moments
-from imgcal.pipeline.repeats import name_repeats, without_repeats
-from imgcal.pipeline.sources import Frames, blobs_of
+from imgcal.pipeline.recalibration import fit_with_timing, late_cameras, require_same_moments
+from imgcal.pipeline.repeats import drop_repeats, name_repeats
+from imgcal.pipeline.sources import Frames, find_blobs
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior, Volume
 
@@ -102,8 +102,8 @@ def calibrate_from_scratch(
         raise InputError("distance: found an object of known size, expected unknown markers, which know no scale")
     if not obj.unknown_markers:
         obj.require_rigid("to calibrate without a factory calibration")
-    started, cameras, options = time.perf_counter(), _with_prior(cameras), options.of_object(obj)
-    detections, repeats = without_repeats(blobs_of(source, cameras, obj, detection))
+    started, cameras, options = time.perf_counter(), _set_prior(cameras), options.of_object(obj)
+    detections, repeats = drop_repeats(find_blobs(source, cameras, obj, detection))
     if obj.unknown_markers:
         found = time.perf_counter()
         with require_solvable():
@@ -113,7 +113,7 @@ def calibrate_from_scratch(
     require_one_turn(cameras, obj)
     found = time.perf_counter()
     is_labelled = (detections.fiducial >= 0).any()
-    alone = detections if is_labelled else labels_of_images(detections, cameras, obj, options, progress)
+    alone = detections if is_labelled else label_images(detections, cameras, obj, options, progress)
     first = _first_rig(alone, cameras, obj)
     placed = replace(first.rig, prior=PLACED)
     labelled: Associations | None = None
@@ -153,13 +153,13 @@ def _fit(
     start.distortion[:, K3 - 10] = cameras.distortion[:, K3 - 10]  # about which it has a prior that tells
     std = ordinary_lens(_wide(first, cameras).std(start))
     std[0, :6] = 0.0  # whose frame is the rig's
-    fit = fit_as_timed(labelled, labelled.detections, start, obj, options, prior_std=std)
+    fit = fit_with_timing(labelled, labelled.detections, start, obj, options, prior_std=std)
     require_central(fit, cameras)
     require_determined(fit)
     return fit
 
 
-def labels_of_images(
+def label_images(
     detections: Detections,
     cameras: CameraRig,
     obj: CalibrationObject,
@@ -179,26 +179,26 @@ def labels_of_images(
     rows, blobs = rows[order], np.bincount(image, minlength=snapshots * count)
     ends = np.cumsum(blobs)
     fiducial = np.full(len(detections), -1)
-    if is_few_and_flat(obj):
+    if is_small_planar(obj):
         images = np.split(rows, ends[:-1])
         for c in range(count):
             mine = images[c::count]
             blobs_uv, radii = ([column[those] for those in mine] for column in (detections.uv, detections.radius))
-            found = labels_by_shape(blobs_uv, cameras.select([c]), obj, radii)
+            found = label_by_shape(blobs_uv, cameras.select([c]), obj, radii)
             for those, labels in zip(mine, found, strict=True):
                 fiducial[those] = -1 if labels is None else labels
         return replace(detections, fiducial=fiducial)
-    chosen = _chosen(blobs.reshape(snapshots, count), obj.num_fiducials)
+    chosen = _choose(blobs.reshape(snapshots, count), obj.num_fiducials)
     numbers = np.flatnonzero(chosen.any(1)).tolist()
     for s in progress(numbers, len(numbers)) if progress else numbers:
         for c in np.flatnonzero(chosen[s]).tolist():
             number = s * count + c
             those = rows[ends[number] - blobs[number] : ends[number]]
-            fiducial[those] = _labels_alone(detections.select(those), cameras.select([c]), obj, options)
+            fiducial[those] = _label_image(detections.select(those), cameras.select([c]), obj, options)
     return replace(detections, fiducial=fiducial)
 
 
-def _labels_alone(
+def _label_image(
     blobs: Detections, camera: CameraRig, obj: CalibrationObject, options: PipelineOptions
 ) -> NDArray[np.int64]:
     """Label the blobs of one image, or none of them."""
@@ -209,7 +209,7 @@ def _labels_alone(
     return found.labels if found.accepted else zeros - 1
 
 
-def _chosen(blobs: NDArray[np.int64], fiducials: int) -> NDArray[np.bool_]:
+def _choose(blobs: NDArray[np.int64], fiducials: int) -> NDArray[np.bool_]:
     """Choose images (S, C) to label, by their numbers of blobs: in each camera so many, spread over the capture.
 
     First come those with as many blobs as the object has fiducials, in snapshots that several cameras see.
@@ -246,7 +246,7 @@ def _first_rig(labelled: Detections, cameras: CameraRig, obj: CalibrationObject)
     return first
 
 
-def _with_prior(cameras: CameraRig) -> CameraRig:
+def _set_prior(cameras: CameraRig) -> CameraRig:
     cameras = cameras.to(torch.float64)
     return cameras if cameras.prior is not None else replace(cameras, prior=RigPrior(0.15, 25.0, 0.1))
 
@@ -257,14 +257,14 @@ def _corner(values: Tensor) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _apart(rig: CameraRig) -> float:
+def _extent(rig: CameraRig) -> float:
     """Largest distance between two cameras, mm."""
     return max(float(torch.cdist(rig.positions, rig.positions).max()), 1.0)
 
 
 def _wide(rig: CameraRig, cameras: CameraRig) -> RigPrior:
     assert cameras.prior is not None
-    return replace(cameras.prior, rotation=WIDE_ROTATION, position=WIDE_POSITION * _apart(rig))
+    return replace(cameras.prior, rotation=WIDE_ROTATION, position=WIDE_POSITION * _extent(rig))
 
 
 def require_central(fit: Calibration, cameras: CameraRig) -> None:
@@ -289,14 +289,14 @@ def require_determined(fit: Calibration) -> None:
         (
             (std[:, 6:8] / rig.focal_length).amax(1) / LARGEST_FOCAL_STD,
             std[:, 0:3].amax(1) / LARGEST_ROTATION_STD,
-            std[:, 3:6].amax(1) / (LARGEST_POSITION_STD * _apart(rig)),
+            std[:, 3:6].amax(1) / (LARGEST_POSITION_STD * _extent(rig)),
         )
     )
     bad = ~(relative <= 1)
     if bool(bad.any()):
         kind, _ = bad.nonzero()[0].tolist()
         what = ("focal length", "direction", "position")[kind]
-        which = listed(rig.camera_names[c] for c in bad[kind].nonzero().flatten().tolist())
+        which = list_names(rig.camera_names[c] for c in bad[kind].nonzero().flatten().tolist())
         raise RefusedError(
             f"start without a factory calibration: the data say too little about the {what} of camera {which}: carry "
             "the object through more of what it sees, nearer and farther, turned in all directions"

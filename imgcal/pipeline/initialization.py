@@ -55,15 +55,15 @@ class Initializer:
             rig: the factory rig.
             obj: the object.
         """
-        shown = self._shown(observations, rig)
-        turns = [self._turned(shown, rig, obj, motion) for motion in obj.symmetries]
-        residuals = torch.stack([residual_of(turn, observations, obj) for turn in turns])  # (turns, S, C, N, 2)
+        shown = self._show(observations, rig)
+        turns = [self._turn(shown, rig, obj, motion) for motion in obj.symmetries]
+        residuals = torch.stack([prediction_residual(turn, observations, obj) for turn in turns])  # (turns, S, C, N, 2)
         best = residuals.square().sum((2, 3, 4)).nan_to_num(torch.inf).argmin(0), torch.arange(len(observations.uv))
         guess = Prediction.combine(turns, lambda tensors: torch.stack(tensors)[best])
         mean = rig.retract(guess.rig.local(rig).mean(0))
         return Initialization(self.name, mean, guess.rig_from_object, residuals[best])
 
-    def _shown(self, observations: Observations, rig: CameraRig) -> Views:
+    def _show(self, observations: Observations, rig: CameraRig) -> Views:
         """What all cameras of the training see: those that are not there see nothing."""
         cameras = self._present
         scale = self.trained.image_size[cameras].to(observations.uv) / rig.image_size
@@ -78,7 +78,7 @@ class Initializer:
     def _present(self) -> list[int]:
         return list(range(self.trained.num_cameras) if self.cameras is None else self.cameras)
 
-    def _turned(self, shown: Views, rig: CameraRig, obj: CalibrationObject, motion: Symmetry) -> Prediction:
+    def _turn(self, shown: Views, rig: CameraRig, obj: CalibrationObject, motion: Symmetry) -> Prediction:
         """What the network says of an object turned by a symmetry, turned back: (S,), in the pixels of `rig`."""
         assert shown.uv is not None and shown.seen is not None
         source = torch.from_numpy(np.argsort(motion.permutation))  # fiducial whose image each label gets
@@ -97,7 +97,7 @@ class Initializer:
         return prediction
 
 
-def residual_of(prediction: Prediction, observations: Observations, obj: CalibrationObject) -> Tensor:
+def prediction_residual(prediction: Prediction, observations: Observations, obj: CalibrationObject) -> Tensor:
     """Predicted minus observed: (S, C, N, 2) pixels, zero where not seen; one rig (S,) a snapshot or one for all."""
     poses = prediction.rig_from_object
     rigs = prediction.rig.expand(len(observations.uv))

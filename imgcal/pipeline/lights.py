@@ -29,7 +29,7 @@ from imgcal.association import (
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, EstimationOptions, estimate
 from imgcal.geometry import RigidTransform
-from imgcal.messages import listed
+from imgcal.messages import list_names
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
 
 HELD_OUT = 4
@@ -200,19 +200,19 @@ def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject
     Raises:
         RefusedError: there is none, or another one explains the blobs as well.
     """
-    learnt, tested = held_out(detections)
+    learnt, tested = split_moments(detections)
     std = (rig.prior or RigPrior()).std(rig)
     generator = torch.Generator().manual_seed(0)
-    factory = agreement_of(tested, rig)
+    factory = measure_agreement(tested, rig)
     if bool(factory.agrees.all()):
         return rig, factory, 0
     best = factory if factory.judged.any() else None
     for start in range(STARTS):
         random = torch.randn(std.shape, generator=generator, dtype=std.dtype)
-        trial = _followed(learnt, rig, rig.retract(SPREAD[start] * random * std), obj, start)
+        trial = _refine_start(learnt, rig, rig.retract(SPREAD[start] * random * std), obj, start)
         if trial is None:
             continue
-        agreement = agreement_of(tested, trial)
+        agreement = measure_agreement(tested, trial)
         if bool(agreement.agrees.all()):
             return trial, agreement, start + 1
         if best is None or agreement.score > best.score:
@@ -228,7 +228,7 @@ NOTHING = (
 )
 
 
-def held_out(detections: Detections) -> tuple[Detections, Detections]:
+def split_moments(detections: Detections) -> tuple[Detections, Detections]:
     """Part blobs by moments: those from which a rig is made, and those that take no part.
 
     Raises:
@@ -259,13 +259,14 @@ def _why(agreement: Agreement | None, rig: CameraRig) -> str:
     unjudged = [rig.camera_names[c] for c in np.flatnonzero(~agreement.judged)]
     if unjudged and not (agreement.judged & ~agreement.agrees).any():
         return (
-            f"unknown markers: camera {listed(unjudged)}: in the snapshots that took no part, the other cameras find "
+            f"unknown markers: camera {list_names(unjudged)}: in the snapshots that took no part, the other "
+            "cameras find "
             f"too few markers in its view to judge it by (expected {LEAST_PREDICTED}): capture more, or leave it out"
         )
     bad = np.flatnonzero(agreement.judged & ~agreement.agrees)
     worst = int(bad[np.argmin(agreement.found[bad])])
     return (
-        f"unknown markers: camera {listed([rig.camera_names[c] for c in bad])}: of {agreement.predicted[worst]} "
+        f"unknown markers: camera {list_names([rig.camera_names[c] for c in bad])}: of {agreement.predicted[worst]} "
         f"markers that the other cameras find in view of {rig.camera_names[worst]}, in snapshots that took no part, "
         f"{100 * max(agreement.found[worst], 0):.0f} % have a blob in their place and "
         f"{100 * max(agreement.near_misses[worst], 0):.0f} % one beside it: which blobs belong together cannot be "
@@ -273,7 +274,7 @@ def _why(agreement: Agreement | None, rig: CameraRig) -> str:
     )
 
 
-def _followed(
+def _refine_start(
     detections: Detections, factory: CameraRig, first: CameraRig, obj: CalibrationObject, seed: int
 ) -> CameraRig | None:
     """Follow one start: align the rig without labels, then label and fit by turns, narrower each time."""
@@ -308,7 +309,7 @@ def narrow(
     """
     while True:
         found = associate_lights(detections, now, even_error(factory, error))
-        lost = _lost(found, now) if joined > 0 else []
+        lost = _find_lost_cameras(found, now) if joined > 0 else []
         joined -= 1
         if lost:
             for camera in lost:
@@ -322,7 +323,7 @@ def narrow(
         error = max(FINEST, min(NARROWER * error, 3 * spread))
 
 
-def _lost(lights: Lights, rig: CameraRig) -> list[int]:
+def _find_lost_cameras(lights: Lights, rig: CameraRig) -> list[int]:
     """Cameras that show few of the markers in their view."""
     visible = rig.project(torch.from_numpy(lights.point)).visible.numpy()  # (C, R)
     shown = (lights.row >= 0).T & visible
@@ -355,7 +356,7 @@ def _fit(
     return estimate(observations, factory, obj, poses, prior_std=std, initial_rig=first, options=options)
 
 
-def agreement_of(detections: Detections, rig: CameraRig) -> Agreement:
+def measure_agreement(detections: Detections, rig: CameraRig) -> Agreement:
     """Compare what each camera sees with what all the others say that it should.
 
     Args:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from imgcal.association import PipelineOptions, associate_lights, background_rows
 from imgcal.errors import InputError, RefusedError
-from imgcal.estimation import cold_start_from_points, in_frame_of_pair, prior_of_pair
+from imgcal.estimation import cold_start_from_points, move_to_pair_frame, prior_of_pair
 from imgcal.geometry import RigidTransform
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.fitting import fit_steady
@@ -23,12 +23,12 @@ from imgcal.pipeline.lights import (
     AFTER_ALIGNMENT,
     NOTHING,
     FoundLights,
-    agreement_of,
     even_error,
-    held_out,
+    measure_agreement,
     narrow,
     require_agreement,
     rows_of_lights,
+    split_moments,
 )
 from imgcal.pipeline.scale import KnownDistance
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
@@ -88,19 +88,19 @@ def calibrate_lights_from_scratch(
     pair = None if known is None else (names.index(known.first), names.index(known.second))
     background = background_rows(detections)
     moving = detections.select(~background)
-    learnt, tested = held_out(moving)
+    learnt, tested = split_moments(moving)
     assert cameras.prior is not None
-    start = cold_start_from_points(_alone(learnt, cameras), cameras, pair)
+    start = cold_start_from_points(_pair_observations(learnt, cameras), cameras, pair)
     first, pair = start.rig, start.pair
     error = min(max(AFTER_ALIGNMENT * start.spread, 1.0), AFTER_ALIGNMENT)
     trial = narrow(learnt, first, _wide(first, pair, cameras.prior), first, obj, error, joined=0)
     if trial is None:
         raise RefusedError(NOTHING)
-    agreement = agreement_of(tested, trial)
+    agreement = measure_agreement(tested, trial)
     require_agreement(agreement, trial)
     if known is None:
         known = KnownDistance(names[pair[0]], names[pair[1]], 1000.0, is_given=False)
-    first = _scaled(in_frame_of_pair(trial, pair)[0], known.length / 1000.0)
+    first = _scale(move_to_pair_frame(trial, pair)[0], known.length / 1000.0)
     found = associate_lights(moving, first, even_error(first))
     lights = FoundLights(
         rows_of_lights(found, moving, first),
@@ -118,7 +118,7 @@ def calibrate_lights_from_scratch(
     return fit
 
 
-def _alone(detections: Detections, cameras: CameraRig) -> Observations:
+def _pair_observations(detections: Detections, cameras: CameraRig) -> Observations:
     """What images with one usable blob show, of the moments at which two such images are.
 
     Raises:
@@ -144,22 +144,22 @@ def _alone(detections: Detections, cameras: CameraRig) -> Observations:
     return Observations(*(torch.from_numpy(column[kept]) for column in (uv, sigma, seen)))
 
 
-def _scaled(rig: CameraRig, factor: float) -> CameraRig:
+def _scale(rig: CameraRig, factor: float) -> CameraRig:
     placed = RigidTransform(rig.cam_from_rig.rotation, factor * rig.cam_from_rig.translation)
     return replace(rig, cam_from_rig=placed)
 
 
-def _apart(rig: CameraRig) -> float:
+def _rig_extent(rig: CameraRig) -> float:
     """Largest distance between two cameras, mm."""
     return float(torch.cdist(rig.positions, rig.positions).max())
 
 
 def _prior(rig: CameraRig, lenses: RigPrior) -> RigPrior:
-    return replace(lenses, rotation=WIDE_ROTATION, position=WIDE_POSITION * _apart(rig))
+    return replace(lenses, rotation=WIDE_ROTATION, position=WIDE_POSITION * _rig_extent(rig))
 
 
 def _wide(rig: CameraRig, pair: tuple[int, int], lenses: RigPrior) -> torch.Tensor:
-    return prior_of_pair(rig, pair, lenses, WIDE_ROTATION, WIDE_POSITION * _apart(rig))
+    return prior_of_pair(rig, pair, lenses, WIDE_ROTATION, WIDE_POSITION * _rig_extent(rig))
 
 
 def _require_determined(fit: Calibration, reference: int) -> None:
@@ -170,7 +170,7 @@ def _require_determined(fit: Calibration, reference: int) -> None:
         (
             (std[:, 6:8] / rig.focal_length).amax(1) / LARGEST_FOCAL_STD,
             std[:, 0:3].amax(1) / LARGEST_ROTATION_STD,
-            std[:, 3:6].amax(1) / (LARGEST_POSITION_STD * _apart(rig)),
+            std[:, 3:6].amax(1) / (LARGEST_POSITION_STD * _rig_extent(rig)),
         )
     )
     if bool((relative <= 1).all()):

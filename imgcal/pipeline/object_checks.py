@@ -80,7 +80,7 @@ def object_offsets(
     return found
 
 
-def lost_fiducials(seen: NDArray[np.bool_], in_view: NDArray[np.bool_]) -> tuple[int, ...]:
+def find_lost_fiducials(seen: NDArray[np.bool_], in_view: NDArray[np.bool_]) -> tuple[int, ...]:
     """Choose the fiducials that were hardly found where all the others were: missing, hidden, or somewhere else.
 
     Args:
@@ -94,7 +94,7 @@ def lost_fiducials(seen: NDArray[np.bool_], in_view: NDArray[np.bool_]) -> tuple
     return tuple(np.flatnonzero(lost).tolist())
 
 
-def displaced(found: tuple[FiducialOffset, ...], obj: CalibrationObject) -> tuple[FiducialOffset, ...]:
+def find_displaced(found: tuple[FiducialOffset, ...], obj: CalibrationObject) -> tuple[FiducialOffset, ...]:
     """Choose the fiducials that are farther from their places than chance and their tolerance explain."""
     granted = obj.granted.double().numpy()
     return tuple(

@@ -18,18 +18,18 @@ from imgcal.association import Associations, PipelineOptions, Progress, associat
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.geometry import RigidTransform
-from imgcal.pipeline.arrangement import arrange
 from imgcal.pipeline.board_turns import settle_turns
 from imgcal.pipeline.calibration import Calibration
+from imgcal.pipeline.clock_offset import LateCamera, find_late_camera, suspects
 from imgcal.pipeline.fitting import fit_labelled, fit_steady
 from imgcal.pipeline.initialization import Initializer
-from imgcal.pipeline.lateness import LateCamera, late_camera, suspects
+from imgcal.pipeline.label_counts import LabelCounts, count_labels
+from imgcal.pipeline.labelled_capture import arrange_labels
+from imgcal.pipeline.learned_measurer import LearnedMeasurer
 from imgcal.pipeline.lights import find_lights
-from imgcal.pipeline.measuring import LearnedMeasurer
-from imgcal.pipeline.repeats import Repeats, name_repeats, without_repeats
-from imgcal.pipeline.sources import Detector, Frames, blobs_of, checked_frames, sight_of
+from imgcal.pipeline.repeats import Repeats, drop_repeats, name_repeats
+from imgcal.pipeline.sources import Detector, Frames, check_frames, find_blobs, make_sight
 from imgcal.pipeline.synchronization import NOTICEABLE, find_unsynchronized
-from imgcal.pipeline.tally import Tally, tally
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import (
     CalibrationObject,
@@ -87,15 +87,15 @@ def calibrate(
     """
     obj = as_one(obj)
     started, rig, options = time.perf_counter(), rig.to(torch.float64), options.of_object(obj)
-    source = source if isinstance(source, Detections) else checked_frames(source, rig)
-    blobs = settle_turns(blobs_of(source, rig, obj, detection, measurer), rig, obj)
-    detections, repeats = without_repeats(blobs)
+    source = source if isinstance(source, Detections) else check_frames(source, rig)
+    blobs = settle_turns(find_blobs(source, rig, obj, detection, measurer), rig, obj)
+    detections, repeats = drop_repeats(blobs)
     found = time.perf_counter()
     if obj.unknown_markers and detector != "classical":
         raise InputError(f"detector {detector}: found unknown markers, expected an object with a pattern to look for")
-    sight = sight_of(detector, source, detection, measurer)
+    sight = make_sight(detector, source, detection, measurer)
     if obj.unknown_markers:
-        return _of_lights(detections, repeats, rig, obj, options, found - started)
+        return _calibrate_lights(detections, repeats, rig, obj, options, found - started)
     if obj.parts and (sight is not None or initializer is not None):
         obj.require_rigid("for detectors and networks that look for a pattern")
     labelled: Associations | None = None
@@ -103,12 +103,12 @@ def calibrate(
         with require_solvable():
             labelled = associate(detections, rig, obj, options, progress, sight)
             identified = time.perf_counter()
-            given = detections if sight is None else _as_given(labelled)
-            fit = fit_as_timed(labelled, given, rig, obj, options, initializer)
+            given = detections if sight is None else _given_labels(labelled)
+            fit = fit_with_timing(labelled, given, rig, obj, options, initializer)
             if any(part.pose_rank == 5 for part in obj.each):
                 fit = _labelled_again(fit, given, rig, obj, options)
     except RefusedError as error:
-        if sight is not None and labelled is not None and sight.where_blobs_fail and _by_blobs(labelled):
+        if sight is not None and labelled is not None and sight.where_blobs_fail and _used_blobs(labelled):
             # They told the pose, and failed all the same.
             with contextlib.suppress(RefusedError):
                 sight = replace(sight, where_blobs_fail=False)
@@ -130,7 +130,7 @@ def calibrate(
     return replace(fit, labelled=name_repeats(fit.labelled, repeats), seconds=seconds, late=late, repeats=repeats)
 
 
-def _of_lights(
+def _calibrate_lights(
     detections: Detections,
     repeats: Repeats,
     rig: CameraRig,
@@ -169,11 +169,11 @@ def _labelled_again(
     with contextlib.suppress(RefusedError):
         again = associate(given, replace(fit.estimate.rig, prior=FOUND), obj, options)
         if int((again.detections.fiducial >= 0).sum()) > int((fit.labelled.detections.fiducial >= 0).sum()):
-            return fit_as_timed(again, given, rig, obj, options)
+            return fit_with_timing(again, given, rig, obj, options)
     return fit
 
 
-def fit_as_timed(
+def fit_with_timing(
     labelled: Associations,
     given: Detections,
     rig: CameraRig,
@@ -207,7 +207,7 @@ def fit_as_timed(
     return fit
 
 
-def _by_blobs(labelled: Associations) -> bool:
+def _used_blobs(labelled: Associations) -> bool:
     """Tell whether blobs decided about some snapshot, of which nobody has looked at the frames then."""
     snapshots = (labelled.snapshots[number] for number in labelled.used)
     return any(snapshot.found_by == "classical" and snapshot.status != "coded" for snapshot in snapshots)
@@ -231,9 +231,9 @@ def require_same_moments(
         obj: the calibration object.
         options: how sure a result must be.
     """
-    arranged = arrange(labelled, rig, obj)
+    arranged = arrange_labels(labelled, rig, obj)
     labels = arranged.observations.seen.numpy()
-    counts = tally(arranged.labelled, labels, arranged.poses, rig, obj)
+    counts = count_labels(arranged.labelled, labels, arranged.poses, rig, obj)
     moves = error.moved if isinstance(error, MovedError) else ()
     moved = tuple((move.camera, detections.snapshot_names.index(move.snapshot)) for move in moves)
     for slipped in late_cameras(detections, counts, rig, obj, options, moved, arranged.labelled):
@@ -246,7 +246,7 @@ def require_same_moments(
 
 def late_cameras(
     detections: Detections,
-    counts: Tally,
+    counts: LabelCounts,
     rig: CameraRig,
     obj: CalibrationObject,
     options: PipelineOptions,
@@ -275,7 +275,7 @@ def late_cameras(
         fit = fit_labelled(associate(blobs, rig, obj, options), rig, obj, replace(options, blind_cameras=True))
         return fit.labelled.used, fit.rig_from_object
 
-    found = (late_camera(detections, rig, obj, camera, around, others) for camera, around in asked.items())
+    found = (find_late_camera(detections, rig, obj, camera, around, others) for camera, around in asked.items())
     return tuple(late for late in found if late is not None)
 
 
@@ -286,7 +286,7 @@ def _of_part(detections: Detections, obj: CalibrationObject, part: int) -> tuple
     return replace(detections, fiducial=np.where(own, detections.fiducial - first, -1)), obj.parts[part]
 
 
-def _as_given(labelled: Associations) -> Detections:
+def _given_labels(labelled: Associations) -> Detections:
     """All blobs, also those that a proposer measured, with the labels of the input alone."""
     coded = np.array([snapshot.status == "coded" for snapshot in labelled.snapshots])
     detections = labelled.detections

@@ -43,7 +43,7 @@ class Repeats:
         return f"{' and '.join(parts)}: these copies are left out" if parts else ""
 
 
-def without_repeats(detections: Detections) -> tuple[Detections, Repeats]:
+def drop_repeats(detections: Detections) -> tuple[Detections, Repeats]:
     """Leave out blobs that are bit-identical copies of others.
 
     Args:
@@ -65,7 +65,7 @@ def without_repeats(detections: Detections) -> tuple[Detections, Repeats]:
     first: dict[tuple[int, bytes], int] = {}
     originals = dict[int, set[int]]()
     images = 0
-    for number in _alike(detections.uv[order], image[1], begins):
+    for number in _are_equal(detections.uv[order], image[1], begins):
         part = order[begins[number] : ends[number]]
         snapshot, camera = (int(value) for value in image[:, begins[number]])
         earlier = first.setdefault((camera, detections.uv[part].tobytes()), snapshot)
@@ -80,7 +80,7 @@ def without_repeats(detections: Detections) -> tuple[Detections, Repeats]:
     return (detections if kept.all() else detections.select(kept)), repeats
 
 
-def _alike(uv: NDArray[np.float64], camera: NDArray[np.int64], begins: NDArray[np.int64]) -> NDArray[np.int64]:
+def _are_equal(uv: NDArray[np.float64], camera: NDArray[np.int64], begins: NDArray[np.int64]) -> NDArray[np.int64]:
     """Find images (I,), each from a row of `begins` on, that may be copies: the sums of their blobs are the same."""
     if not len(begins):
         return begins

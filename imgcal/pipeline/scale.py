@@ -87,7 +87,7 @@ class Scale:
         }
 
 
-def scale_of(estimate: Estimate, obj: CalibrationObject, scale_sigma: float | None, volume: WorkingVolume) -> Scale:
+def find_scale(estimate: Estimate, obj: CalibrationObject, scale_sigma: float | None, volume: WorkingVolume) -> Scale:
     """Say where the scale of an estimate comes from.
 
     Args:
@@ -97,7 +97,7 @@ def scale_of(estimate: Estimate, obj: CalibrationObject, scale_sigma: float | No
         volume: where the rig is used.
     """
     if obj.pose_rank == 3:
-        return Scale("cameras", _of_positions(estimate), noticed_from=None, px_per_percent=None, mm_per_percent=None)
+        return Scale("cameras", _position_sigma(estimate), noticed_from=None, px_per_percent=None, mm_per_percent=None)
     granted, known = obj.scale_tolerance, scale_sigma or math.inf
     response = scale_response(estimate) * PERCENT
     effect = predicted_error(estimate, volume=volume, covariance=response[:, None] * response)
@@ -111,7 +111,7 @@ def scale_of(estimate: Estimate, obj: CalibrationObject, scale_sigma: float | No
     )
 
 
-def _of_positions(estimate: Estimate) -> float:
+def _position_sigma(estimate: Estimate) -> float:
     """How well the estimate knows the size of the rig: relative, one standard deviation."""
     parts = estimate.problem.prior_std.shape[1:]
     covariance = camera_covariance(estimate, curved=False).unflatten(0, parts).unflatten(-1, parts)

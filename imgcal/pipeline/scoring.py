@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from imgcal.association import Associations, PipelineOptions, Progress, associate, observations_of
+from imgcal.association import Associations, PipelineOptions, Progress, accepted_observations, associate
 from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import estimate
 from imgcal.pipeline.board_turns import settle_turns
 from imgcal.pipeline.lights import FoundLights, find_lights
 from imgcal.pipeline.recalibration import as_one
-from imgcal.pipeline.sources import Frames, blobs_of
+from imgcal.pipeline.sources import Frames, find_blobs
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
@@ -108,23 +108,23 @@ def score(
     """
     obj = as_one(obj)
     rig, options = rig.to(torch.float64), options.of_object(obj)
-    detections = settle_turns(blobs_of(source, rig, obj, detection), rig, obj)
+    detections = settle_turns(find_blobs(source, rig, obj, detection), rig, obj)
     if obj.unknown_markers:
         with require_solvable():
             lights = find_lights(detections, rig, obj, options)
-            return replace(_scored(lights.labelled, rig, obj, options), lights=lights)
+            return replace(_fit_poses(lights.labelled, rig, obj, options), lights=lights)
     try:
         with require_solvable():
-            return _scored(associate(detections, rig, obj, options, progress), rig, obj, options)
+            return _fit_poses(associate(detections, rig, obj, options, progress), rig, obj, options)
     except RefusedError as error:
         if obj.pose_rank == 6 and not obj.parts:  # as in `calibrate`
             require_units(error, detections, rig, obj)
         raise
 
 
-def _scored(labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> RigScore:
+def _fit_poses(labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> RigScore:
     """Fit a pose in each labelled snapshot."""
-    observations, poses = observations_of(labelled, rig, obj)
+    observations, poses = accepted_observations(labelled, rig, obj)
     if obj.unknown_markers:
         poses = None  # those are of the rig by which the markers were found
     fixed = torch.zeros(*rig.distortion.shape[:-1], rig.num_parameters, dtype=rig.distortion.dtype)

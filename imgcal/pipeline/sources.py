@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from imgcal.association import Proposer, Sight, matched_to_rig
+from imgcal.association import Proposer, Sight, match_to_rig
 from imgcal.detection import DetectionOptions, Frame, detect
 from imgcal.errors import InputError
 from imgcal.io import MARGIN, grey_frame, model_file, nearest
 from imgcal.matching import MatchedFilter
-from imgcal.pipeline.learned import LearnedProposer, load_proposer
-from imgcal.pipeline.measuring import LearnedMeasurer
+from imgcal.pipeline.learned_measurer import LearnedMeasurer
+from imgcal.pipeline.learned_proposer import LearnedProposer, load_proposer
 from imgcal.types import BLOB_RADIUS, SIGMA, CalibrationObject, CameraRig, Detections
 
 Frames = Mapping[str, Frame | Sequence[Frame | None] | None]
@@ -31,7 +31,7 @@ with frames that are not in memory. Blobs decide where nobody else can."""
 ROWS = tuple(field.name for field in fields(Detections) if not field.name.endswith("_names"))
 
 
-def blobs_of(
+def find_blobs(
     source: Detections | Frames,
     rig: CameraRig,
     obj: CalibrationObject,
@@ -48,19 +48,19 @@ def blobs_of(
             raise InputError(f"measurer {measurer.name}: found blobs without frames, expected frames to look at")
         if obj.unknown_markers and len(source):
             source = replace(source, fiducial=np.full(len(source), -1))
-        return checked_detections(source, rig, obj)
-    frames = checked_frames(source, rig)
+        return check_detections(source, rig, obj)
+    frames = check_frames(source, rig)
     if not frames:
         raise InputError(f"frames: found no camera, expected frames of the cameras of rig {rig.name}")
     blobs = detect(frames, options, board=obj.board)
     if obj.board is not None and measurer is not None:
         raise InputError(f"measurer {measurer.name}: found a printed board, expected an object with markers")
     if measurer is not None:
-        blobs = measurer.of_snapshots(_in_memory(frames), blobs, options)
-    return matched_to_rig(blobs, rig)
+        blobs = measurer.of_snapshots(_read_memory(frames), blobs, options)
+    return match_to_rig(blobs, rig)
 
 
-def sight_of(
+def make_sight(
     detector: Detector,
     source: Detections | Frames,
     detection: DetectionOptions,
@@ -79,13 +79,15 @@ def sight_of(
     """
     if isinstance(detector, Sight) or detector == "classical":
         return None if isinstance(detector, str) else detector
-    proposer, where_blobs_fail = proposer_of(detector, measurer)
+    proposer, where_blobs_fail = choose_proposer(detector, measurer)
     if isinstance(source, Detections):
         raise InputError(f"detector {proposer.name}: found blobs without frames, expected frames to look at")
-    return Sight(proposer, _in_memory(source), where_blobs_fail, detection)
+    return Sight(proposer, _read_memory(source), where_blobs_fail, detection)
 
 
-def proposer_of(detector: DetectorName | Proposer, measurer: LearnedMeasurer | None = None) -> tuple[Proposer, bool]:
+def choose_proposer(
+    detector: DetectorName | Proposer, measurer: LearnedMeasurer | None = None
+) -> tuple[Proposer, bool]:
     """Give who looks, and whether only where blobs decide nothing.
 
     Args:
@@ -111,13 +113,13 @@ def _reading(proposer: LearnedProposer, measurer: LearnedMeasurer | None) -> Lea
     return proposer if measurer is None else replace(proposer, measurer=measurer.network)
 
 
-def _in_memory(source: Frames) -> Callable[[int], Mapping[str, Frame | None]]:
+def _read_memory(source: Frames) -> Callable[[int], Mapping[str, Frame | None]]:
     """Frames of one snapshot after another, of cameras that have one frame or many."""
     series = {name: entry if isinstance(entry, Sequence) else (entry,) for name, entry in source.items()}
     return lambda number: {name: frames[number] if number < len(frames) else None for name, frames in series.items()}
 
 
-def checked_frames(frames: object, rig: CameraRig) -> dict[str, Any]:
+def check_frames(frames: object, rig: CameraRig) -> dict[str, Any]:
     """Return frames by camera, in grey, if all of them are of the rig's cameras and sizes, and explain otherwise.
 
     Frames of three equal channels, as OpenCV reads grey videos, are grey: the same that files may be.
@@ -133,13 +135,13 @@ def checked_frames(frames: object, rig: CameraRig) -> dict[str, Any]:
             )
         width, height = (int(size) for size in sizes[camera])
         if isinstance(entry, Sequence) and not isinstance(entry, str):
-            checked[camera] = [_checked_frame(frame, camera, width, height, rig) for frame in entry]
+            checked[camera] = [_check_frame(frame, camera, width, height, rig) for frame in entry]
         else:
-            checked[camera] = _checked_frame(entry, camera, width, height, rig)
+            checked[camera] = _check_frame(entry, camera, width, height, rig)
     return checked
 
 
-def _checked_frame(frame: Any, camera: str, width: int, height: int, rig: CameraRig) -> Any:
+def _check_frame(frame: Any, camera: str, width: int, height: int, rig: CameraRig) -> Any:
     """Look at what is a frame; detection explains what is none."""
     if not isinstance(frame, np.ndarray):
         return frame
@@ -153,7 +155,7 @@ def _checked_frame(frame: Any, camera: str, width: int, height: int, rig: Camera
     return frame
 
 
-def checked_detections(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Detections:
+def check_detections(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Detections:
     """Return detections with their cameras numbered as in the rig, if they can be of this rig and object.
 
     Raises:
@@ -188,7 +190,7 @@ def checked_detections(detections: Detections, rig: CameraRig, obj: CalibrationO
         np.isnan(detections.radius) | ((detections.radius >= 0) & (detections.radius <= BLOB_RADIUS.high)),
         f"a radius, {BLOB_RADIUS}, or nan",
     )
-    detections = matched_to_rig(detections, rig)
+    detections = match_to_rig(detections, rig)
     size = rig.image_size.numpy()[detections.camera]
     inside = ((detections.uv >= -0.5 - MARGIN) & (detections.uv <= size - 0.5 + MARGIN)).all(axis=1)
     if not inside.all():

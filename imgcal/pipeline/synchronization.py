@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from imgcal.association import Associations, observations_of
+from imgcal.association import Associations, accepted_observations
 from imgcal.estimation import estimate
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
@@ -75,7 +75,7 @@ def find_unsynchronized(
     """
     if rig.num_cameras < 2:
         return None
-    observations, poses = observations_of(labelled, rig, obj)
+    observations, poses = accepted_observations(labelled, rig, obj)
     even = replace(observations, sigma=torch.ones_like(observations.sigma))
     fit = estimate(even, rig, obj.taken_as_exact(), poses)
     if not bool(fit.converged):
@@ -97,7 +97,7 @@ def find_unsynchronized(
     usual = float(np.median(moved))
     added = found.still**2 + (found.share * torch.where(speed.isfinite(), speed, usual)) ** 2
     # All points of an image are shifted alike: that of N of them says no more than that of one.
-    return found, _with_sigma(labelled, (count * added / 2).numpy())
+    return found, _add_variance(labelled, (count * added / 2).numpy())
 
 
 def _verdict(
@@ -131,7 +131,7 @@ def _speed(uv: Tensor, seen: Tensor, before: NDArray[np.int64]) -> Tensor:
     return (torch.where(seen, squared.nanmean(0), 0.0).sum(-1) / seen.sum(-1)).sqrt()
 
 
-def _with_sigma(labelled: Associations, added: NDArray[np.float64]) -> Detections:
+def _add_variance(labelled: Associations, added: NDArray[np.float64]) -> Detections:
     """The detections with more variance (px^2 of each axis) by image (S, C) of the used snapshots."""
     detections = labelled.detections
     row = np.full(len(labelled.snapshots), -1)

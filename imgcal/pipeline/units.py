@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 
 from imgcal.association import to_observations
 from imgcal.errors import RefusedError
-from imgcal.estimation import poses_alone
+from imgcal.estimation import single_camera_poses
 from imgcal.geometry import vector_from_rotation
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
@@ -161,7 +161,7 @@ def _doubt_by_poses(detections: Detections, rig: CameraRig, obj: CalibrationObje
     rows = np.flatnonzero((detections.fiducial >= 0) & detections.usable)
     snapshots = np.unique(detections.snapshot[rows])[:MOST_ASKED]
     seen = to_observations(detections.select(rows[np.isin(detections.snapshot[rows], snapshots)]), rig, obj)
-    placed, known = poses_alone(seen, rig, obj)
+    placed, known = single_camera_poses(seen, rig, obj)
     lengths, turns = [], []
     for first in range(rig.num_cameras):
         for second in range(first):

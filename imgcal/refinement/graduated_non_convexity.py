@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation import Estimate, EstimationOptions, initial_pose
-from imgcal.refinement.points import as_prediction, observed, refine_points
+from imgcal.refinement.points import make_observations, make_prediction, refine_points
 from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 
 SQUARED = EstimationOptions(loss="squared")
@@ -97,9 +97,9 @@ def refine_robustly(
     target = Target(views.uv.double(), views.seen, factory.to(torch.float64), obj, prior_std.double(), sigma, trust)
     fit = target.fit(guess, AT_FIRST)
     suspect = (~fits(fit, sigma, options.fits)).nonzero().squeeze(-1)
-    result = as_prediction(fit)
+    result = make_prediction(fit)
     if len(suspect):
-        result = _replaced(result, suspect, _robust(guess[suspect], target[suspect], options))
+        result = _replace_rigs(result, suspect, _robust(guess[suspect], target[suspect], options))
     return result
 
 
@@ -123,13 +123,13 @@ def _robust(guess: Prediction, target: Target, options: RobustOptions) -> Predic
             part, some = result[rows], target[rows]
             bounded = EstimationOptions(loss="geman_mcclure", threshold=limit)
             points = undo_label_swaps(part, some, options.mending * limit)
-            result = _replaced(result, rows, as_prediction(some.fit(part, bounded, points.uv, points.seen)))
+            result = _replace_rigs(result, rows, make_prediction(some.fit(part, bounded, points.uv, points.seen)))
     for _ in range(options.rounds):
         points = undo_label_swaps(result, target, options.gate)
-        result = as_prediction(target.fit(result, uv=points.uv, seen=points.fits))
+        result = make_prediction(target.fit(result, uv=points.uv, seen=points.fits))
     worse = ~(_misfit(result, target) < _misfit(guess, target))
     rows = worse.nonzero().squeeze(-1)
-    return _replaced(result, rows, guess[rows])
+    return _replace_rigs(result, rows, guess[rows])
 
 
 def _misfit(prediction: Prediction, target: Target) -> Tensor:
@@ -197,11 +197,11 @@ def robust_pose(views: Views, factory: CameraRig, obj: CalibrationObject, sigma:
     uv, rig = views.uv.double(), factory.to(torch.float64)
     fixed = torch.zeros_like(rig.distortion[..., :1]).expand(rig.num_cameras, rig.num_parameters)
     target = Target(uv, views.seen, rig, obj, fixed, sigma)
-    pose = initial_pose(observed(uv, views.seen, sigma), rig, obj)[:, 0]
+    pose = initial_pose(make_observations(uv, views.seen, sigma), rig, obj)[:, 0]
     result = Prediction(rig.expand(len(views)), pose)
     for pixels in (100.0, 30.0):
         bounded = EstimationOptions(loss="geman_mcclure", threshold=pixels / sigma)
-        result = as_prediction(target.fit(result, bounded))
+        result = make_prediction(target.fit(result, bounded))
     return result
 
 
@@ -211,6 +211,6 @@ def _predicted_uv(prediction: Prediction, target: Target) -> Tensor:
     return prediction.cameras_from_object.project(points, radius).uv
 
 
-def _replaced(whole: Prediction, rows: Tensor, part: Prediction) -> Prediction:
+def _replace_rigs(whole: Prediction, rows: Tensor, part: Prediction) -> Prediction:
     """Put `part` in the place of some rigs of a batch."""
     return Prediction.combine((whole, part), lambda pair: pair[0].index_copy(0, rows, pair[1]))

@@ -33,7 +33,7 @@ def colours_at(images: Tensor, uv: Tensor, dot: float) -> Tensor:
     return torch.linalg.solve(overlap + torch.diag_embed(RIDGE * weight + (weight == 0)), (1 + RIDGE) * seen)
 
 
-def swapped_labels(found: Tensor, colours: Tensor, fits: Tensor) -> Tensor:
+def find_swapped_labels(found: Tensor, colours: Tensor, fits: Tensor) -> Tensor:
     """Name the fiducial whose colour is at each fiducial's place.
 
     Args:

@@ -1,7 +1,7 @@
 """Photometric normal equations of colour-coded dots: what images say about moving each dot.
 
 A dot is an outer product (colour x profile down x profile across), so products of images of dots are products of short
-one-dimensional sums. From afar (`blurred_step`) no image is rendered at all; from near (`DotWindows`) windows are,
+one-dimensional sums. From afar (`take_blurred_step`) no image is rendered at all; from near (`DotWindows`) windows are,
 because only there overlapping dots that saturate can be told from others.
 
 Axes: M images (rigs times cameras), N dots, K channels, H, W image, w side of a window.
@@ -38,12 +38,12 @@ class ShiftPrior:
         one_axis = (torch.eye(count).to(like) - together / (alone + count * together)) / alone
         return torch.block_diag(one_axis, one_axis)
 
-    def scaled(self, factor: float) -> ShiftPrior:
+    def scale(self, factor: float) -> ShiftPrior:
         """Change the unit of length."""
         return ShiftPrior(self.together * factor, self.alone * factor)
 
 
-def blurred_step(
+def take_blurred_step(
     images: Tensor, uv: Tensor, colours: Tensor, dot: float, blur: float, prior: ShiftPrior, trust: float
 ) -> tuple[Tensor, Tensor]:
     """Take one Gauss-Newton step of all dots at once towards the images, both blurred.

@@ -59,7 +59,7 @@ def refine_points(
     seen = torch.ones_like(uv[..., 0], dtype=torch.bool) if views.seen is None else views.seen
     guess = prediction.detach().to(torch.float64)
     return estimate(
-        observed(uv, seen, sigma),
+        make_observations(uv, seen, sigma),
         factory.to(torch.float64),
         obj,
         guess.rig_from_object.reshape(len(uv), 1),
@@ -69,12 +69,12 @@ def refine_points(
     )
 
 
-def observed(uv: Tensor, seen: Tensor, sigma: Tensor | float) -> Observations:
+def make_observations(uv: Tensor, seen: Tensor, sigma: Tensor | float) -> Observations:
     """One snapshot a rig, uv (B, C, N, 2), seen and sigma (B, C, N), as observations (B, 1, C, N)."""
     sigmas = torch.as_tensor(sigma, dtype=uv.dtype, device=uv.device).expand(seen.shape)
     return Observations(uv[:, None], sigmas[:, None], seen[:, None])
 
 
-def as_prediction(estimate: Estimate) -> Prediction:
+def make_prediction(estimate: Estimate) -> Prediction:
     """Take an estimate of one snapshot a rig, (B,) and (B, 1) poses, as a prediction."""
     return Prediction(estimate.rig, estimate.rig_from_object[:, 0])

@@ -12,9 +12,9 @@ from torch import Tensor
 from imgcal.errors import InputError
 from imgcal.estimation import Estimate, EstimationOptions, estimate, make_problem
 from imgcal.refinement.graduated_non_convexity import refine_robustly
-from imgcal.refinement.label_swaps import colours_at, swapped_labels
-from imgcal.refinement.photometric import DotWindows, NearFit, ShiftPrior, blurred_step
-from imgcal.refinement.points import as_prediction
+from imgcal.refinement.label_swaps import colours_at, find_swapped_labels
+from imgcal.refinement.photometric import DotWindows, NearFit, ShiftPrior, take_blurred_step
+from imgcal.refinement.points import make_prediction
 from imgcal.synthesis import GREY_LEVELS, ImageOptions
 from imgcal.types import CalibrationObject, CameraRig, Observations, Prediction, Views
 
@@ -64,7 +64,7 @@ def refine_images(
 
     Each image is compared with rendered dots, blurred at first and sharp at last, every camera on its own, which gives
     the dots' places and how well they are known; the most probable rig follows from those. Rigs that the images do not
-    confirm are tried again from there, and with dots taken for those whose places they have (`swapped_labels`).
+    confirm are tried again from there, and with dots taken for those whose places they have (`find_swapped_labels`).
 
     Args:
         prediction: (B,) first guess.
@@ -92,24 +92,24 @@ def search(problem: ImageProblem, prediction: Prediction, images: Tensor) -> tup
     """Do the work of `refine_images`; the estimate is for images."""
     guess = prediction.detach().to(torch.float64)
     guess = Prediction(guess.rig.resized(problem.size), guess.rig_from_object)
-    dots = problem.look(images, guess)
+    dots = problem.find_dots(images, guess)
     result = problem.solve(dots, guess)
     for attempt in problem.options.attempts:
         again = (~result.converged).nonzero().squeeze(-1)
         if len(again) == 0:
             break
-        found = as_prediction(result)
+        found = make_prediction(result)
         if attempt == "relabel":
             again = again[problem.near(guess[again], dots.select(again))]
             if len(again) == 0:
                 continue
             new = problem.relabel(images[again], guess[again], dots.select(again))
             relabelled = problem.solve(new, found[again])
-            better = problem.explained(relabelled, new) > problem.explained(result, dots)[again]
+            better = problem.count_explained(relabelled, new) > problem.count_explained(result, dots)[again]
             again, new = again[better], new.select(better)
         else:
-            new = problem.look(images[again], found[again], dots.select(again) if attempt == "near" else None)
-        dots = dots.updated(again, new)
+            new = problem.find_dots(images[again], found[again], dots.select(again) if attempt == "near" else None)
+        dots = dots.update(again, new)
         result = problem.solve(dots, found)
     return result, dots
 
@@ -128,7 +128,7 @@ class Dots:
         """Keep some rigs."""
         return Dots(**{name: value[rows] for name, value in vars(self).items()})
 
-    def updated(self, rows: Tensor, new: Dots) -> Dots:
+    def update(self, rows: Tensor, new: Dots) -> Dots:
         """Replace some rigs."""
         return Dots(**{name: value.index_copy(0, rows, getattr(new, name)) for name, value in vars(self).items()})
 
@@ -155,7 +155,7 @@ class ImageProblem:
         self.points = obj.points.to(prior_std)
         self.colours = obj.colours.to(prior_std.device, torch.float32)
 
-    def look(self, images: Tensor, guess: Prediction, known: Dots | None = None) -> Dots:
+    def find_dots(self, images: Tensor, guess: Prediction, known: Dots | None = None) -> Dots:
         """Find the dots of images (B, C, 3, H, W) near where a prediction puts them, or near where they are known."""
         options, flat, batch = self.options, images.flatten(0, 1), images.shape[:2]
         uv = self._places(guess)
@@ -174,7 +174,7 @@ class ImageProblem:
         offset = torch.where(dots.believed, (self._places(guess) - dots.uv).norm(dim=-1), torch.nan)
         return offset.flatten(1).nanmedian(-1).values < self.options.near
 
-    def explained(self, result: Estimate, dots: Dots) -> Tensor:
+    def count_explained(self, result: Estimate, dots: Dots) -> Tensor:
         """Count the dots that rigs explain, (B,): none where they contradict each other."""
         return dots.believed.sum((1, 2)) * (result.chi2_per_dof < self.options.most_chi2)
 
@@ -186,15 +186,15 @@ class ImageProblem:
             guess: (B,) where to start.
             dots: what was found; some may be at the place of another fiducial.
         """
-        rig = self._agreed(guess, dots)
+        rig = self._fit_robustly(guess, dots)
         uv = self._places(rig)
         offset = (uv - dots.uv).norm(dim=-1)
         colour = colours_at(images.flatten(0, 1), uv.flatten(0, 1), self.options.image.dot)
         fits = dots.believed & (offset < self.options.gate * dots.sigma)
-        taken = swapped_labels(colour.unflatten(0, uv.shape[:2]), self.colours, fits)
+        taken = find_swapped_labels(colour.unflatten(0, uv.shape[:2]), self.colours, fits)
         return self.measure(images, uv, taken >= 0, taken.clamp_min(0), dots.light, 2 * self.options.steps)
 
-    def _agreed(self, guess: Prediction, dots: Dots) -> Prediction:
+    def _fit_robustly(self, guess: Prediction, dots: Dots) -> Prediction:
         """Estimate rigs in spite of dots that are not what they seem."""
         typical = float(dots.sigma[dots.believed].median()) if bool(dots.believed.any()) else 1.0
         factor = torch.where(dots.believed, dots.sigma / typical, 1.0)
@@ -243,11 +243,11 @@ class ImageProblem:
         """Take blurred steps: places (M, N, 2), amplitudes (M, N) and the light of each image (M,)."""
         options, pool = self.options, self.options.pooling
         pieces = flat.split(_chunk(flat, flat.shape[1:].numel()))
-        pooled, dot = torch.cat([_pooled(some, pool) for some in pieces]), options.image.dot / pool
-        shift, amplitude = options.shift.scaled(1 / pool), uv.new_ones(uv.shape[:-1])
+        pooled, dot = torch.cat([_pool(some, pool) for some in pieces]), options.image.dot / pool
+        shift, amplitude = options.shift.scale(1 / pool), uv.new_ones(uv.shape[:-1])
         near = ((uv + 0.5) / pool - 0.5).to(self.colours)
         for blur in blurs:
-            step, amplitude = blurred_step(pooled, near, self.colours, dot, blur / pool, shift, options.trust)
+            step, amplitude = take_blurred_step(pooled, near, self.colours, dot, blur / pool, shift, options.trust)
             near = near + step
         dark = (1 + options.noise) / GREY_LEVELS  # noise that cannot be negative adds up over a black image
         light = torch.where(pooled > dark, pooled, 0.0).sum((1, 2, 3))
@@ -300,7 +300,7 @@ def _chunk(images: Tensor, floats: int) -> int:
     return max(1, CHUNK.get(images.device.type, CHUNK["cuda"]) // floats)
 
 
-def _pooled(images: Tensor, pool: int) -> Tensor:
+def _pool(images: Tensor, pool: int) -> Tensor:
     """Mean over squares of pixels: (M, K, H, W) -> (M, K, H / pool, W / pool), float32."""
     rows = images[:, :, ::pool].float()
     for row in range(1, pool):  # slices: several times faster than a sum over a short axis

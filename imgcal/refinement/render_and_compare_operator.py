@@ -18,9 +18,9 @@ from imgcal.estimation import (
     make_loss,
     make_problem,
     pose_at,
+    prepend_lenses,
     rig_at,
-    with_lenses,
-    without_lenses,
+    split_lenses,
 )
 from imgcal.geometry import ModelNames, RigidTransform
 from imgcal.operators import Operator, Tensors
@@ -43,7 +43,7 @@ def refine_images_anywhere(
         factory: (B,) the centre of the prior.
         obj: N fiducials in their colours, exact.
         prior_std: (B, C, K) standard deviation of each factory value.
-        options: how to compare, as `encoded_image_options` returns it.
+        options: how to compare, as `encode_image_options` returns it.
 
     Returns:
         (B,) rigs, poses, and whether they have converged; float64.
@@ -63,17 +63,17 @@ def refine_images_anywhere(
         points,
         obj.colours,
         radius,
-        options=with_lenses(factory, options),
+        options=prepend_lenses(factory, options),
     )[:8]
     return _rig(rig, factory.image_size, factory.lens_model), RigidTransform(rotation, translation), converged
 
 
-def encoded_image_options(options: ImageRefinementOptions) -> str:
+def encode_image_options(options: ImageRefinementOptions) -> str:
     """Write options as `refine_images_anywhere` takes them."""
     return json.dumps(asdict(options))
 
 
-def _decoded(options: str) -> ImageRefinementOptions:
+def _decode(options: str) -> ImageRefinementOptions:
     values: dict[str, Any] = json.loads(options)
     values |= {name: tuple(values[name]) for name in ("blurs", "attempts")}
     for name, kind in (("image", ImageOptions), ("shift", ShiftPrior), ("estimation", EstimationOptions)):
@@ -120,10 +120,10 @@ def _like(inputs: Tensors, options: str) -> Tensors:
 
 
 def _problem(inputs: Tensors, options: str) -> ImageProblem:
-    lenses, options = without_lenses(options)
+    lenses, options = split_lenses(options)
     image_size, prior_std, points, colours, radius = inputs[13:]
     obj = CalibrationObject(points, colours, radius=radius if len(radius) else None)
-    return ImageProblem(_rig(inputs[8:13], image_size, lenses), obj, prior_std, _decoded(options))
+    return ImageProblem(_rig(inputs[8:13], image_size, lenses), obj, prior_std, _decode(options))
 
 
 def _tensors(rig: CameraRig) -> Tensors:

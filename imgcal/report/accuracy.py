@@ -37,11 +37,11 @@ def sentences(content: ReportContent) -> tuple[str, ...]:
         words = f"Median predicted error {length(predicted.median_mm)}; 95 % of the volume below {most}; "
         without = float(predicted.mm_without_exceptions.nanmedian())
         if without < WORTH_SAYING * predicted.median_mm:
-            words += f"{length(without)} without {_listed(names)}; "
+            words += f"{length(without)} without {_list_names(names)}; "
     words += f"{'' if words else 'Median predicted error '}in the images {svg.pixels(usual)} px"
     if names:
         worst = [f"{content.cameras[i]} ({svg.pixels(predicted.camera_px[i])} px)" for i in predicted.exceptions]
-        words += f", except through {_listed(worst)}"
+        words += f", except through {_list_names(worst)}"
     found = [words + "."]
     if content.scale:
         found.append(f"{content.scale[0].upper()}{content.scale[1:]}.")
@@ -162,7 +162,7 @@ def _range(values: Array) -> float:
     return float(np.quantile(known, 0.95) / max(np.quantile(known, 0.05), 1e-300)) if len(known) else 0.0
 
 
-def _listed(names: list[str]) -> str:
+def _list_names(names: list[str]) -> str:
     shown = ", ".join(names[:MOST_NAMED])
     return shown if len(names) <= MOST_NAMED else f"{shown} and {len(names) - MOST_NAMED} more"
 

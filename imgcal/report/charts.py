@@ -72,7 +72,7 @@ def rms_by_camera(content: ReportContent) -> Markup:
     after = content.rms_by(content.detections.camera, content.residual_after, count)
     both = np.concatenate((before, after))
     both = np.log10(np.maximum(both[np.isfinite(both)], 1e-6))
-    names = [svg.shortened(name) for name in content.cameras]
+    names = [svg.shorten_name(name) for name in content.cameras]
     margin = 24 + 6.5 * max(len(name) for name in names)
     limits = (float(both.min()) - 0.1, float(both.max()) + 0.1)
     axes = Axes(margin, 330, 6, 12 + 22 * count, limits, (0, 1))
@@ -190,7 +190,7 @@ def time_bars(seconds: Mapping[str, float]) -> Markup:
     parts = []
     for i, (stage, value) in enumerate(seconds.items()):
         y = 4 + 22 * i
-        parts.append(svg.text(108, y + 13, svg.shortened(stage), kind="label", anchor="end"))
+        parts.append(svg.text(108, y + 13, svg.shorten_name(stage), kind="label", anchor="end"))
         parts.append(svg.box(116, y + 2, max(340 * value / largest, 1), 14, "bar after"))
         parts.append(svg.text(124 + 340 * value / largest, y + 13, duration(value), anchor="start"))
     return svg.drawing(560, 8 + 22 * len(seconds), "Time of each stage", *parts)

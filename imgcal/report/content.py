@@ -141,16 +141,16 @@ class ReportContent:
     @cached_property
     def change(self) -> Array | None:
         """Recalibrated minus factory, a motion of the whole rig taken out: (C, K)."""
-        if self.laid is None:
+        if self.aligned_rig is None:
             return None
-        return self.laid.local(self.factory.to(torch.float64)).detach().cpu().numpy()
+        return self.aligned_rig.local(self.factory.to(torch.float64)).detach().cpu().numpy()
 
     @cached_property
-    def laid(self) -> CameraRig | None:
+    def aligned_rig(self) -> CameraRig | None:
         """The recalibrated rig, laid upon the factory's as `gauge` says."""
         if self.recalibrated is None or self.gauge is None:
             return None
-        return self.gauge.laid(self.recalibrated.to(torch.float64), self.factory.to(torch.float64))
+        return self.gauge.align(self.recalibrated.to(torch.float64), self.factory.to(torch.float64))
 
     @property
     def reference(self) -> int | None:

@@ -110,7 +110,7 @@ def _kind(one: Taught, before: RigPrior) -> dict[str, Any]:
         ],
         "trends": [
             (
-                t.covariate, t.camera, one.kind.name_of(t),
+                t.covariate, t.camera, one.kind.parameter_name(t),
                 f"{factor * t.slope:.3g} ± {factor * t.sigma:.1g} {unit}",
             )
             for t in learnt.trends

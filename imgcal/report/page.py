@@ -61,7 +61,7 @@ def render(content: ReportContent) -> str:
         overlays=_overlays(content),
         rows=tables.camera_rows(content),
         groups=tables.GROUPS,
-        knowledge=list(zip(content.cameras, tables.knowledge(content), strict=False)),
+        knowledge=list(zip(content.cameras, tables.knowledge_rows(content), strict=False)),
         parameters=[content.factory.parameter_names[i] for i in tables.columns(content)],
         limits={"moved": MOVED, "undetermined": round(100 * UNDETERMINED)},
         times=charts.time_bars(content.seconds) if content.seconds else None,
@@ -144,7 +144,7 @@ def _coverage(content: ReportContent) -> dict[str, object]:
     counts = np.bincount(content.detections.camera[rows], minlength=len(content.cameras))
 
     def words(camera: int) -> str:
-        number = f"{svg.grouped(int(counts[camera]))} blobs"
+        number = f"{svg.group_digits(int(counts[camera]))} blobs"
         if not labelled.any():  # what a reflection covers is unknown
             return f"{number}, none labelled"
         return f"{number}, {100 * charts.covered_share(content, camera):.0f} %"
@@ -191,8 +191,8 @@ def _accuracy(content: ReportContent) -> dict[str, object] | None:
 
 
 def _rig(content: ReportContent) -> dict[str, object]:
-    drawn = scene.drawn_scene(content)
-    snapshots, fiducials = scene.drawn_fiducials(content)
+    drawn = scene.describe_scene(content)
+    snapshots, fiducials = scene.choose_fiducials(content)
     return {
         "scene": _values(drawn.values),
         "factors": drawn.factors,
@@ -221,11 +221,13 @@ def _subsampling(content: ReportContent) -> list[str]:
     notes = []
     used = int(content.used.sum())
     if used > charts.LARGEST_SCATTER:
-        notes.append(f"The scatter shows {svg.grouped(charts.LARGEST_SCATTER)} of {svg.grouped(used)} residuals.")
+        notes.append(
+            f"The scatter shows {svg.group_digits(charts.LARGEST_SCATTER)} of {svg.group_digits(used)} residuals."
+        )
     panel = charts.panel_size(content)
     if len(content.detections) and int(np.bincount(content.detections.camera).max()) > panel:
         notes.append(f"The coverage shows at most {panel} observations of each camera.")
-    snapshots, fiducials = scene.drawn_fiducials(content)
+    snapshots, fiducials = scene.choose_fiducials(content)
     total = 0 if content.object_points is None else len(content.object_points)
     known = sum(not s.reason for s in content.snapshots)
     if len(snapshots) and (len(snapshots) < known or len(fiducials) < total):

@@ -57,7 +57,7 @@ def rig_scene(rigs: Sequence[DrawnRig], points: Array | None = None) -> Scene:
             "name": rig.name,
             "colour": rig.colour,
             "filled": rig.filled,
-            "steps": [_rounded(frustums(step, length)) for step in rig.steps],
+            "steps": [_round(frustums(step, length)) for step in rig.steps],
         }
         for rig in rigs
     ]
@@ -66,7 +66,7 @@ def rig_scene(rigs: Sequence[DrawnRig], points: Array | None = None) -> Scene:
         "up": [round(float(v), 6) for v in up],
         "forward": [round(float(v), 6) for v in _forward(first, up)],
         "rigs": drawn,
-        "groups": [] if points is None else _rounded(points),
+        "groups": [] if points is None else _round(points),
     }
 
 
@@ -85,7 +85,7 @@ def up_axis(rig: CameraRig) -> Array:
     size = float(np.linalg.norm(mean))
     if size < UPRIGHT:
         return np.array([0.0, -1.0, 0.0])
-    return _snapped(mean / size)
+    return _snap(mean / size)
 
 
 def frustum_length(rig: CameraRig, points: Array | None = None) -> float:
@@ -125,20 +125,20 @@ def _forward(rig: CameraRig, up: Array) -> Array:
     level = mean - (mean @ up) * up
     size = float(np.linalg.norm(level))
     if size > UPRIGHT / 2:
-        return _snapped(level / size)
+        return _snap(level / size)
     axis = np.eye(3)[int(np.argmin(np.abs(up)))] if abs(up[2]) > ALONG_AXIS else np.array([0.0, 0.0, 1.0])
     level = axis - (axis @ up) * up
     return np.asarray(level / np.linalg.norm(level))
 
 
-def _snapped(direction: Array) -> Array:
+def _snap(direction: Array) -> Array:
     axis = int(np.argmax(np.abs(direction)))
     if abs(direction[axis]) < ALONG_AXIS:
         return direction
     return np.asarray(np.eye(3)[axis] * np.sign(direction[axis]))
 
 
-def _rounded(points: Array) -> list[Any]:
+def _round(points: Array) -> list[Any]:
     """Nested lists, to 0.01 mm."""
     rounded: list[Any] = np.round(points, 2).tolist()
     return rounded

@@ -25,7 +25,7 @@ class DrawnScene:
     start: int = 0
 
 
-def drawn_scene(content: ReportContent) -> DrawnScene:
+def describe_scene(content: ReportContent) -> DrawnScene:
     """Describe the scene; the recalibrated rig has one step for each exaggeration of its changes.
 
     Convention: drawn in the factory's rig frame; the recalibrated rig is laid upon the factory's by `content.gauge`.
@@ -37,17 +37,17 @@ def drawn_scene(content: ReportContent) -> DrawnScene:
     start = 0
     if content.recalibrated is not None:
         factors, start = _exaggerations(content, frustum_length(factory, points))
-        steps = tuple(_exaggerated(content, factor) for factor in factors)
+        steps = tuple(_exaggerate(content, factor) for factor in factors)
         rigs.append(DrawnRig("recalibrated", "--after", steps, filled=True))
     scene = rig_scene(rigs, points)
     if points is not None:
-        snapshots, fiducials = drawn_fiducials(content)
+        snapshots, fiducials = choose_fiducials(content)
         names = content.detections.snapshot_names
         scene |= {"groupNames": [f"snapshot {names[s]}" for s in snapshots], "fiducials": fiducials.tolist()}
     return DrawnScene(scene, factors, start)
 
 
-def drawn_fiducials(content: ReportContent) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def choose_fiducials(content: ReportContent) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Choose snapshots and fiducials to draw: indices, evenly spread, all of them where there are few."""
     if content.rig_from_object is None or content.object_points is None:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -63,22 +63,22 @@ def _evenly(count: int, largest: int) -> NDArray[np.int64]:
 
 def _object_points(content: ReportContent, factory: CameraRig) -> Array | None:
     """Fiducials of the drawn snapshots in the factory's rig frame: (S', N', 3) mm."""
-    snapshots, fiducials = drawn_fiducials(content)
+    snapshots, fiducials = choose_fiducials(content)
     if content.recalibrated is None or content.rig_from_object is None or not len(snapshots):
         return None
-    recalibrated, laid = content.recalibrated.to(torch.float64), content.laid
+    recalibrated, laid = content.recalibrated.to(torch.float64), content.aligned_rig
     drawn_from_rig = (recalibrated if laid is None else laid).cam_from_rig[0].inverse() @ recalibrated.cam_from_rig[0]
     points = torch.as_tensor(content.object_points)[fiducials].to(torch.float64)
     poses = content.rig_from_object.to(torch.float64)[torch.as_tensor(snapshots)]
     return drawn_from_rig.apply(poses.apply(points.to(poses.translation.device))).detach().cpu().numpy()
 
 
-def _exaggerated(content: ReportContent, factor: float) -> CameraRig:
+def _exaggerate(content: ReportContent, factor: float) -> CameraRig:
     """Factory cameras, moved by `factor` times their change."""
-    if content.laid is None:
+    if content.aligned_rig is None:
         return content.factory
     factory = content.factory.to(torch.float64)
-    step = content.laid.local(factory).detach()
+    step = content.aligned_rig.local(factory).detach()
     step[..., :6] *= factor
     return factory.retract(step)
 

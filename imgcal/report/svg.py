@@ -121,7 +121,7 @@ def number(value: float) -> str:
     return "0" if rounded == "-0" else rounded
 
 
-def grouped(count: int) -> str:
+def group_digits(count: int) -> str:
     """Write a large number with narrow spaces between thousands."""
     return f"{count:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
 
@@ -132,7 +132,7 @@ def pixels(value: float) -> str:
     return f"{value:.{digits}f}" if value >= 0.01 or value == 0 else f"{value:.2g}"
 
 
-def shortened(name: str, length: int = 16) -> str:
+def shorten_name(name: str, length: int = 16) -> str:
     """Cut a long name for a narrow place."""
     return name if len(name) <= length else name[: length - 1] + "\N{HORIZONTAL ELLIPSIS}"
 

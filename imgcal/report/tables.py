@@ -49,7 +49,7 @@ class CameraRow:
 
 
 @dataclass(frozen=True)
-class Knowledge:
+class KnowledgeRow:
     """How much the data say about one parameter."""
 
     label: str
@@ -84,7 +84,7 @@ def columns(content: ReportContent) -> list[int]:
     return [i for i, name in enumerate(content.factory.parameter_names) if name != "-"]
 
 
-def knowledge(content: ReportContent) -> list[list[Knowledge]]:
+def knowledge_rows(content: ReportContent) -> list[list[KnowledgeRow]]:
     """Compare the standard deviations after and before the data: C rows of `columns`; none when refused."""
     std, prior = content.std, content.prior_std
     if std is None or prior is None:
@@ -97,21 +97,21 @@ def knowledge(content: ReportContent) -> list[list[Knowledge]]:
             parameter = own[i]
             if parameter == "-":
                 tip = f"{name} {content.factory.parameter_names[i]}: not of its lens"
-                cells.append(Knowledge("·", 0, False, tip))
+                cells.append(KnowledgeRow("·", 0, False, tip))
                 continue
             if content.fixed[camera, i]:
                 fixed = "reference" if camera == content.reference and i < 6 else "fixed"
-                cells.append(Knowledge("·", 0, False, f"{name} {parameter}: {fixed}"))
+                cells.append(KnowledgeRow("·", 0, False, f"{name} {parameter}: {fixed}"))
                 continue
             share = 100 * std[camera, i] / prior[camera, i]
             tip = f"{name} {parameter}: ± {std[camera, i]:.3g} after, ± {prior[camera, i]:.3g} before"
             label = f"{share:.0f}" if share >= 1 else "<1"
-            cells.append(Knowledge(label, min(round(share), 100), bool(content.undetermined[camera, i]), tip))
+            cells.append(KnowledgeRow(label, min(round(share), 100), bool(content.undetermined[camera, i]), tip))
         rows.append(cells)
     return rows
 
 
-def signed(value: float, std: float) -> tuple[str, str]:
+def format_signed(value: float, std: float) -> tuple[str, str]:
     """Write a value and its standard deviation to two digits of the latter: ("+7.31", "0.42")."""
     if not (math.isfinite(std) and std > 0):
         return _sign(f"{value:+.3g}"), ""
@@ -132,7 +132,7 @@ def _changes(
     cells = []
     for k, (i, name) in enumerate(zip(range(columns.start, columns.start + len(names)), names, strict=True)):
         spread = math.nan if content.std is None else content.std[camera, i]
-        change, std = signed(content.change[camera, i] * factor, spread * factor)
+        change, std = format_signed(content.change[camera, i] * factor, spread * factor)
         kind = "moved" if content.moved[camera, i] else "unknown" if content.undetermined[camera, i] else ""
         if content.fixed[camera, i]:
             kind = "fixed"

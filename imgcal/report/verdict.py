@@ -12,8 +12,8 @@ from imgcal.pipeline import MOVED
 from imgcal.report.accuracy import advice, length, sentences
 from imgcal.report.charts import duration
 from imgcal.report.content import NOT_IDENTIFIED, ReportContent
-from imgcal.report.sightings import sightings
-from imgcal.report.svg import grouped, pixels
+from imgcal.report.svg import group_digits, pixels
+from imgcal.report.unexplained_blobs import unexplained_sentences
 
 GOOD_CHI2 = 1.5  # above, the residuals are larger than the stated noise
 SMALL_CHI2 = 0.5  # below, the noise was overstated
@@ -60,7 +60,7 @@ class Verdict:
 def judge(content: ReportContent) -> Verdict:
     """Put the result into words."""
     if content.status == "refused" or content.recalibrated is None:
-        return _refused(content)
+        return _refused_verdict(content)
     reservations = _reservations(content)
     identity = IDENTITY.get(content.identity, f"Identity: {content.identity}.")
     found = (_improvement(content), *sentences(content), *_movement(content), identity)
@@ -113,7 +113,7 @@ def _movement(content: ReportContent) -> tuple[str, ...]:
 
 def _reservations(content: ReportContent) -> list[tuple[str, str]]:
     """Reasons for doubt, each with a remedy."""
-    notes = sightings(content)
+    notes = unexplained_sentences(content)
     if content.chi2_per_dof > GOOD_CHI2:
         larger = math.sqrt(content.chi2_per_dof)
         notes.append((
@@ -134,12 +134,12 @@ def _reservations(content: ReportContent) -> list[tuple[str, str]]:
     blind = [name for name, n in zip(content.cameras, content.observations, strict=True) if n == 0]
     if blind:
         notes.append((
-            f"No usable observations in {_listed(blind)}: not recalibrated, still at the factory's values.",
-            f"Bring the object into the view of {_listed(blind)} and check exposure and cabling.",
+            f"No usable observations in {_list_names(blind)}: not recalibrated, still at the factory's values.",
+            f"Bring the object into the view of {_list_names(blind)} and check exposure and cabling.",
         ))  # fmt: skip
     few = [name for name, n in zip(content.cameras, content.observations, strict=True) if 0 < n < FEW_OBSERVATIONS]
     if few:
-        notes.append((f"Few observations in {_listed(few)}.", "Capture more snapshots, seen by all cameras."))
+        notes.append((f"Few observations in {_list_names(few)}.", "Capture more snapshots, seen by all cameras."))
     rejected = sum(bool(s.reason) for s in content.snapshots)
     if rejected > 0.2 * max(len(content.snapshots), 1):
         notes.append((
@@ -171,7 +171,7 @@ def _figures(content: ReportContent) -> tuple[KeyFigure, ...]:
         KeyFigure(f"{before}{pixels(content.rms_after)} px", "reprojection error", note),
         KeyFigure(f"{content.chi2_per_dof:.2f}", "chi² per dof", "1: as the noise says"),
         KeyFigure(f"{used} / {total}", "snapshots used"),
-        KeyFigure(f"{grouped(int(content.used.sum()))} / {grouped(len(content.detections))}", "blobs used"),
+        KeyFigure(f"{group_digits(int(content.used.sum()))} / {group_digits(len(content.detections))}", "blobs used"),
     ]
     predicted = content.predicted
     if predicted is not None and math.isfinite(predicted.median_mm):
@@ -184,7 +184,7 @@ def _figures(content: ReportContent) -> tuple[KeyFigure, ...]:
     return tuple(figures)
 
 
-def _refused(content: ReportContent) -> Verdict:
+def _refused_verdict(content: ReportContent) -> Verdict:
     d = content.detections
     blobs = np.bincount(d.camera, minlength=len(content.cameras))
     labelled = int((content.labels >= 0).sum())
@@ -192,11 +192,11 @@ def _refused(content: ReportContent) -> Verdict:
     used = sum(not s.reason for s in content.snapshots)
     about_all = not content.moves and not content.reason.startswith(NOT_IDENTIFIED)
     figures = [
-        KeyFigure(grouped(total), "snapshots")
+        KeyFigure(group_digits(total), "snapshots")
         if about_all
         else KeyFigure(f"{used} / {total}", f"snapshots {'since the last move' if content.moves else 'accepted'}"),
-        KeyFigure(grouped(len(d)), "blobs found"),
-        *([KeyFigure(grouped(labelled), "blobs labelled")] if content.reason.startswith(NOT_IDENTIFIED) else []),
+        KeyFigure(group_digits(len(d)), "blobs found"),
+        *([KeyFigure(group_digits(labelled), "blobs labelled")] if content.reason.startswith(NOT_IDENTIFIED) else []),
         KeyFigure(f"{int((blobs > 0).sum())} / {len(blobs)}", "cameras with blobs"),
     ]
     if content.seconds:
@@ -222,10 +222,11 @@ def _helpful(content: ReportContent) -> list[str]:
     if total == 0:
         steps.append("No blob was found: check exposure, infrared light, and the polarity (bright or dark markers).")
     elif blind:
-        steps.append(f"Nothing was found in {_listed(blind)}: check exposure, cabling and the view.")
+        steps.append(f"Nothing was found in {_list_names(blind)}: check exposure, cabling and the view.")
     if labelled < 0.5 * total and content.reason.startswith(NOT_IDENTIFIED):
         steps.append(
-            f"{grouped(total - labelled)} of {grouped(total)} blobs could not be labelled: cover or mask reflections, "
+            f"{group_digits(total - labelled)} of {group_digits(total)} blobs could not be labelled: cover or "
+            "mask reflections, "
             "and check that the object file is that of the object in the images."
         )
     if content.reason.startswith(ABOUT_OBJECT):
@@ -239,7 +240,7 @@ def _helpful(content: ReportContent) -> list[str]:
     return steps
 
 
-def _listed(names: list[str]) -> str:
+def _list_names(names: list[str]) -> str:
     shown = names[:4]
     rest = len(names) - len(shown)
     return ", ".join(shown) + (f" and {rest} more" if rest else "")

@@ -1,4 +1,4 @@
-from .arrangements import arranged_positions, arranged_rig, look_at
+from .arrangements import arrange_positions, arrange_rig, look_at
 from .boards import Print, render_board, simulate_board
 from .captures import (
     FrameModel,
@@ -32,7 +32,7 @@ from .rigs import (
     synthesize_at_once,
 )
 from .simulated_rig import SimulatedRig
-from .volumes import place_markers, sample_path, sample_volume, seen_volume, simulate_volume
+from .volumes import find_seen_volume, place_markers, sample_path, sample_volume, simulate_volume
 
 __all__ = [
     "DIFFICULTIES",
@@ -61,10 +61,11 @@ __all__ = [
     "SimulatedRig",
     "Snapshots",
     "Truth",
-    "arranged_positions",
-    "arranged_rig",
+    "arrange_positions",
+    "arrange_rig",
     "degrade_crops",
     "expose_patches",
+    "find_seen_volume",
     "host_generator",
     "join_truths",
     "look_at",
@@ -77,7 +78,6 @@ __all__ = [
     "sample_scenes",
     "sample_volume",
     "second_look",
-    "seen_volume",
     "share_of_good_rigs",
     "simulate_board",
     "simulate_frames",

@@ -51,7 +51,7 @@ def look_at(positions: Tensor, target: Tensor, up: tuple[float, float, float] = 
     return RigidTransform(rotation, -(rotation @ positions[..., None]).squeeze(-1))
 
 
-def arranged_positions(shape: Shape, cameras: int, radius: float, height: float) -> Tensor:
+def arrange_positions(shape: Shape, cameras: int, radius: float, height: float) -> Tensor:
     """Place cameras around the z axis: (C, 3) mm.
 
     Args:
@@ -62,7 +62,7 @@ def arranged_positions(shape: Shape, cameras: int, radius: float, height: float)
         height: mm: z of the circle, the sphere's centre or the line.
 
     Examples:
-        >>> arranged_positions("ring", 4, 1000.0, 500.0)[1].round(decimals=6)
+        >>> arrange_positions("ring", 4, 1000.0, 500.0)[1].round(decimals=6)
         tensor([   0., 1000.,  500.], dtype=torch.float64)
     """
     number = torch.arange(cameras, dtype=torch.float64)
@@ -75,7 +75,7 @@ def arranged_positions(shape: Shape, cameras: int, radius: float, height: float)
     return torch.stack((out * angle.cos(), out * angle.sin(), height + radius * up), dim=-1)
 
 
-def arranged_rig(
+def arrange_rig(
     shape: Shape,
     cameras: int,
     radius: float,
@@ -90,7 +90,7 @@ def arranged_rig(
     """Make a rig of equal cameras that all look at one point.
 
     Args:
-        shape: ring, dome or row; see `arranged_positions`.
+        shape: ring, dome or row; see `arrange_positions`.
         cameras: how many.
         radius: mm.
         height: mm.
@@ -105,7 +105,7 @@ def arranged_rig(
         InputError: no camera or too many; a radius that is not positive; a camera at the target.
 
     Examples:
-        >>> rig = arranged_rig("ring", 8, 4000.0, height=2500.0, target=(0.0, 0.0, 1000.0))
+        >>> rig = arrange_rig("ring", 8, 4000.0, height=2500.0, target=(0.0, 0.0, 1000.0))
         >>> rig.name, rig.num_cameras, rig.volume.low
         ('ring8', 8, (-1068.0..., -1068.0..., 0.0))
     """
@@ -113,7 +113,7 @@ def arranged_rig(
         raise InputError(f"cameras: found {cameras}, expected 1 to {limits.MOST_CAMERAS}")
     if not 1e-3 <= radius <= 1e6:
         raise InputError(f"radius: found {radius:g}, expected 0.001 to 1e+06 mm")
-    positions, middle = arranged_positions(shape, cameras, radius, height), torch.tensor(target, dtype=torch.float64)
+    positions, middle = arrange_positions(shape, cameras, radius, height), torch.tensor(target, dtype=torch.float64)
     cam_from_rig = look_at(positions, middle)
     if volume is None:
         reach = USED / 2 * float((positions - middle).norm(dim=-1).min())

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from imgcal.geometry import RigidTransform, undistort
 from imgcal.synthesis.captures import Frames, Truth
 from imgcal.synthesis.rigs import Drift
-from imgcal.synthesis.volumes import sample_volume, seen_volume
+from imgcal.synthesis.volumes import find_seen_volume, sample_volume
 from imgcal.types import Board, CalibrationObject, CameraRig
 
 Floats = NDArray[np.float64]
@@ -100,7 +100,7 @@ def _places(rig: CameraRig, count: int, generator: torch.Generator) -> torch.Ten
         inside = torch.cat((unit[:, :2] * reach, torch.ones_like(unit[:, :1])), 1) * distance[:, None]
         turned = (rig.cam_from_rig.rotation[camera].double().mT @ inside[..., None])[..., 0]
         return rig.positions[camera].double() + turned
-    return sample_volume(rig.volume or seen_volume(rig), count, generator)
+    return sample_volume(rig.volume or find_seen_volume(rig), count, generator)
 
 
 def _facing(away: Floats, right: Floats) -> Floats:

@@ -80,15 +80,15 @@ def render_views(
     shape = (options.size, options.size)
     if torch.is_grad_enabled() and points.requires_grad:
         images = splat(points, colours, options.dot, shape, visible=seen, out=out).clamp(0, 1)
-        return images + (as_saved(images.detach().clone()) - images.detach()) if quantise else images
+        return images + (round_to_grey_levels(images.detach().clone()) - images.detach()) if quantise else images
     # Rounded to 8 bit before anything coarser: a bfloat16 buffer would round first.
     direct = out is None or not quantise or out.dtype == points.dtype
     images = splat(points, colours, options.dot, shape, visible=seen, out=out if direct else None).clamp_(0, 1)
     if quantise:
-        images = as_saved(images)
+        images = round_to_grey_levels(images)
     return images if direct or out is None else out.copy_(images)
 
 
-def as_saved(images: Tensor) -> Tensor:
+def round_to_grey_levels(images: Tensor) -> Tensor:
     """Round images in [0, 1] to grey levels, in place."""
     return images.mul_(GREY_LEVELS).round_().div_(GREY_LEVELS)

@@ -53,10 +53,10 @@ class Corruption(StrictRecord):
         draws = torch.rand((6, *seen.shape), generator=generator, dtype=uv.dtype, device=uv.device)
         noise = torch.randn(uv.shape, generator=generator, dtype=uv.dtype, device=uv.device)
         if self.nothing:
-            return Corrupted(Views(uv=_hidden(uv, seen), seen=seen), seen, torch.zeros_like(seen, dtype=torch.uint8))
+            return Corrupted(Views(uv=_hide(uv, seen), seen=seen), seen, torch.zeros_like(seen, dtype=torch.uint8))
         uv = uv + self.noise * noise
         seen = seen & (draws[0] >= self.missing)
-        source = _exchanged(seen, self.swapped, draws[1], draws[2])
+        source = _exchange(seen, self.swapped, draws[1], draws[2])
         own = torch.arange(seen.shape[-1], device=uv.device)
         uv = uv.gather(-2, source[..., None].expand(uv.shape))
         false = seen & (draws[3] < self.false)
@@ -64,7 +64,7 @@ class Corruption(StrictRecord):
         uv = torch.where(false[..., None], anywhere * image_size.to(uv)[:, None] - 0.5, uv)
         fault = (source != own).to(torch.uint8) * SWAPPED
         fault = torch.where(false, FALSE, fault)
-        return Corrupted(Views(uv=_hidden(uv, seen), seen=seen), seen & (fault == 0), fault)
+        return Corrupted(Views(uv=_hide(uv, seen), seen=seen), seen & (fault == 0), fault)
 
 
 @dataclass(frozen=True)
@@ -76,12 +76,12 @@ class Corrupted:
     fault: Tensor  # (B, C, N) uint8: 0, SWAPPED or FALSE; means nothing where not seen
 
 
-def _hidden(uv: Tensor, seen: Tensor) -> Tensor:
+def _hide(uv: Tensor, seen: Tensor) -> Tensor:
     """Remove the positions of unseen fiducials, so that nothing can learn from them."""
     return torch.where(seen[..., None], uv, 0.0)
 
 
-def _exchanged(seen: Tensor, share: float, order: Tensor, chance: Tensor) -> Tensor:
+def _exchange(seen: Tensor, share: float, order: Tensor, chance: Tensor) -> Tensor:
     """For each fiducial (*B, N) the one whose place it takes: itself, or its partner in a random pair of seen ones.
 
     A pair is exchanged with the probability that makes `share` of the seen ones exchanged on average; of an odd number

@@ -136,7 +136,7 @@ def _photograph(place: Tensor, radius: Tensor, draw: Draw) -> tuple[Tensor, Tens
         torch.where(draw.unit(*batch, false, 1) < 0.5, velocity[:, :, None], 0.0).expand(*batch, false, 2),
         torch.full((*batch, false), 9.0, device=place.device),
     )
-    light = _drawn(_joined(markers, strays), blur, draw) + _background(batch, draw)
+    light = _add_spots(_joined(markers, strays), blur, draw) + _background(batch, draw)
     light = light.clamp(max=draw.between(0.7, 3.0, *batch)[..., None, None])
     noise = draw.between(math.log(0.0015), math.log(0.22), *batch).exp()
     shot = draw.often(0.5, 1.0, *batch)[..., None, None] * light.clamp(min=0)
@@ -181,7 +181,7 @@ def degrade_crops(
         torch.zeros(*batch, dots, 2, device=crops.device),
         torch.full((*batch, dots), 9.0, device=crops.device),
     )
-    light = light + _drawn(spots, draw.between(0.3, 0.8, *batch), draw)[:, 0]
+    light = light + _add_spots(spots, draw.between(0.3, 0.8, *batch), draw)[:, 0]
     cover, level = _drapes(count, draw)
     light = light + cover * (level[:, None, None] - light)
     where = place.round().clamp(0, SIZE - 1).long()
@@ -236,7 +236,7 @@ def _joined(*parts: _Spots) -> _Spots:
     return _Spots(*(torch.cat([getattr(part, name) for part in parts], dim=2) for name in _Spots.__dataclass_fields__))
 
 
-def _drawn(spots: _Spots, blur: Tensor, draw: Draw) -> Tensor:
+def _add_spots(spots: _Spots, blur: Tensor, draw: Draw) -> Tensor:
     """Add up spots, each in a window of its own: (B, C, S, S)."""
     batch, count = spots.radius.shape[:2], spots.radius.shape[2]
     corner = spots.place.detach().clamp(-PATCH, SIZE + PATCH).round() - PATCH // 2

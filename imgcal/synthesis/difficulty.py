@@ -10,7 +10,7 @@ from torch import Tensor
 
 from imgcal.geometry import RigidTransform
 from imgcal.types import CameraRig
-from renderers import BlobRange, ClutterModel, SensorModel, Smear, Spots, Surface, draped
+from renderers import BlobRange, ClutterModel, SensorModel, Smear, Spots, Surface, drape_spots
 
 Interval = tuple[float, float]
 NONE: Interval = (0.0, 0.0)
@@ -91,7 +91,8 @@ class Difficulty:
             return None
         like = rig.focal_length
         before, after = (
-            rig.project(pose.apply(points), radius).uv for pose in self._moved(rig_from_object, points, generator)
+            rig.project(pose.apply(points), radius).uv
+            for pose in self._exposure_poses(rig_from_object, points, generator)
         )
         path = (after - before) / MOMENT
         defocus = _uniform(self.defocus, generator, rig.num_cameras, 1).to(like).expand(path.shape[:-1])
@@ -117,7 +118,7 @@ class Difficulty:
             return markers
         return replace(markers, surface=surface)
 
-    def _moved(
+    def _exposure_poses(
         self, pose: RigidTransform, points: Tensor, generator: torch.Generator
     ) -> tuple[RigidTransform, RigidTransform]:
         """Two poses a `MOMENT` of the exposure apart, around the one in its middle."""
@@ -146,7 +147,7 @@ class Difficulty:
 
 def behind_drapes(markers: Spots, drapes: Tensor | None) -> Spots:
     """Cut markers at the edges of drapes, if there are any."""
-    return markers if drapes is None else draped(markers, drapes)
+    return markers if drapes is None else drape_spots(markers, drapes)
 
 
 def _uniform(interval: tuple[float, float], generator: torch.Generator, *shape: int) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from imgcal.io import StrictRecord
-from imgcal.synthesis.colour_coding import ImageOptions, as_saved
+from imgcal.synthesis.colour_coding import ImageOptions, round_to_grey_levels
 from imgcal.synthesis.corruption import Corrupted, Corruption
 from imgcal.types import CalibrationObject, Views
 from renderers import splat
@@ -79,7 +79,7 @@ class Degradation(StrictRecord):
         uv, seen = drawn.views.uv, drawn.views.seen
         assert uv is not None and seen is not None
         images = self._dots(options.from_sensor(uv, image_size), seen, obj.colours.to(uv), options, generator)
-        return as_saved(self._degraded(images.flatten(0, 1), generator).view_as(images)), drawn
+        return round_to_grey_levels(self._degrade(images.flatten(0, 1), generator).view_as(images)), drawn
 
     def _dots(
         self, uv: Tensor, seen: Tensor, colours: Tensor, options: ImageOptions, generator: torch.Generator
@@ -105,7 +105,7 @@ class Degradation(StrictRecord):
             visible=torch.cat((seen, there), dim=-1),
         )
 
-    def _degraded(self, images: Tensor, generator: torch.Generator) -> Tensor:
+    def _degrade(self, images: Tensor, generator: torch.Generator) -> Tensor:
         """Background, blur, noise and compression of images (I, 3, H, W)."""
         count, _, height, width = images.shape
         like: dict[str, Any] = {"generator": generator, "dtype": images.dtype, "device": images.device}
@@ -117,12 +117,12 @@ class Degradation(StrictRecord):
             smooth = functional.interpolate(coarse, (height, width), mode="bicubic", align_corners=False)
             images = images + self.background * strength[0] * smooth
         if self.blur:
-            images = _blurred(images, self.blur * strength[1], self.blur)
+            images = _blur(images, self.blur * strength[1], self.blur)
         if self.pixel_noise:
             noise = torch.randn(images.shape, **like)
             images = images + self.pixel_noise * strength[2] * noise
         images = images.clamp(0, 1)
-        return _compressed(images, self.jpeg, generator) if self.jpeg else images
+        return _compress(images, self.jpeg, generator) if self.jpeg else images
 
 
 _NOISY = Corruption(noise=0.1)
@@ -145,7 +145,7 @@ LEVELS: tuple[Degradation, ...] = (
 dots; 3 blur, background, merged dots; 4 more of all that, exchanged labels, JPEG."""
 
 
-def _blurred(images: Tensor, sigma: Tensor, largest: float) -> Tensor:
+def _blur(images: Tensor, sigma: Tensor, largest: float) -> Tensor:
     """Blur each image (I, 3, H, W) with its own Gaussian, sigma (I, 1, 1, 1) pixels."""
     reach = max(1, round(BLUR_REACH * largest))
     offset = torch.arange(-reach, reach + 1, device=images.device, dtype=images.dtype)
@@ -157,7 +157,7 @@ def _blurred(images: Tensor, sigma: Tensor, largest: float) -> Tensor:
     return functional.conv2d(flat, each[..., None, :], groups=count * channels).view_as(images)
 
 
-def _compressed(images: Tensor, least: int, generator: torch.Generator) -> Tensor:
+def _compress(images: Tensor, least: int, generator: torch.Generator) -> Tensor:
     """Save and load images (I, 3, H, W) as JPEG, each with its own quality."""
     from kornia.enhance import jpeg_codec_differentiable  # slow to import, and only the last level needs it
 

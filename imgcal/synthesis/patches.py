@@ -35,7 +35,7 @@ class Patches:
     offset: Tensor  # (M, 2) patch pixels, from the middle of the patch to the marker's centre
     kind: Tensor  # (M,) BlobKind
 
-    def take(self, rows: Tensor) -> Patches:
+    def select(self, rows: Tensor) -> Patches:
         """Keep some patches."""
         return Patches(*(getattr(self, field.name)[rows] for field in fields(self)))
 
@@ -140,7 +140,7 @@ def _chunk(count: int, trouble: Trouble, draw: Draw) -> Patches:
         smear = Smear(path[:, None], (draw.often(0.5, DEFOCUS, count) * expected)[:, None])
     spots = Spots(offset[:, None], (root @ root.mT)[:, None], light, light > 0, light, surface, smear)
     if trouble.merged or trouble.company:
-        spots = _with_neighbour(spots, expected, (0.7, 2.0) if trouble.merged else (2.3, 4.0), draw)
+        spots = _add_neighbour(spots, expected, (0.7, 2.0) if trouble.merged else (2.3, 4.0), draw)
     size = 1.2 * trouble.radius * (FACTORS[1] * 5.0**0.5 if trouble.false else 1.3)
     reach = size + (1.2 * trouble.radius * (PATH / 2 + DEFOCUS) if trouble.smeared else 0.0)
     middle = torch.zeros(count, 2, device=radius.device)
@@ -166,7 +166,7 @@ def _bumps(count: int, draw: Draw) -> Tensor:
     return torch.cat([place, draw.between(0.15, 0.5, count, 3, 1), draw.between(-0.9, 0.6, count, 3, 1)], dim=-1)
 
 
-def _with_neighbour(marker: Spots, radius: Tensor, away: tuple[float, float], draw: Draw) -> Spots:
+def _add_neighbour(marker: Spots, radius: Tensor, away: tuple[float, float], draw: Draw) -> Spots:
     """Put another blob behind markers (M, 1), with their surface and smear, `away` radii from them."""
     count = len(radius)
     to = draw.direction(count, of=2) * (radius * draw.between(*away, count))[:, None]

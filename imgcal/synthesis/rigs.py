@@ -17,7 +17,7 @@ from torch import Tensor
 from imgcal.errors import InputError, RefusedError
 from imgcal.geometry import Projection, RigidTransform, euler_from_rotation, rotate, rotation_from_euler
 from imgcal.io import StrictRecord
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 from imgcal.synthesis.physical_drift import PhysicalDrift
 from imgcal.types import CalibrationObject, CameraRig
 
@@ -127,7 +127,7 @@ class RelativeDrift(StrictRecord):
         )
 
 
-def drift_of(block: Any) -> Any:
+def make_drift(block: Any) -> Any:
     """Make a drift from the block of an experiment file; values that are not named do not drift.
 
     Args:
@@ -139,7 +139,7 @@ def drift_of(block: Any) -> Any:
     if isinstance(block, RelativeDrift | PhysicalDrift):
         return block
     if not isinstance(block, Mapping):
-        raise ValueError(f"found {shortened(repr(block))}, expected kappas or physical units by name")
+        raise ValueError(f"found {shorten(repr(block))}, expected kappas or physical units by name")
     values = {name: value for name, value in block.items() if value is not None}
     named = sorted(map(str, values))
     relative = [name for name in named if name.startswith("kappa")]
@@ -150,7 +150,7 @@ def drift_of(block: Any) -> Any:
     return TypeAdapter(kind).validate_python({field.name: 0.0 for field in fields(kind)} | values)
 
 
-Drift = Annotated[RelativeDrift | PhysicalDrift, BeforeValidator(drift_of)]
+Drift = Annotated[RelativeDrift | PhysicalDrift, BeforeValidator(make_drift)]
 """A value in Python; in an experiment file the block `drift`."""
 
 

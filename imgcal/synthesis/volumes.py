@@ -96,7 +96,7 @@ def simulate_volume(
         (torch.Size([5, 10, 4, 2]), True)
     """
     true_rig = rig if drift is None else drift.apply(rig, generator)
-    volume = volume or rig.volume or seen_volume(rig)
+    volume = volume or rig.volume or find_seen_volume(rig)
     points = obj.points.to(rig.focal_length)
     centroid = points.mean(0)
     motion: Motion | None = None
@@ -129,7 +129,7 @@ def place_markers(rig: CameraRig, count: int, generator: torch.Generator) -> Cal
     if rig.volume is None and rig.working_distance is not None:
         side = BODY * rig.working_distance
     else:
-        volume = rig.volume or seen_volume(rig)
+        volume = rig.volume or find_seen_volume(rig)
         side = BODY * min(b - a for a, b in zip(volume.low, volume.high, strict=True))
     unit = torch.rand(count, 3, generator=generator, dtype=torch.float64)
     return CalibrationObject((unit - 0.5) * side, palette(count).double(), name="body")
@@ -158,7 +158,7 @@ def sample_volume(volume: Volume, count: int, generator: torch.Generator) -> Ten
     return found[:count]
 
 
-def seen_volume(rig: CameraRig) -> Volume:
+def find_seen_volume(rig: CameraRig) -> Volume:
     """Find a volume for a rig whose file gives none: a box about what most of its cameras see together.
 
     Raises:
@@ -166,7 +166,7 @@ def seen_volume(rig: CameraRig) -> Volume:
 
     Examples:
         >>> import imgcal
-        >>> box = seen_volume(imgcal.load_rig("T4"))
+        >>> box = find_seen_volume(imgcal.load_rig("T4"))
         >>> 0 < box.low[2] < box.high[2]
         True
     """

@@ -1,12 +1,12 @@
 from .callbacks import Callbacks, DivergedError
-from .engine import Run, finished, prepare, progress, train, train_step
+from .engine import Run, is_finished, prepare, progress, train, train_step
 from .experiment import Experiment
-from .experiment_file import KINDS, changed, load_experiment, save_experiment
+from .experiment_file import KINDS, change_experiment, load_experiment, save_experiment
 from .frame_dataset import CARD, HELD_OUT, TRAIN, FrameDataset, adaptation, load_frames, load_splits
 from .infrared_task import InfraredExperiment, InfraredTask
 from .labelled_crops import harvest
 from .measurer_task import MeasurerExperiment, MeasurerTask
-from .rigs import RigExperiment, RigTask, experiment_of
+from .rigs import RigExperiment, RigTask, checkpoint_experiment
 from .state import TrainingState, load_state, save_state
 from .task import Loss, Result, Task
 
@@ -31,10 +31,10 @@ __all__ = [
     "Task",
     "TrainingState",
     "adaptation",
-    "changed",
-    "experiment_of",
-    "finished",
+    "change_experiment",
+    "checkpoint_experiment",
     "harvest",
+    "is_finished",
     "load_experiment",
     "load_frames",
     "load_splits",

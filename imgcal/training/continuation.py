@@ -12,7 +12,7 @@ from imgcal.training.run import Best, Run
 from imgcal.training.state import TrainingState, random_states, restore_random_states
 
 
-def state_of(run: Run) -> TrainingState:
+def gather_state(run: Run) -> TrainingState:
     """Gather the state; all processes must call this together, and the main one's is whole."""
     gathered = {
         name: run.accelerator.gather(state.to(run.accelerator.device)[None])

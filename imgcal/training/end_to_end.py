@@ -7,7 +7,7 @@ from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.nn import project_fiducials, rms_per_axis
-from imgcal.refinement import as_prediction, refine_points
+from imgcal.refinement import make_prediction, refine_points
 from imgcal.training.data import RigBatch, Source
 from imgcal.training.losses import RefinedLoss
 from imgcal.types import Prediction
@@ -15,7 +15,7 @@ from imgcal.types import Prediction
 WORST = 200.0  # pixels: where the error of a refined rig stops to count
 
 
-def refined_loss(
+def end_to_end_loss(
     prediction: Prediction, batch: RigBatch, source: Source, prior_std: Tensor, config: RefinedLoss
 ) -> Tensor | float:
     """Weigh every fiducial as the network says, estimate the rig, and compare it with the truth.
@@ -45,7 +45,7 @@ def refined_loss(
         sigma = config.sigma * prediction.log_sigma.double().exp()
         fit = refine_points(prediction, batch.views, source.factory, source.obj, prior_std, sigma)
         truth = project_fiducials(batch.truth.cameras_from_object, source.obj).double()
-        re = rms_per_axis(project_fiducials(as_prediction(fit).cameras_from_object, source.obj) - truth)
+        re = rms_per_axis(project_fiducials(make_prediction(fit).cameras_from_object, source.obj) - truth)
         counts = fit.converged & (re < WORST)
         error = torch.where(counts, torch.log1p(torch.where(counts, re, 0.0)), 0.0)
         return config.weight * (error.sum() / counts.sum().clamp_min(1)).float()

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from imgcal.errors import InputError, RefusedError
 from imgcal.networks import drawing_from
 from imgcal.training.callbacks import Callbacks, DivergedError
-from imgcal.training.continuation import restore, state_of
+from imgcal.training.continuation import gather_state, restore
 from imgcal.training.experiment import Experiment, TrainingConfig
 from imgcal.training.optimization import Schedule, freeze, learning, make_average, make_optimizer, update_average
 from imgcal.training.run import Best, Pending, Run
@@ -45,7 +45,7 @@ def train(
         should_stop: asked after every step of the main process; True = make a checkpoint and return early.
 
     Returns:
-        The run as it ended; `finished(run, run.seconds)` tells whether it came to its end.
+        The run as it ended; `is_finished(run, run.seconds)` tells whether it came to its end.
 
     Raises:
         InputError: unusable experiment, or a state that does not belong to it.
@@ -67,19 +67,19 @@ def _take_steps(run: Run, told: Callbacks, should_stop: Callable[[], bool]) -> N
     due = run.experiment.training
     seconds, stop = run.seconds, False
     logged = (run.step, seconds)
-    while not (stop or finished(run, seconds)):
+    while not (stop or is_finished(run, seconds)):
         run.schedule.set_progress(progress(run, seconds))
         train_step(run)
-        seconds, stop = _agreed(run, should_stop())
+        seconds, stop = _agree(run, should_stop())
         told.on_step(run, seconds)
-        last = stop or finished(run, seconds)
+        last = stop or is_finished(run, seconds)
         extra = run.step % due.log_every != 0
         if last or not extra:
             logged = _log(run, told, logged, seconds, extra)
         extra = run.step % due.validate_every != 0
         if last or not extra:
             validate(run, told, extra)
-        last = last or finished(run, seconds)
+        last = last or is_finished(run, seconds)
         if last and not stop:
             _check_result(run)
         if last or run.step % due.save_every == 0:
@@ -92,7 +92,7 @@ def prepare(experiment: Experiment, state: TrainingState | None = None) -> Run:
     # Without a GPU, accelerate joins several processes only if `cpu` is set.
     accelerator = Accelerator(cpu=settings.device == "cpu" or not torch.accelerator.is_available())
     device, processes = accelerator.device, accelerator.num_processes
-    batch_size = _at_once(settings, processes)
+    batch_size = _micro_batch_size(settings, processes)
     weights = torch.Generator().manual_seed(settings.seed)
     task = experiment.make_task(device, batch_size, weights, fresh=state is None)
     freeze(task.network, experiment.optimizer.freeze)
@@ -137,7 +137,7 @@ def stream_seeds(seed: int, process: int) -> tuple[int, int]:
     return seed * 4096 + process, int(layers)
 
 
-def _at_once(settings: TrainingConfig, processes: int) -> int:
+def _micro_batch_size(settings: TrainingConfig, processes: int) -> int:
     """The part of a batch that a process feeds to its network at once."""
     parts = processes * settings.accumulate
     if settings.batch_size % parts:
@@ -228,10 +228,10 @@ def validation(run: Run, network: nn.Module) -> dict[str, float]:
 
 
 def validate(run: Run, told: Callbacks, extra: bool) -> None:
-    """Report the errors of the weights that would be the result now; see `_tell`."""
+    """Report the errors of the weights that would be the result now; see `_record`."""
     check_finite(run)
     if run.accelerator.is_main_process and (found := validation(run, run.candidate)):
-        _tell(run, told, {"step": run.step, **found}, extra)
+        _record(run, told, {"step": run.step, **found}, extra)
     if run.experiment.training.patience is not None:
         _keep_best(run, extra)
 
@@ -282,7 +282,7 @@ def _check_result(run: Run) -> None:
 def save(run: Run, told: Callbacks) -> None:
     """Pass on the state, and the network that would be the result now; all processes must call this together."""
     check_finite(run)
-    state = state_of(run)
+    state = gather_state(run)
     if run.accelerator.is_main_process:
         told.on_checkpoint(run, state, run.task.result(*run.chosen))
 
@@ -295,7 +295,7 @@ def progress(run: Run, seconds: float) -> float:
     return min(max(by_steps, by_time), 1.0)
 
 
-def finished(run: Run, seconds: float) -> bool:
+def is_finished(run: Run, seconds: float) -> bool:
     """Tell whether the run has ended or stopped improving."""
     patience = run.experiment.training.patience
     exhausted = run.best is not None and patience is not None and run.best.since >= patience
@@ -317,7 +317,7 @@ def _account(run: Run, rows: list[dict[str, Tensor]]) -> None:
         run.judged = None
 
 
-def _agreed(run: Run, stop: bool) -> tuple[float, bool]:
+def _agree(run: Run, stop: bool) -> tuple[float, bool]:
     """The main process's clock and stop request, shared with all processes."""
     if run.accelerator.num_processes == 1:
         return run.seconds, stop
@@ -326,7 +326,7 @@ def _agreed(run: Run, stop: bool) -> tuple[float, bool]:
     return seconds, bool(stopping)
 
 
-def _tell(run: Run, told: Callbacks, row: dict[str, Any], extra: bool) -> None:
+def _record(run: Run, told: Callbacks, row: dict[str, Any], extra: bool) -> None:
     """Keep plain values and pass them on. An `extra` row is written because the run ends here, for now."""
     run.latest |= row
     run.told = row if run.told.get("step") != run.step else run.told | row
@@ -347,5 +347,5 @@ def _log(run: Run, told: Callbacks, logged: tuple[int, float], seconds: float, e
     row["lr"] = max(group["lr"] for group in run.optimizer.param_groups)
     row[f"{run.task.unit}_per_s"] = steps * run.experiment.training.batch_size / max(duration, 1e-9)
     row["seconds"] = seconds
-    _tell(run, told, row, extra)
+    _record(run, told, row, extra)
     return run.step, seconds

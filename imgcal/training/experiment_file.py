@@ -15,11 +15,11 @@ from imgcal.io import (
     nearest,
     parse_yaml,
     read_yaml_mapping,
-    validated,
+    validate,
     write_text,
     yaml_text,
 )
-from imgcal.messages import quoted
+from imgcal.messages import quote
 from imgcal.training.experiment import Experiment
 from imgcal.training.infrared_task import InfraredExperiment
 from imgcal.training.measurer_task import MeasurerExperiment
@@ -67,15 +67,15 @@ def load_experiment(
     """
     path = find_file(path, "experiments", ".yaml")
     content = read_yaml_mapping(path, FORMAT)
-    content |= {key: _found(content[key], path.parent) for key in ("rig", "object") if key in content}
-    experiment = changed(experiment_from(content, str(path)), *changes)
+    content |= {key: _find_file(content[key], path.parent) for key in ("rig", "object") if key in content}
+    experiment = change_experiment(parse_experiment(content, str(path)), *changes)
     if not isinstance(experiment, kind):
         names = ", ".join(name for name, one in KINDS.items() if issubclass(one, kind))
         raise InputError(f"{path}: task: found {experiment.task}, expected {names}")
     return experiment
 
 
-def experiment_from(content: Mapping[str, Any], where: str) -> Experiment:
+def parse_experiment(content: Mapping[str, Any], where: str) -> Experiment:
     """Validate the plain values of an experiment; errors begin with `where`.
 
     Raises:
@@ -84,28 +84,28 @@ def experiment_from(content: Mapping[str, Any], where: str) -> Experiment:
     task = content.get("task", "rig")
     if not isinstance(task, str) or task not in KINDS:
         hint = nearest(str(task), KINDS) or f", expected one of {', '.join(KINDS)}"
-        raise InputError(f"{where}: task: found {quoted(repr(task))}{hint}")
-    return validated(dict(content), KINDS[task], where)
+        raise InputError(f"{where}: task: found {quote(repr(task))}{hint}")
+    return validate(dict(content), KINDS[task], where)
 
 
-def changed(experiment: Kind, *changes: str) -> Kind:
+def change_experiment(experiment: Kind, *changes: str) -> Kind:
     """Set values of an experiment: `training.steps=100`, `drift={rotation_deg: 0.5}`; validated when all are set."""
     if not changes:
         return experiment
-    content = as_written(experiment)
+    content = written_values(experiment)
     for change in changes:
         _apply(content, change)
-    return validated(content, type(experiment), f"--set {quoted(' '.join(changes))}")
+    return validate(content, type(experiment), f"--set {quote(' '.join(changes))}")
 
 
-def as_written(experiment: Experiment) -> dict[str, Any]:
+def written_values(experiment: Experiment) -> dict[str, Any]:
     """The plain values of the blocks that were given, without defaults where a block knows what it was given."""
     return experiment.model_dump(exclude_unset=True)
 
 
 def resolved_text(experiment: Experiment) -> str:
     """All values, defaults included, as YAML."""
-    values = _resolved(experiment)
+    values = _resolve(experiment)
     return yaml_text({name: values[name] for name in dict.fromkeys((*ORDER, *values)) if name in values})
 
 
@@ -114,14 +114,14 @@ def save_experiment(experiment: Experiment, path: str | Path) -> None:
     write_text(path, resolved_text(experiment))
 
 
-def _found(name: Any, folder: Path) -> Any:
+def _find_file(name: Any, folder: Path) -> Any:
     """The path of a file that an experiment in `folder` names; the name as it is where no file lies there."""
     if not isinstance(name, str) or Path(name).exists() or not (folder / name).is_file():
         return name
     return str(folder / name)
 
 
-def _resolved(model: StrictModel) -> dict[str, Any]:
+def _resolve(model: StrictModel) -> dict[str, Any]:
     """All values but those that are None because nothing was given: a None that switches something off stays."""
     fields = type(model).model_fields
     values = {name: value for name, value in model if value is not None or fields[name].default is not None}
@@ -130,14 +130,14 @@ def _resolved(model: StrictModel) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, StrictModel):
-        return _resolved(value)
+        return _resolve(value)
     if isinstance(value, StrictRecord):
         return {name: _plain(field) for name, field in vars(value).items()}
     return Flow(value) if isinstance(value, list | tuple) else value
 
 
 def _apply(content: dict[str, Any], change: str) -> None:
-    where = f"--set {quoted(change)}"
+    where = f"--set {quote(change)}"
     key, equals, text = change.partition("=")
     steps = key.strip().split(".")
     if not equals or not all(steps):
@@ -149,6 +149,6 @@ def _apply(content: dict[str, Any], change: str) -> None:
         record = record[step]
         if not isinstance(record, dict):
             raise InputError(
-                f"{where}: found the value {quoted(repr(record))} at `{quoted(step)}`, expected a group of keys"
+                f"{where}: found the value {quote(repr(record))} at `{quote(step)}`, expected a group of keys"
             )
     record[steps[-1]] = parse_yaml(text, where)

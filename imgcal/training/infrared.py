@@ -29,7 +29,7 @@ class QueryLosses:
         return self.cell + 0.5 * self.offset + 0.3 * self.likelihood + 0.5 * self.presence
 
 
-def queries_of(truth: CropTruth) -> Queries:
+def make_queries(truth: CropTruth) -> Queries:
     """Ask for all fiducials of rendered crops: (P, N), P = B C; what is expected outside the crop is not asked for."""
     inside = ((truth.expected > -0.5) & (truth.expected < truth.placement.size - 0.5)).all(-1) & truth.radius.isfinite()
     asked = inside & (truth.radius > 0)

@@ -18,13 +18,13 @@ from imgcal.networks import (
     InfraredNetwork,
     Queries,
     drawing_from,
-    normalized,
+    normalize_crops,
     warm_start,
 )
 from imgcal.synthesis import degrade_crops, host_generator, render_crops, sample_scenes, second_look
 from imgcal.training.experiment import Experiment, Fraction
 from imgcal.training.frame_dataset import FrameDataset, expect_elsewhere, load_splits, turn
-from imgcal.training.infrared import evidence_at_best, queries_of, query_losses
+from imgcal.training.infrared import evidence_at_best, make_queries, query_losses
 from imgcal.training.task import Loss, Task
 
 SECOND_LOOKS = 0.5  # share of the batches, as after a rig was fitted to a first look
@@ -129,7 +129,7 @@ class InfraredTask(Task[CropBatch, Evidence]):
         truth = second_look(truth, generator) if second else truth
         crops, place, seen = (part.flatten(0, 1) for part in (truth.crops, truth.place, truth.seen))
         window = self.network.config.close_window if second else None
-        return CropBatch(normalized(crops), queries_of(truth), place, seen, window)
+        return CropBatch(normalize_crops(crops), make_queries(truth), place, seen, window)
 
     def _batch_of_frames(self, crops: FrameDataset, generator: torch.Generator) -> CropBatch:
         """Make crops of real frames harder, and ask for their fiducials from elsewhere."""
@@ -138,7 +138,7 @@ class InfraredTask(Task[CropBatch, Evidence]):
         second = float(torch.rand((), generator=host_generator(generator))) < SECOND_LOOKS
         window = self.network.config.close_window if second else None
         queries = expect_elsewhere(crops, generator, near=second)
-        return CropBatch(normalized(light), queries, crops.place, seen, window)
+        return CropBatch(normalize_crops(light), queries, crops.place, seen, window)
 
     def predict(self, network: nn.Module, batch: CropBatch) -> Evidence:
         """Say where the fiducials are."""

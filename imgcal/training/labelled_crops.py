@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from imgcal.association import Associations, PipelineOptions, Progress, Sight, associate, observations_of
+from imgcal.association import Associations, PipelineOptions, Progress, Sight, accepted_observations, associate
 from imgcal.detection import DetectionOptions, Frame
 from imgcal.errors import RefusedError
 from imgcal.estimation import estimate
@@ -98,7 +98,7 @@ def fit_poses(
     Raises:
         RefusedError: no pose fits.
     """
-    observations, poses = observations_of(labelled, rig, obj)
+    observations, poses = accepted_observations(labelled, rig, obj)
     fixed = torch.zeros(*rig.distortion.shape[:-1], rig.num_parameters, dtype=rig.distortion.dtype)
     fit = estimate(observations, rig, obj.taken_as_exact(), poses, prior_std=fixed, options=options.estimation)
     if not bool(fit.converged):
@@ -196,12 +196,12 @@ def _cut(
     aside = ASIDE * far * torch.randn(1, 3, generator=generator, dtype=torch.float64)
     near = RigidTransform(rotation_from_vector(turn) @ pose.rotation, pose.translation + aside)
     tiles = Tiles.of_object(rig, obj, near, size)
-    queries = tiles.of(Expectation.of(rig, obj, pose, tiles.usual)).queries(tiles.placement)
+    queries = tiles.arrange_expected(Expectation.of(rig, obj, pose, tiles.usual)).queries(tiles.placement)
     names = tuple(rig.camera_names[camera] for camera in tiles.camera.tolist())
     light = cut_crops(frames, names, tiles.placement, inverted=detection.polarity == "dark")
     shown = seen[tiles.camera[:, None], tiles.fiducial] & queries.asked
     blur = (sigma[tiles.camera] / tiles.placement.scale[:, None]).float().expand_as(queries.radius)
-    light, usable = _in_units_of_markers(light, queries.place, shown)
+    light, usable = _normalize_light(light, queries.place, shown)
     kept = (usable & (blur[:, 0] < LARGEST_SIGMA)).nonzero()[:, 0]
     nowhere = torch.zeros(len(kept), dtype=torch.int64)
     return FrameDataset(
@@ -210,7 +210,7 @@ def _cut(
     )  # fmt: skip
 
 
-def _in_units_of_markers(light: Tensor, place: Tensor, shown: Tensor) -> tuple[Tensor, Tensor]:
+def _normalize_light(light: Tensor, place: Tensor, shown: Tensor) -> tuple[Tensor, Tensor]:
     """Measure light (T, S, S) from its ground, in units of the median marker; say where there are enough markers."""
     size = light.shape[-1]
     ground = light.flatten(1).nanmedian(1).values.nan_to_num()

@@ -108,7 +108,7 @@ def compound(
         weights: parameters of the network, for the L1 regularizer.
     """
     with torch.autocast(truth.rig.focal_length.device.type, enabled=False):
-        predicted = _stacked(predictions)  # (T, B)
+        predicted = _stack_passes(predictions)  # (T, B)
         cameras, true_cameras = predicted.cameras_from_object, truth.cameras_from_object
         difference = project_fiducials(cameras, obj) - project_fiducials(true_cameras, obj)
         re = rms_per_axis(difference)  # (T, B)
@@ -246,7 +246,7 @@ def _extra_terms(cameras: CameraRig, true_cameras: CameraRig, config: LossConfig
     return terms
 
 
-def _stacked(predictions: Sequence[Prediction]) -> Prediction:
+def _stack_passes(predictions: Sequence[Prediction]) -> Prediction:
     """Put passes on an axis of their own, in float32 or better: (T, B)."""
     return Prediction.combine(predictions, _stack)
 

@@ -18,7 +18,7 @@ from imgcal.networks import (
     MeasurerCheckpoint,
     MeasurerConfig,
     drawing_from,
-    normalized,
+    normalize_crops,
     warm_start,
 )
 from imgcal.synthesis import Patches, expose_patches, render_patches
@@ -90,7 +90,7 @@ class MeasurerTask(Task[PatchBatch, Measured]):
     def batch(self, count: int, generator: torch.Generator) -> PatchBatch:
         """Take patches of the pool, and give them light and noise."""
         rows = torch.randint(len(self.pool.kind), (count,), generator=generator, device=self.device)
-        return _exposed(self.pool.take(rows), generator)
+        return _expose(self.pool.select(rows), generator)
 
     def predict(self, network: nn.Module, batch: PatchBatch) -> Measured:
         """Measure."""
@@ -118,7 +118,7 @@ class MeasurerTask(Task[PatchBatch, Measured]):
             return {}
         generator = torch.Generator(self.device).manual_seed(VALIDATION_SEED)
         rows = torch.arange(sum(self.sizes), device=self.device).split(self.sizes)
-        batches = [_exposed(self.held_out.take(some), generator) for some in rows]
+        batches = [_expose(self.held_out.select(some), generator) for some in rows]
         answers = [predict(batch) for batch in batches]
         error = torch.cat([answer.offset - batch.offset for answer, batch in zip(answers, batches, strict=True)])
         sigma = torch.cat([answer.log_sigma for answer in answers]).exp()
@@ -144,6 +144,6 @@ def _pool(count: int, seed: int, device: torch.device) -> Patches:
         return render_patches(count, torch.Generator(device).manual_seed(seed))
 
 
-def _exposed(patches: Patches, generator: torch.Generator) -> PatchBatch:
+def _expose(patches: Patches, generator: torch.Generator) -> PatchBatch:
     grey, radius, offset = expose_patches(patches, generator)
-    return PatchBatch(normalized(grey), radius, offset, patches.kind)
+    return PatchBatch(normalize_crops(grey), radius, offset, patches.kind)

@@ -28,7 +28,7 @@ def make_optimizer(network: nn.Module, config: OptimizerConfig) -> torch.optim.O
     Raises:
         InputError: a learning rate for a group that the network does not have.
     """
-    groups = named_groups(network)
+    groups = group_parameters(network)
     _check_names(config.learning_rates, groups, "learning_rates")
     scales = layer_scales(network, config.layer_decay)
     settings = []
@@ -44,7 +44,7 @@ def make_optimizer(network: nn.Module, config: OptimizerConfig) -> torch.optim.O
     return optimizers[config.kind](settings, betas=(first, second), fused=True)
 
 
-def named_groups(network: nn.Module) -> dict[str, list[nn.Parameter]]:
+def group_parameters(network: nn.Module) -> dict[str, list[nn.Parameter]]:
     """Group the trainable parameters of a network; what its `parameter_groups()` leaves out is the group `rest`."""
     given: Callable[[], Mapping[str, Iterable[nn.Parameter]]] | None = getattr(network, "parameter_groups", None)
     groups = {"network": network.parameters()} if given is None else given()
@@ -60,7 +60,7 @@ def freeze(network: nn.Module, names: Iterable[str]) -> None:
     Raises:
         InputError: an unknown group, or nothing is left to train.
     """
-    groups, names = named_groups(network), tuple(names)
+    groups, names = group_parameters(network), tuple(names)
     _check_names(names, groups, "freeze")
     for name in names:
         for parameter in groups[name]:

@@ -24,8 +24,8 @@ from imgcal.networks import (
     NetworkSpec,
     PositionNetwork,
     build_network,
+    drop_pretrained,
     warm_start,
-    without_pretrained,
 )
 from imgcal.training.data import Levels, draw_levels, object_to
 from imgcal.training.experiment import Experiment
@@ -91,7 +91,7 @@ class PositionsTask(Task[PositionBatch, Located]):
         self.experiment, self.batch_size = experiment, batch_size
         self.rig, obj = load_rig(experiment.rig), load_object(experiment.object)
         self.files = {"rig": rig_text(self.rig, experiment.rig), "object": object_text(obj, experiment.object)}
-        spec, starts = experiment if fresh else without_pretrained(experiment), experiment.training.starts
+        spec, starts = experiment if fresh else drop_pretrained(experiment), experiment.training.starts
         whole = build_network(spec, self.rig, obj, weights)
         if not isinstance(whole, ImageNetwork):
             raise InputError(f"task positions: found the network {spec.network.preset}, expected vit or cnn")
@@ -135,7 +135,7 @@ class PositionsTask(Task[PositionBatch, Located]):
     def result(self, network: nn.Module, metrics: Mapping[str, Any]) -> Checkpoint:
         """The whole image network, whose trunk is untrained: `training.init_from` of others takes what it needs."""
         whole = build_network(
-            without_pretrained(self.experiment), self.rig, self.true_obj, torch.Generator().manual_seed(0)
+            drop_pretrained(self.experiment), self.rig, self.true_obj, torch.Generator().manual_seed(0)
         )
         assert isinstance(whole, ImageNetwork)
         whole.positions.load_state_dict(network.state_dict())

@@ -12,12 +12,12 @@ from torch import Tensor, nn
 
 from imgcal.errors import InputError
 from imgcal.formats import load_rig
-from imgcal.io import load_object, object_text, rig_text, validated
-from imgcal.networks import Checkpoint, Network, NetworkSpec, build_network, warm_start, without_pretrained
+from imgcal.io import load_object, object_text, rig_text, validate
+from imgcal.networks import Checkpoint, Network, NetworkSpec, build_network, drop_pretrained, warm_start
 from imgcal.nn import project_fiducials, rms_per_axis
 from imgcal.synthesis import Corruption, share_of_good_rigs
 from imgcal.training.data import Levels, RigBatch, Source, object_to
-from imgcal.training.end_to_end import refined_loss
+from imgcal.training.end_to_end import end_to_end_loss
 from imgcal.training.experiment import Experiment
 from imgcal.training.losses import LossConfig, compound
 from imgcal.training.task import Loss, Task
@@ -58,7 +58,7 @@ class RigExperiment(Experiment, NetworkSpec):
         return RigTask(self, device, batch_size, weights, fresh)
 
 
-def experiment_of(spec: NetworkSpec) -> RigExperiment:
+def checkpoint_experiment(spec: NetworkSpec) -> RigExperiment:
     """Read all of what a network was trained by: `Checkpoint.experiment`.
 
     Raises:
@@ -66,7 +66,7 @@ def experiment_of(spec: NetworkSpec) -> RigExperiment:
     """
     if isinstance(spec, RigExperiment):
         return spec
-    return validated(spec.model_dump(mode="json"), RigExperiment, "experiment of a network")
+    return validate(spec.model_dump(mode="json"), RigExperiment, "experiment of a network")
 
 
 class RigTask(Task[RigBatch, Passes]):
@@ -83,7 +83,7 @@ class RigTask(Task[RigBatch, Passes]):
         """Build it; see `Experiment.make_task`."""
         self.experiment = experiment
         self.factory, self.obj = experiment.load_rig(), experiment.load_object()  # float64
-        spec = experiment if fresh else without_pretrained(experiment)
+        spec = experiment if fresh else drop_pretrained(experiment)
         network, starts = build_network(spec, self.factory, self.obj, weights), experiment.training.starts
         self.untrained = warm_start(starts, network) if fresh and starts else ()
         self.files = {"rig": rig_text(self.factory, experiment.rig), "object": object_text(self.obj, experiment.object)}
@@ -126,7 +126,7 @@ class RigTask(Task[RigBatch, Passes]):
         config = self.experiment.loss
         parameters = self.network.parameters()
         terms = compound(answer, batch.truth, self.source.obj, config, step, self.prior_std, parameters)
-        refined = refined_loss(answer[-1], batch, self.source, self.prior_std, config.refined)
+        refined = end_to_end_loss(answer[-1], batch, self.source, self.prior_std, config.refined)
         passes = terms.passes.unbind()
         earlier = {f"re_pass{t + 1}_px": re for t, re in enumerate(passes[:-1])}
         return Loss(terms.total + refined, {"re_px": passes[-1], **earlier})

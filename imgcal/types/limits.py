@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from imgcal import geometry
 from imgcal.errors import InputError
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -84,7 +84,7 @@ def check_rig(rig: CameraRig) -> None:
         wrong = ~plausible.holds(tensor)
         if bool(wrong.any()):
             place = wrong.nonzero()[0].tolist()
-            camera = shortened(rig.camera_names[place[-2]])
+            camera = shorten(rig.camera_names[place[-2]])
             _fail(f"rig {rig.name}: camera {camera}: {name}", float(tensor[tuple(place)]), plausible)
     if rig.volume is not None:
         replace(rig.volume)  # checks its points

@@ -16,9 +16,9 @@ from imgcal.geometry import (
     ModelNames,
     Projection,
     RigidTransform,
+    lens_label,
     lens_names,
     lens_width,
-    named_lenses,
     project_components,
     project_cpu,
     resized_pixels,
@@ -340,7 +340,7 @@ class CameraRig:
             ),
             image_size=self.image_size[index],
             camera_names=tuple(self.camera_names[i] for i in index),
-            lens_model=named_lenses([self.lens_models[i] for i in index]),
+            lens_model=lens_label([self.lens_models[i] for i in index]),
         )
 
     @classmethod

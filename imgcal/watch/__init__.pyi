@@ -1,9 +1,8 @@
 from .bags import Bag
 from .event_log import EventLog, forget_after
-from .exposures import CameraBlobs, Exposure, Item, Source, Unreadable, checked
+from .exposures import CameraBlobs, Exposure, Item, Source, Unreadable, check_exposure
 from .folder import Folder
 from .hook import Hook
-from .intake import Intake, Known
 from .json_lines import JsonLines
 from .lab_streaming import LabStreaming
 from .loop import EVENTS, STATE, Keeper, Page, Progress, Watch
@@ -16,6 +15,7 @@ from .poses import PoseRecord, Poses, PoseSink
 from .qualisys import Qualisys
 from .recordings import BlobTable, Videos, holds_videos
 from .rig_files import CURRENT, RigFiles, put_aside
+from .source_reader import Known, SourceReader
 from .synchronization import COUNTS, Synchronizer, TimedSnapshot
 from .timing import Timing
 from .zeromq import ZeroMQ
@@ -32,7 +32,6 @@ __all__ = [
     "Exposure",
     "Folder",
     "Hook",
-    "Intake",
     "Item",
     "JsonLines",
     "Keeper",
@@ -51,6 +50,7 @@ __all__ = [
     "Qualisys",
     "RigFiles",
     "Source",
+    "SourceReader",
     "Synchronizer",
     "Tally",
     "TimedSnapshot",
@@ -59,7 +59,7 @@ __all__ = [
     "Videos",
     "Watch",
     "ZeroMQ",
-    "checked",
+    "check_exposure",
     "forget_after",
     "holds_videos",
     "listening_address",

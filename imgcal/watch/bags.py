@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from imgcal.errors import InputError
-from imgcal.messages import listed, quoted, shortened
+from imgcal.messages import list_names, quote, shorten
 from imgcal.types import CameraRig
 from imgcal.watch.exposures import Exposure, Item, Unreadable
 
@@ -45,34 +45,34 @@ class Bag:
                         message = reader.deserialize(raw, connection.msgtype)
                         yield _exposure(camera, message, recorded)
                     except (InputError, AttributeError, ValueError, TypeError, IndexError) as error:
-                        yield Unreadable(f"{connection.topic}: {quoted(str(error))}", camera)
+                        yield Unreadable(f"{connection.topic}: {quote(str(error))}", camera)
         except InputError:
             raise
         except Exception as error:  # a damaged file makes the reader fail in any way
-            raise InputError(f"{self.path}: cannot be read: {quoted(str(error) or type(error).__name__)}") from error
+            raise InputError(f"{self.path}: cannot be read: {quote(str(error) or type(error).__name__)}") from error
 
     def _cameras(self, types: Mapping[str, str]) -> dict[str, str]:
         """Say which camera each topic is of."""
         images = sorted(topic for topic, kind in types.items() if kind == IMAGE)
-        there = f"image topics of this recording: {listed(images) or 'none'}"
+        there = f"image topics of this recording: {list_names(images) or 'none'}"
         found: dict[str, str] = {}
         for camera in self.rig.camera_names:
             named = [topic for topic in images if camera in topic.split("/")]
             topic = self.topics.get(camera) or (named[0] if len(named) == 1 else None)
             if topic is None and named:
                 raise InputError(
-                    f"{self.path}: found {listed(named)} for camera {camera}, expected --topic {camera}=..."
+                    f"{self.path}: found {list_names(named)} for camera {camera}, expected --topic {camera}=..."
                 )
             if topic is not None and topic not in images:
-                raise InputError(f"{self.path}: found no images of the topic {shortened(topic)}; {there}")
+                raise InputError(f"{self.path}: found no images of the topic {shorten(topic)}; {there}")
             if topic is not None and topic in found:
-                cameras = listed((found[topic], camera))
-                raise InputError(f"{self.path}: found the topic {shortened(topic)} for {cameras}, expected one camera")
+                cameras = list_names((found[topic], camera))
+                raise InputError(f"{self.path}: found the topic {shorten(topic)} for {cameras}, expected one camera")
             if topic is not None:
                 found[topic] = camera
         unknown = sorted(set(self.topics) - set(self.rig.camera_names))
         if unknown:
-            raise InputError(f"--topic: found camera {listed(unknown)}, expected those of rig {self.rig.name}")
+            raise InputError(f"--topic: found camera {list_names(unknown)}, expected those of rig {self.rig.name}")
         if not found:
             raise InputError(f"{self.path}: found no topic that names a camera, expected --topic CAMERA=TOPIC; {there}")
         return found
@@ -82,7 +82,7 @@ def _exposure(camera: str, message: Any, recorded: int) -> Exposure:
     """Take the pixels of a `sensor_msgs/msg/Image`."""
     kind = ENCODINGS.get(message.encoding)
     if kind is None:
-        raise InputError(f"found the encoding {shortened(repr(message.encoding))}, expected {listed(ENCODINGS)}")
+        raise InputError(f"found the encoding {shorten(repr(message.encoding))}, expected {list_names(ENCODINGS)}")
     order = ">" if message.is_bigendian else "<"
     pixel = np.dtype(order + kind)
     height, width, step = int(message.height), int(message.width), int(message.step)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from imgcal.errors import InputError
 from imgcal.io import DEFAULT_SIGMA, MARGIN, Frame
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 from imgcal.types import CameraRig, limits
 
 MOST_BLOBS = 10_000
@@ -100,14 +100,14 @@ class Source(Protocol):
         """Give what comes, and None at least ten times a second while nothing does; ends where the source does."""
 
 
-def checked(exposure: Exposure, rig: CameraRig) -> Exposure:
+def check_exposure(exposure: Exposure, rig: CameraRig) -> Exposure:
     """Compare an exposure with the rig that it is to be of.
 
     Raises:
         InputError: a camera that the rig does not have, no time, a frame of another size, blobs beside the image.
     """
     if exposure.camera not in rig.camera_names:
-        raise InputError(f"found camera {shortened(exposure.camera)!r}, expected one of rig {rig.name}")
+        raise InputError(f"found camera {shorten(exposure.camera)!r}, expected one of rig {rig.name}")
     if not 0 <= exposure.time < LATEST:  # nor nan
         raise InputError(f"{exposure.camera}: found the time {exposure.time:g}, expected seconds since the epoch")
     width, height = rig.image_size[rig.camera_names.index(exposure.camera)].tolist()
@@ -127,7 +127,7 @@ def _numbers(name: str, values: Any) -> NDArray[np.float64]:
     try:
         return np.array(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{name}: found {shortened(repr(values))}, expected numbers") from error
+        raise InputError(f"{name}: found {shorten(repr(values))}, expected numbers") from error
 
 
 def _column(name: str, values: Any, count: int) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from imgcal.errors import InputError
 from imgcal.io import IMAGE_SUFFIXES, is_file_name, natural_key, nearest, read_frame
-from imgcal.messages import listed
+from imgcal.messages import list_names
 from imgcal.types import CameraRig
 from imgcal.watch.exposures import Exposure, Item, Unreadable
 
@@ -50,7 +50,7 @@ class Folder:
         stems = {path.stem for path in files if path.suffix.lower() in IMAGE_SUFFIXES and is_file_name(path.stem)}
         return sum(natural_key(stem) <= natural_key(self.after) for stem in stems)
 
-    def saved(self, name: str) -> None:
+    def delete_read(self, name: str) -> None:
         """Delete frames that have been read of the snapshots up to one: they will not be needed again.
 
         Raises:
@@ -75,12 +75,12 @@ class Folder:
     def items(self) -> Iterator[Item]:
         """Give frames snapshot by snapshot, those that are there first, then as they come."""
         frames = self.folder / "frames"
-        yield from self._checked(frames)
+        yield from self._check_names(frames)
         cameras = {name: _Camera(frames / name, self.after) for name in self.rig.camera_names}
         heard, looks = time.monotonic(), 0
         while self.until_idle is None or time.monotonic() - heard < self.until_idle:
             now = time.monotonic()
-            ready = [(path, name) for name, camera in cameras.items() for path in camera.ready(now)]
+            ready = [(path, name) for name, camera in cameras.items() for path in camera.stable_files(now)]
             for path, name in sorted(ready, key=lambda pair: (natural_key(pair[0].stem), pair[1])):
                 item = self._read(cameras[name], name, path, now)
                 if item is not None:
@@ -92,7 +92,7 @@ class Folder:
             yield None
             time.sleep(TICK)
 
-    def _checked(self, frames: Path) -> Iterator[Item]:
+    def _check_names(self, frames: Path) -> Iterator[Item]:
         """Find what a typing error looks like; the folders of the cameras themselves may come later."""
         if not self.folder.is_dir():
             raise InputError(f"{self.folder}: no such folder, expected one that holds or will hold frames/<camera>/")
@@ -104,7 +104,7 @@ class Folder:
             yield Unreadable(f"{self.folder}: found no folder frames in it, expected frames/<camera>/<snapshot>.png")
         for path in sorted(frames.iterdir()) if frames.is_dir() else ():
             if not path.name.startswith(".") and path.name not in self.rig.camera_names:
-                expected = f"the cameras of rig {self.rig.name}: {listed(self.rig.camera_names)}"
+                expected = f"the cameras of rig {self.rig.name}: {list_names(self.rig.camera_names)}"
                 yield Unreadable(f"{path}: expected {expected}{nearest(path.name, self.rig.camera_names)}")
 
     def _read(self, camera: _Camera, name: str, path: Path, now: float) -> Item:
@@ -133,7 +133,7 @@ class _Camera:
         self._growing: dict[str, tuple[int, int]] = {}  # size and time of change at the last look
         self._since: dict[str, float] = {}  # when a file was first found steady, yet unreadable
 
-    def ready(self, now: float) -> list[Path]:
+    def stable_files(self, now: float) -> list[Path]:
         """The new files whose size has not changed since the last look."""
         steady: list[Path] = []
         growing: dict[str, tuple[int, int]] = {}

@@ -13,7 +13,7 @@ import time
 from collections import deque
 
 from imgcal.errors import InputError
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 from imgcal.online import Event
 
 MOST_WAITING = 100
@@ -42,9 +42,9 @@ class Hook:
         try:
             self.command = shlex.split(command)
         except ValueError as error:
-            raise InputError(f"--hook: found {shortened(command)!r}, expected a command: {error}") from error
+            raise InputError(f"--hook: found {shorten(command)!r}, expected a command: {error}") from error
         if not self.command or shutil.which(self.command[0]) is None:
-            raise InputError(f"--hook: found {shortened(command)!r}, expected a program that can be run")
+            raise InputError(f"--hook: found {shorten(command)!r}, expected a program that can be run")
         self.dropped = self.failed = 0
         """Events that were dropped; runs that ended with an error, or not in time."""
         self.problem: str | None = None
@@ -56,7 +56,7 @@ class Hook:
         self._thread = threading.Thread(target=self._work, name="hook", daemon=True)
         self._thread.start()
 
-    def tell(self, event: Event) -> None:
+    def notify(self, event: Event) -> None:
         """Let the command be run; returns at once."""
         with self._changed:
             self._events.append(event)
@@ -115,4 +115,4 @@ class Hook:
 
     def _fail(self, how: str) -> None:
         self.failed += 1
-        self.problem = f"--hook: {shortened(shlex.join(self.command))} {how}"
+        self.problem = f"--hook: {shorten(shlex.join(self.command))} {how}"

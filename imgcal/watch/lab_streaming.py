@@ -12,7 +12,7 @@ from typing import Any
 
 from imgcal.errors import InputError
 from imgcal.io import read_json
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 from imgcal.watch.exposures import Item, Unreadable
 from imgcal.watch.wire import LONGEST_LINE, exposure_from_json
 
@@ -42,7 +42,7 @@ class LabStreaming:
         """
         found = NAME.fullmatch(self.address)
         if found is None:
-            raise InputError(f"{shortened(self.address)}: expected lsl://NAME, the name of one or more streams")
+            raise InputError(f"{shorten(self.address)}: expected lsl://NAME, the name of one or more streams")
         try:
             import pylsl  # not in the core
         except (OSError, RuntimeError) as error:  # its wheels for some machines bring no library along
@@ -93,7 +93,7 @@ def _open_new(found: list[Any], streams: dict[str, _Stream | None], library: Any
         if (one.channel_format(), one.channel_count()) != (library.cf_string, 1):
             streams[one.uid()] = None
             kind = f"{one.channel_count()} channels of type {one.channel_format()}"
-            yield Unreadable(f"stream {shortened(one.name())}: found {kind}, expected one of text")
+            yield Unreadable(f"stream {shorten(one.name())}: found {kind}, expected one of text")
             continue
         inlet = library.StreamInlet(one, max_buflen=BUFFERED, recover=True)
         with contextlib.suppress(*_failures(library)):
@@ -112,21 +112,21 @@ def _item(text: str, stamp: float, inlet: Any, library: Any) -> Item:
         if len(text) > LONGEST_LINE:
             raise InputError(f"found {len(text):,} characters, expected a line of JSON")
         if '"time"' not in text:
-            text = _with_time(text, stamp, inlet, library)
+            text = _add_time(text, stamp, inlet, library)
         return exposure_from_json(text)
     except InputError as error:
         return Unreadable(str(error))
 
 
-def _with_time(text: str, stamp: float, inlet: Any, library: Any) -> str:
+def _add_time(text: str, stamp: float, inlet: Any, library: Any) -> str:
     """Give a line the time of its stamp, in seconds since 1970."""
     try:
         entry = read_json(text)
         offset = inlet.time_correction(timeout=TICK)
     except ValueError as error:
-        raise InputError(f"found {shortened(repr(text))}, expected a line of JSON: {error}") from error
+        raise InputError(f"found {shorten(repr(text))}, expected a line of JSON: {error}") from error
     except _failures(library) as error:
         raise InputError("found no time in the blobs, and the sender's clock is not known yet") from error
     if not isinstance(entry, dict):
-        raise InputError(f"found {shortened(repr(text))}, expected a line of JSON")
+        raise InputError(f"found {shorten(repr(text))}, expected a line of JSON")
     return json.dumps({**entry, "time": stamp + offset + time.time() - library.local_clock()})

@@ -16,10 +16,10 @@ from imgcal.online import Event, RigState
 from imgcal.types import CameraRig, Detections
 from imgcal.watch.event_log import EventLog
 from imgcal.watch.hook import Hook
-from imgcal.watch.intake import Intake
 from imgcal.watch.metrics import Tally
 from imgcal.watch.poses import Poses
 from imgcal.watch.rig_files import FRAMES, STATE, RigFiles
+from imgcal.watch.source_reader import SourceReader
 from imgcal.watch.synchronization import TimedSnapshot
 
 EVENTS = "events.jsonl"
@@ -166,19 +166,19 @@ class Watch:
         """Save what is known, and close the outputs."""
         self.save()
         self._files.close()
-        self._told_problems()
-        self._told_of_poses()
+        self._report_problems()
+        self._report_poses()
         self._log.close()
         if self._hook is not None:
             self._hook.close()
-            self._told_of_hook()
+            self._report_hook()
 
     @property
     def unwritten(self) -> dict[str, str]:
         """What could not be written the last time that it was tried, by output, and why."""
         return {output: why for output, why in self._files.problems.items() if output != FRAMES}
 
-    def run(self, intake: Intake, stopped: threading.Event, looked: Callable[[], None] = lambda: None) -> None:
+    def run(self, intake: SourceReader, stopped: threading.Event, looked: Callable[[], None] = lambda: None) -> None:
         """Work on what comes until it ends, or until told to stop.
 
         Args:
@@ -193,16 +193,16 @@ class Watch:
             snapshot = intake.next(LOOKED_EVERY)
             if snapshot is None and intake.ended:
                 return
-            self._obey()
-            self._told_of_hook()
-            self._told_of_poses()
+            self._apply_commands()
+            self._report_hook()
+            self._report_poses()
             if snapshot is not None:
-                self.take(snapshot)
+                self.process(snapshot)
             if time.monotonic() - self._saved >= SAVED_EVERY:
                 self.save()
             looked()
 
-    def take(self, snapshot: TimedSnapshot) -> RigState | None:
+    def process(self, snapshot: TimedSnapshot) -> RigState | None:
         """Work on one snapshot; None = it could not be used, or nothing is to be learnt now."""
         if self.paused:
             self.tally.paused += 1
@@ -215,32 +215,32 @@ class Watch:
             state = self.keeper.update(snapshot.source(names), snapshot.time, silent)
         except InputError as error:
             self.tally.unusable += 1
-            self._failed("snapshots", str(error))
+            self._fail("snapshots", str(error))
             return None
         self.tally.update_took(time.perf_counter() - started)
         self.tally.refused += state.refused is not None
         self.tally.latest = state
         for exposure in snapshot.exposures.values():
-            self.tally.stamped(exposure.camera, exposure.time - snapshot.time)
+            self.tally.count_time_stamp(exposure.camera, exposure.time - snapshot.time)
         self._progress = Progress(snapshot.time, snapshot.name, source=self._source, rate=self._rate)
         self._unsaved = True
         for event in state.events:
-            self.tell(event)
+            self.publish_event(event)
         for output in self._poses:
             output.publish(state)
         if self._page is not None:
             self._page.publish(state, snapshot.frames(names))
         return state
 
-    def tell(self, event: Event) -> None:
+    def publish_event(self, event: Event) -> None:
         """Give an event to all who want to know."""
         self.tally.events[event.kind] += 1
         try:
             self._log.append(event)
         except OSError as error:
-            self._failed(EVENTS, str(error))
+            self._fail(EVENTS, str(error))
         if self._hook is not None:
-            self._hook.tell(event)
+            self._hook.notify(event)
         if self.tally.latest is not None and event.kind in IN_HISTORY:
             self._keep(self.tally.latest)
         if self._page is not None and (self.tally.latest is None or event not in self.tally.latest.events):
@@ -254,7 +254,7 @@ class Watch:
         unsaved = self._unsaved or bool(self._files.problems)
         if state is None or self._progress is None or not unsaved:
             return
-        self._told_problems()
+        self._report_problems()
         progress = replace(self._progress, logged=self._log.size)
         memory = self.keeper.saved(asdict(progress))
         self._files.write(
@@ -268,36 +268,36 @@ class Watch:
         self._kept = state.time
         self._files.write(state, keep=True)
 
-    def _told_problems(self) -> None:
+    def _report_problems(self) -> None:
         for output, message in self._files.problems.items():
-            self._failed(output, message)
+            self._fail(output, message)
 
-    def _told_of_hook(self) -> None:
+    def _report_hook(self) -> None:
         """Say once that the command fails; how often, the display and the metrics say."""
         problem = None if self._hook is None or self._hook_told else self._hook.problem
         if problem is not None:
             self._hook_told = True
             self._problem(problem)
 
-    def _told_of_poses(self) -> None:
+    def _report_poses(self) -> None:
         """Say once of each output of poses that it fails."""
         for output in self._poses:
             if output.problem is not None and not self.tally.problems[output.name]:
-                self._failed(output.name, output.problem)
+                self._fail(output.name, output.problem)
 
-    def _failed(self, output: str, message: str) -> None:
+    def _fail(self, output: str, message: str) -> None:
         self.tally.problems[output] += 1
         if self.tally.problems[output] == 1:
             self._problem(message)
 
-    def _obey(self) -> None:
+    def _apply_commands(self) -> None:
         """Do what people have asked for."""
         for command in () if self._page is None else self._page.commands():
             if command.name in ("pause", "resume"):
                 self.paused = command.name == "pause"
             elif command.name == "factory":
                 try:
-                    self.tell(self.keeper.accept_as_factory())
+                    self.publish_event(self.keeper.accept_as_factory())
                 except RefusedError as error:
                     self._problem(str(error))
                 else:

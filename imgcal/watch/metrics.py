@@ -13,7 +13,7 @@ from imgcal.errors import InputError
 from imgcal.live_page import Address, Gate
 from imgcal.online import EVENT_KINDS, RigState
 from imgcal.watch.hook import Hook
-from imgcal.watch.intake import Intake
+from imgcal.watch.source_reader import SourceReader
 
 if TYPE_CHECKING:
     from prometheus_client import Metric
@@ -50,7 +50,7 @@ class Tally:
         """Snapshots that taught something."""
         return self.snapshots - self.refused - self.unusable
 
-    def stamped(self, camera: str, offset: float) -> None:
+    def count_time_stamp(self, camera: str, offset: float) -> None:
         """Count a time stamp."""
         before = self.stamps.get(camera, offset)
         self.stamps[camera] = before + (offset - before) / STAMPS
@@ -64,7 +64,7 @@ class Tally:
 class Metrics:
     """Serves them by HTTP. A context manager: leaving it ends the server."""
 
-    def __init__(self, tally: Tally, intake: Intake, hook: Hook | None, address: tuple[str, int]) -> None:
+    def __init__(self, tally: Tally, intake: SourceReader, hook: Hook | None, address: tuple[str, int]) -> None:
         """Say what to serve, and where: 127.0.0.1 unless others are to read it."""
         self._tally, self._intake, self._hook, self._address = tally, intake, hook, address
 
@@ -81,7 +81,7 @@ class Metrics:
         host, port = self._address
         try:
             self._server, self._thread = start_http_server(port, host, registry)
-            self._server.set_app(_guarded(make_wsgi_app(registry), Gate(Address(host, port), "")))
+            self._server.set_app(_guard(make_wsgi_app(registry), Gate(Address(host, port), "")))
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise InputError(f"--metrics: {host}:{port} cannot be listened on: {reason}") from error
@@ -146,10 +146,10 @@ class Metrics:
             stamps.add_metric([camera], offset)
         yield stamps
         if tally.latest is not None:
-            yield from _of_cameras(tally.latest)
+            yield from _camera_values(tally.latest)
 
 
-def _of_cameras(state: RigState) -> Iterator[Metric]:
+def _camera_values(state: RigState) -> Iterator[Metric]:
     """What is known of each camera."""
     from prometheus_client.core import GaugeMetricFamily
 
@@ -177,7 +177,7 @@ def _of_cameras(state: RigState) -> Iterator[Metric]:
         yield family
 
 
-def _guarded(serve: Application, gate: Gate) -> Application:
+def _guard(serve: Application, gate: Gate) -> Application:
     """Serve only who asks for this machine by its own name: another site's may be pointed here (DNS rebinding)."""
 
     def answer(environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:

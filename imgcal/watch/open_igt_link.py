@@ -13,7 +13,7 @@ import time
 from dataclasses import dataclass, field
 
 from imgcal.errors import InputError
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 from imgcal.watch.poses import PoseRecord, PoseStatus
 
 PORT = 18944
@@ -92,7 +92,7 @@ def listening_address(text: str) -> tuple[str, int]:
     found = re.fullmatch(r"igtl://(?:(?P<only>\d{1,5})|(?P<host>[^\s:/]*)(?::(?P<port>\d{1,5}))?)/?", text)
     port = int((found["only"] or found["port"] or PORT) if found else -1)
     if found is None or not 0 <= port < 2**16:
-        raise InputError(f"{shortened(text)}: expected igtl://[HOST:]PORT, such as igtl://127.0.0.1:{PORT}")
+        raise InputError(f"{shorten(text)}: expected igtl://[HOST:]PORT, such as igtl://127.0.0.1:{PORT}")
     return found["host"] or "127.0.0.1", port
 
 

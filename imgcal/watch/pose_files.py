@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from imgcal.errors import InputError
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 from imgcal.watch.poses import COLUMNS, PoseRecord
 
 SUFFIXES = (".csv", ".jsonl")
@@ -58,7 +58,7 @@ class PoseFile:
         known = first == header if self._table else first.startswith('{"time": ')
         if not known:
             expected = "the columns of poses" if self._table else "poses, a line of JSON each"
-            raise InputError(f"{self._path}: found {shortened(first)!r}, expected a new file or {expected}")
+            raise InputError(f"{self._path}: found {shorten(first)!r}, expected a new file or {expected}")
 
     def _append(self, text: str) -> None:
         if self._descriptor is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from imgcal.errors import InputError
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 from imgcal.watch.poses import PoseRecord
 from imgcal.watch.zeromq import ADDRESS
 
@@ -23,7 +23,7 @@ class PosePublisher:
 
         found = ADDRESS.fullmatch(address)
         if found is None or int(found[1] or 0) >= 2**16:  # ZeroMQ would take the port modulo 65536
-            raise InputError(f"{shortened(address)}: expected tcp://HOST:PORT or ipc://PATH to publish at")
+            raise InputError(f"{shorten(address)}: expected tcp://HOST:PORT or ipc://PATH to publish at")
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.PUB)
         self._socket.setsockopt(zmq.LINGER, 0)
@@ -32,7 +32,7 @@ class PosePublisher:
             self._socket.bind(address)
         except zmq.ZMQError as error:
             self.close()
-            raise InputError(f"{shortened(address)}: cannot be published at: {error}") from error
+            raise InputError(f"{shorten(address)}: cannot be published at: {error}") from error
 
     def send(self, record: PoseRecord) -> None:
         """See `PoseSink`."""

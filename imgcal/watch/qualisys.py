@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from imgcal.errors import InputError
 from imgcal.formats import Element, parse_xml
-from imgcal.messages import listed, one_line, shortened
+from imgcal.messages import list_names, one_line, shorten
 from imgcal.types import CameraRig
 from imgcal.watch.exposures import MOST_BLOBS, CameraBlobs, Exposure, Item, Unreadable
 
@@ -111,7 +111,7 @@ class Qualisys:
         while True:
             clock.fresh = True
             try:
-                with (yield from _connected(host, port, self.silence)) as connection:
+                with (yield from _connect(host, port, self.silence)) as connection:
                     for item in self._session(connection, clock):
                         said = "" if isinstance(item, Exposure) else said
                         yield item
@@ -141,10 +141,10 @@ class Qualisys:
                 continue
             kind, body = packet
             if kind == ERROR:
-                raise _Lost(f"QTM says: {shortened(_text(body))}")
+                raise _Lost(f"QTM says: {shorten(_text(body))}")
             try:
                 if kind == XML:
-                    cameras = cameras_of(parse_xml(_text(body), "GetParameters General"), self.rig)
+                    cameras = find_cameras(parse_xml(_text(body), "GetParameters General"), self.rig)
                 elif kind == DATA and cameras is None:
                     raise InputError("found data before the parameters of the cameras")
                 elif kind == DATA and cameras is not None:
@@ -155,7 +155,7 @@ class Qualisys:
                     raise _Lost(str(error)) from error
 
 
-def cameras_of(root: Element, rig: CameraRig) -> tuple[_Camera | None, ...]:
+def find_cameras(root: Element, rig: CameraRig) -> tuple[_Camera | None, ...]:
     """Find the cameras of a rig among those of QTM's general settings.
 
     Args:
@@ -177,7 +177,7 @@ def cameras_of(root: Element, rig: CameraRig) -> tuple[_Camera | None, ...]:
     names = [known.get(serial, serial) for serial in serials]
     if not any(serial in known for serial in serials):
         if len(serials) != rig.num_cameras:
-            found = f"{len(serials)} cameras ({listed(serials)})"
+            found = f"{len(serials)} cameras ({list_names(serials)})"
             raise InputError(f"found {found}, expected {rig.num_cameras}, or cameras with serials as in rig {rig.name}")
         names = list(rig.camera_names)
     sizes = dict(zip(rig.camera_names, rig.image_size.tolist(), strict=True))
@@ -281,7 +281,7 @@ def _packets(connection: socket.socket, silence: float) -> Iterator[tuple[int, b
         del waiting[:at]
 
 
-def _connected(host: str, port: int, timeout: float) -> Generator[None, None, socket.socket]:
+def _connect(host: str, port: int, timeout: float) -> Generator[None, None, socket.socket]:
     """Connect, giving None meanwhile.
 
     Raises:
@@ -310,7 +310,7 @@ def _connected(host: str, port: int, timeout: float) -> Generator[None, None, so
 def _host_and_port(address: str) -> tuple[str, int]:
     found = re.fullmatch(r"qtm://([^\s:/]+)(?::(\d{1,5}))?/?", address)
     if found is None or not 0 < int(found[2] or PORT) < 2**16:
-        raise InputError(f"{shortened(address)}: expected an address qtm://HOST[:PORT], such as qtm://127.0.0.1:{PORT}")
+        raise InputError(f"{shorten(address)}: expected an address qtm://HOST[:PORT], such as qtm://127.0.0.1:{PORT}")
     return found[1], int(found[2] or PORT)
 
 

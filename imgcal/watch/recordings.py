@@ -34,7 +34,7 @@ class Videos:
         paths = {camera: next(iter(files.values()))[0] for camera, files in capture.files.items() if files}
         with contextlib.ExitStack() as stack:
             videos = {camera: stack.enter_context(Video(path)) for camera, path in paths.items()}
-            yield from _by_time(videos) if self.differ else _together(videos)
+            yield from _read_by_time(videos) if self.differ else _read_numbered(videos)
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def holds_videos(folder: Path) -> bool:
     return frames.is_dir() and any(path.suffix.lower() in VIDEO_SUFFIXES for path in frames.iterdir())
 
 
-def _together(videos: dict[str, Video]) -> Iterator[Item]:
+def _read_numbered(videos: dict[str, Video]) -> Iterator[Item]:
     """Frames of one number at a time, after a look at their time stamps."""
     for index in range(min(video.count for video in videos.values())):
         frames = {camera: video.read(index) for camera, video in videos.items()}
@@ -77,7 +77,7 @@ def _together(videos: dict[str, Video]) -> Iterator[Item]:
             yield Exposure(camera, videos[camera].seconds, frame, str(index))
 
 
-def _by_time(videos: dict[str, Video]) -> Iterator[Item]:
+def _read_by_time(videos: dict[str, Video]) -> Iterator[Item]:
     heads: list[tuple[float, str, int, Exposure]] = []
 
     def read(camera: str, index: int) -> None:

@@ -164,34 +164,34 @@ class Synchronizer:
         """
         self.counts["received"][exposure.camera] += 1
         if exposure.snapshot is not None or not self._has_leapt(exposure, now):
-            self._take(exposure, now)
-            return self.waited(now)
+            self._add(exposure, now)
+            return self.release_due(now)
         self.counts["astray"][exposure.camera] += 1
         self._astray[exposure.camera] = exposure
         self._astray_in_a_row += 1
         believed = [held for held in self._astray.values() if abs(held.time - exposure.time) <= LEAP]
         if 2 * len(believed) <= len(self._there()) and self._astray_in_a_row < LONGEST_ASTRAY:
-            return self.waited(now)
+            return self.release_due(now)
         done = self.flush()
-        self._begin_anew()
+        self._reset()
         for held in sorted(believed, key=lambda held: held.time):
             self.counts["astray"][held.camera] -= 1
-            self._take(held, now)
-        return done + self.waited(now)
+            self._add(held, now)
+        return done + self.release_due(now)
 
-    def waited(self, now: float) -> tuple[TimedSnapshot, ...]:
+    def release_due(self, now: float) -> tuple[TimedSnapshot, ...]:
         """Give the snapshots that need not wait any more; to be called now and then while nothing comes."""
         done: list[TimedSnapshot] = []
         while self._pending and self._may_go(self._pending[0], now):
-            done.append(self._went_on(self._pending.pop(0)))
-        return self._of_others(done)
+            done.append(self._has_continued(self._pending.pop(0)))
+        return self._drop_unsynchronized(done)
 
     def flush(self) -> tuple[TimedSnapshot, ...]:
         """Give all that is being gathered, as it is."""
         pending, self._pending = self._pending, []
-        return self._of_others([self._went_on(snapshot) for snapshot in pending])
+        return self._drop_unsynchronized([self._has_continued(snapshot) for snapshot in pending])
 
-    def _of_others(self, done: list[TimedSnapshot]) -> tuple[TimedSnapshot, ...]:
+    def _drop_unsynchronized(self, done: list[TimedSnapshot]) -> tuple[TimedSnapshot, ...]:
         """Leave out what a camera sees at moments of its own: nobody knows where the object was then."""
         kept = []
         for snapshot in done:
@@ -201,7 +201,7 @@ class Synchronizer:
                 kept.append(snapshot)
         return tuple(kept)
 
-    def _take(self, exposure: Exposure, now: float) -> None:
+    def _add(self, exposure: Exposure, now: float) -> None:
         camera, before = exposure.camera, self._newest.get(exposure.camera, -math.inf)
         self._astray.pop(camera, None)
         self._astray_in_a_row = 0
@@ -243,7 +243,7 @@ class Synchronizer:
             return now - pending.arrived > self.timing.patience
         return self._clock(now) - pending.latest > self.timing.patience
 
-    def _went_on(self, pending: _Pending) -> TimedSnapshot:
+    def _has_continued(self, pending: _Pending) -> TimedSnapshot:
         if pending.name is None:
             self._gone = pending.earliest, pending.latest
         else:
@@ -300,7 +300,7 @@ class Synchronizer:
     def _has_leapt(self, exposure: Exposure, now: float) -> bool:
         return abs(exposure.time - self._clock(now)) > LEAP
 
-    def _begin_anew(self) -> None:
+    def _reset(self) -> None:
         self.leaps += 1
         self._newest.clear()
         for stamps in self._stamps.values():

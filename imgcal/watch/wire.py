@@ -8,7 +8,7 @@ import numpy as np
 
 from imgcal.errors import InputError
 from imgcal.io import DEFAULT_SIGMA, read_json
-from imgcal.messages import listed, shortened
+from imgcal.messages import list_names, shorten
 from imgcal.types import limits
 from imgcal.watch.exposures import CameraBlobs, Exposure
 
@@ -58,7 +58,7 @@ def exposure_from_pixels(header: str | bytes, pixels: bytes | memoryview) -> Exp
     if not all(isinstance(side, int) and 0 < side <= limits.LONGEST_SIDE for side in (width, height)):
         raise InputError(f"found {width!r} x {height!r} pixels, expected whole numbers up to {limits.LONGEST_SIDE:,}")
     if kind not in tuple(PIXEL_TYPES):  # compares, which a list may be, too
-        raise InputError(f"type: found {shortened(repr(kind))}, expected {' or '.join(PIXEL_TYPES)}")
+        raise InputError(f"type: found {shorten(repr(kind))}, expected {' or '.join(PIXEL_TYPES)}")
     expected = width * height * PIXEL_TYPES[kind].itemsize
     if len(pixels) != expected:
         raise InputError(f"{entry['camera']}: found {len(pixels):,} bytes of pixels, expected {expected:,}")
@@ -72,18 +72,18 @@ def _mapping(text: str | bytes, allowed: set[str], needed: set[str]) -> dict[str
     try:
         entry = read_json(text.decode() if isinstance(text, bytes) else text)
     except ValueError as error:  # also where it is no UTF-8
-        raise InputError(f"found {shortened(repr(text))}, expected a line of JSON: {error}") from error
+        raise InputError(f"found {shorten(repr(text))}, expected a line of JSON: {error}") from error
     if not isinstance(entry, dict) or not needed <= set(entry) <= allowed:
-        found = listed(map(str, entry)) or "no keys" if isinstance(entry, dict) else shortened(repr(entry))
+        found = list_names(map(str, entry)) or "no keys" if isinstance(entry, dict) else shorten(repr(entry))
         optional = allowed - needed
-        may = f", optional {listed(sorted(optional))}" if optional else ""
-        raise InputError(f"found {found}, expected the keys {listed(sorted(needed))}{may}")
+        may = f", optional {list_names(sorted(optional))}" if optional else ""
+        raise InputError(f"found {found}, expected the keys {list_names(sorted(needed))}{may}")
     time = entry["time"]
     if not isinstance(entry["camera"], str) or isinstance(time, bool) or not isinstance(time, int | float):
-        found = f"{shortened(repr(entry['camera']))} and {shortened(repr(time))}"
+        found = f"{shorten(repr(entry['camera']))} and {shorten(repr(time))}"
         raise InputError(f"found camera and time {found}, expected a name and seconds")
     try:
         entry["time"] = float(time)
     except OverflowError as error:
-        raise InputError(f"found the time {shortened(str(time))}, expected seconds") from error
+        raise InputError(f"found the time {shorten(str(time))}, expected seconds") from error
     return entry

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from imgcal.errors import InputError
-from imgcal.messages import shortened
+from imgcal.messages import shorten
 from imgcal.types import MOST_PIXELS
 from imgcal.watch.exposures import Exposure, Item, Unreadable
 from imgcal.watch.wire import LONGEST_LINE, exposure_from_json, exposure_from_pixels
@@ -73,11 +73,11 @@ class ZeroMQ:
         for address in self.addresses:
             found = ADDRESS.fullmatch(address)
             if found is None or int(found[1] or 0) >= 2**16:  # ZeroMQ takes the rest of a division
-                raise InputError(f"{shortened(address)}: expected an address tcp://host:port or ipc://path")
+                raise InputError(f"{shorten(address)}: expected an address tcp://host:port or ipc://path")
             try:
                 socket.connect(address)
             except zmq.ZMQError as error:
-                raise InputError(f"{shortened(address)}: cannot be connected to: {error}") from error
+                raise InputError(f"{shorten(address)}: cannot be connected to: {error}") from error
 
 
 def _exposure(parts: list[memoryview]) -> Exposure:

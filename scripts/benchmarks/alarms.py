@@ -17,7 +17,7 @@ from typing import Any
 
 import tyro
 
-from imgcal.fleet import Mapped, workers
+from imgcal.fleet import Mapper, workers
 from scripts.benchmarks.alarms_runs import Item, run
 from scripts.benchmarks.alarms_tables import draw, summarized, tables
 from scripts.benchmarks.rig_streams import Conditions
@@ -62,7 +62,7 @@ def done(path: Path) -> list[dict[str, Any]]:
     return list({entry["key"]: entry for entry in entries}.values())
 
 
-def go_on(options: Options, mapped: Mapped = map) -> None:
+def go_on(options: Options, mapped: Mapper = map) -> None:
     """Run what is not done yet."""
     path = options.items
     known = {entry["key"] for entry in done(path)}

@@ -14,7 +14,7 @@ import imgcal
 from imgcal.errors import RefusedError
 from imgcal.estimation import Gauge
 from imgcal.geometry import RigidTransform, rotation_from_vector
-from imgcal.monitoring import Change, RigFilter, pixel_changes, spread_of, widened
+from imgcal.monitoring import Change, RigFilter, change_std, pixel_changes, widen
 from imgcal.types import DriftRate
 from scripts.benchmarks.followed_streams import RIGS, SURELY, Followed, distance, held_out, stream_of
 from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
@@ -118,8 +118,8 @@ def half_degree(item: Item) -> dict[str, Any]:
         if observations is None or followed.pose is None:
             continue
         if number == bump.snapshot:
-            spread = spread_of({bump.camera: bump.kind}, pixel_changes(told.belief.rig))
-            told.belief = widened(told.belief, spread.square())
+            spread = change_std({bump.camera: bump.kind}, pixel_changes(told.belief.rig))
+            told.belief = widen(told.belief, spread.square())
         try:
             told.update(observations, followed.pose, 1 / 60)
         except RefusedError:
@@ -157,7 +157,7 @@ def creeping(item: Item) -> dict[str, Any]:
         if number % 1200 == 0:
             found = float(distance(followed.monitor.filter.belief, followed.truth)[camera])
             worst, wrong = max(worst, found), wrong + int(found > SURELY)
-    moved = Gauge.of_most(followed.monitor.filter.belief.rig, start).difference(
+    moved = Gauge.from_majority(followed.monitor.filter.belief.rig, start).difference(
         followed.monitor.filter.belief.rig, start
     )
     return {"rig": stream.factory.name, "alarms": len(followed.told), "asked": 30, "wrong": wrong, "worst_chi2": worst,

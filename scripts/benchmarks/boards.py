@@ -17,7 +17,7 @@ import numpy as np
 import torch
 import tyro
 
-from imgcal.association import associate, observations_of
+from imgcal.association import accepted_observations, associate
 from imgcal.detection import detect
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import EstimationOptions, estimate
@@ -34,7 +34,7 @@ PLAIN = EstimationOptions(threshold=1e6)
 
 def held_out(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> dict[str, float]:
     """Fit poses alone by least squares: errors (px) of all points."""
-    observations, poses = observations_of(associate(detections, rig, obj), rig, obj)
+    observations, poses = accepted_observations(associate(detections, rig, obj), rig, obj)
     even = replace(observations, sigma=torch.ones_like(observations.sigma))
     fixed = torch.zeros(rig.num_cameras, rig.num_parameters, dtype=torch.float64)
     fit = estimate(even, rig, obj.taken_as_exact(), poses, prior_std=fixed, options=PLAIN)

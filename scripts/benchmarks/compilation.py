@@ -35,7 +35,7 @@ def calibrate(helped: bool) -> dict[str, Any]:
     """
     from numba.core import event
 
-    compiling.is_of_use = lambda: helped  # however busy the machine is
+    compiling.is_useful = lambda: helped  # however busy the machine is
     times: list[list[float]] = []
     count = 0
     by_module: dict[str, float] = {}

@@ -26,8 +26,8 @@ from imgcal.association import IdentityOptions, Proposer, judge
 from imgcal.cli.memory import keep_memory
 from imgcal.detection import detect_snapshot
 from imgcal.matching import MatchedFilter, matched_filter, refinement
-from imgcal.pipeline import learned
-from imgcal.pipeline.learned import load_proposer
+from imgcal.pipeline import learned_proposer
+from imgcal.pipeline.learned_proposer import load_proposer
 from imgcal.synthesis import DIFFICULTIES
 from scripts.output import ROOT, command, fill, markdown, read_json, surroundings, write_json
 from scripts.results.infrared import NEARLY, Case, cases
@@ -43,11 +43,11 @@ STAGES: Mapping[str, tuple[tuple[Any, str], ...]] = {
         (matched_filter.Maps, "dilated"),
     ),
     "poses": ((matched_filter.View, "known"),),
-    "encoder": ((learned._View, "of"),),
-    "looks": ((learned._View, "look"),),
-    "measurer": ((learned._View, "_by_network"),),
-    "marker fits": ((refinement, "_measured"), (learned._View, "_fitted")),
-    "rig fits": ((refinement, "_fit"), (learned._View, "fit")),
+    "encoder": ((learned_proposer._View, "of"),),
+    "looks": ((learned_proposer._View, "look"),),
+    "measurer": ((learned_proposer._View, "_by_network"),),
+    "marker fits": ((refinement, "_measured"), (learned_proposer._View, "_fitted")),
+    "rig fits": ((refinement, "_fit"), (learned_proposer._View, "fit")),
 }
 """What is timed as which stage, by who has it; none of them is called within another."""
 COLUMNS = (BLOBS, *STAGES, REST, IDENTITY, "all")

@@ -30,7 +30,7 @@ import torch
 from imgcal.estimation import EstimationOptions, estimate
 from imgcal.online import RigKeeper  # imported here, for all that are forked
 from imgcal.types import Observations
-from imgcal.watch import STATE, Intake, Timing, Watch
+from imgcal.watch import STATE, SourceReader, Timing, Watch
 from scripts.benchmarks.endurance_world import EPOCH, SLOWED, Replay, World
 from scripts.benchmarks.rig_streams import Bump
 from scripts.output import ROOT, fill, surroundings, write_json
@@ -45,7 +45,7 @@ def live(world: World, folder: Path, first: int, last: int, place: mmap.mmap) ->
     """Watch from a snapshot on, as `imgcal watch` does, and write down how it goes."""
     path = folder / STATE
     keeper = RigKeeper.restore(path) if path.is_file() else RigKeeper(world.factory, world.obj)
-    intake = Intake(Replay(world, first, last, place), world.factory, Timing())
+    intake = SourceReader(Replay(world, first, last, place), world.factory, Timing())
     took: list[float] = []
     with keeper, Watch(keeper, folder) as loop, open(folder / "record.jsonl", "a", buffering=1) as record:
         done = 0

@@ -87,9 +87,9 @@ def recalibrated(
         rows = slice(first, first + AT_ONCE)
         seen = Observations(*(getattr(fleet.observations, name)[rows] for name in ("uv", "sigma", "seen")))
         found = estimate(seen, replace(factory, prior=prior), obj, options=EstimationOptions(loss="squared"))
-        parts.append(DriftInformation.of(found))
+        parts.append(DriftInformation.from_estimates(found))
         offsets.append(found.rig.local(factory))
-    return DriftInformation.joined(parts), torch.cat(offsets)
+    return DriftInformation.concatenate(parts), torch.cat(offsets)
 
 
 def found_bumps(learnt: LearntPrior, fleet: Fleet, names: tuple[str, ...]) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from ray import cloudpickle
 from imgcal.cli.main import main as imgcal_command
 from imgcal.fleet import Dataset, Done, Engine, Item, Manifest, Settings, recalibrate_fleet, write_manifest
 from imgcal.fleet import run as fleet_run
-from imgcal.fleet.job import failed_row, processed
+from imgcal.fleet.job import failed_row, process
 from imgcal.io import load_object, load_rig, save_detections
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from scripts.output import ROOT, command, fill, markdown, read_json, surroundings, write_json
@@ -146,10 +146,10 @@ def plain_loop(manifest: Manifest) -> float:
     """CPU seconds of a capture in a loop of this process."""
     items = [item for batch in manifest.batches(1000) for item in batch]
     torch.set_num_threads(1)
-    processed(items[0], Settings())
+    process(items[0], Settings())
     before = time.process_time()
     for item in items:
-        processed(item, Settings())
+        process(item, Settings())
     return (time.process_time() - before) / len(items)
 
 
@@ -161,7 +161,7 @@ def bytes_moved(folder: Path) -> dict[str, Any]:
         path = Path(items[0].capture)
         files = [file for file in path.rglob("*") if file.is_file() and "truth" not in file.parts]
         read = sum(file.stat().st_size for file in files) if path.is_dir() else path.stat().st_size
-        rows = [processed(item, Settings()) for item in items[: 1 if kind == FRAMES else 8]]  # no two alike
+        rows = [process(item, Settings()) for item in items[: 1 if kind == FRAMES else 8]]  # no two alike
         dataset = Dataset(Path(tempfile.mkdtemp(dir=folder)))
         with dataset.written() as writer:
             writer.add([row for row in rows if row is not None])
@@ -258,7 +258,7 @@ def memory(folder: Path, rows: int) -> dict[str, Any]:
             status = Path("/proc/self/status").read_text()
             curve.append((count.read, int(status.partition("RssAnon:")[2].split()[0]) / 1024))
 
-    real, fleet_run._processed = fleet_run._processed, stubbed  # type: ignore[assignment]
+    real, fleet_run._process = fleet_run._process, stubbed  # type: ignore[assignment]
     try:
         with Engine(cores=1) as engine:
             dataset, manifest = Dataset(Path(tempfile.mkdtemp(dir=folder))), Manifest(str(path), "T4", "asymmetric8")
@@ -266,7 +266,7 @@ def memory(folder: Path, rows: int) -> dict[str, Any]:
             count = recalibrate_fleet(manifest, dataset, engine, tell=tell, batch=512)
             spent = time.process_time() - before
     finally:
-        fleet_run._processed = real
+        fleet_run._process = real
     assert count.read == rows and count.status["refused"] == rows and len(dataset.keys()) == rows
     return {"rows": rows, "curve_mb": curve, "driver_cpu_us": 1e6 * spent / rows}
 
@@ -274,10 +274,10 @@ def memory(folder: Path, rows: int) -> dict[str, Any]:
 def driver(folder: Path, rows: int = 2048) -> dict[str, float]:
     """CPU seconds of the driver for a capture: rows as large as real ones, made without work."""
     found: dict[str, float] = {}
-    real = fleet_run._processed
+    real = fleet_run._process
     with Engine(cores=1) as engine:
         for kind in (*KINDS, FRAMES):
-            template = processed(next(fleet_of(folder, kind, 1).batches(1))[0], Settings())
+            template = process(next(fleet_of(folder, kind, 1).batches(1))[0], Settings())
             assert template is not None
 
             def full(items: Sequence[Item], settings: Settings, known: Any, row: Any = template) -> list[Any]:
@@ -285,13 +285,13 @@ def driver(folder: Path, rows: int = 2048) -> dict[str, float]:
 
             manifest = fleet_of(folder, kind, rows)
             try:
-                fleet_run._processed = full
+                fleet_run._process = full
                 recalibrate_fleet(fleet_of(folder, kind, 64), Dataset(Path(tempfile.mkdtemp(dir=folder))), engine)
                 before = time.process_time()
                 count = recalibrate_fleet(manifest, Dataset(Path(tempfile.mkdtemp(dir=folder))), engine)
                 found[kind] = (time.process_time() - before) / rows
             finally:
-                fleet_run._processed = real
+                fleet_run._process = real
             assert count.status["ok"] == rows
     return found
 

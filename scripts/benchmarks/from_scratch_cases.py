@@ -15,7 +15,7 @@ from imgcal.synthesis import (
     PhysicalDrift,
     Shape,
     Truth,
-    arranged_rig,
+    arrange_rig,
     sample_volume,
     simulate_volume,
     true_detections,
@@ -53,7 +53,7 @@ def make_case(number: int, snapshots: int) -> Case:
     shape = SHAPES[number % 3]
     cameras, radius = int(rng.integers(6, 17)), float(rng.uniform(2500, 4500))
     width, height, angle = LENSES[number % len(LENSES)] if number % 2 else LENSES[0]
-    rig = arranged_rig(
+    rig = arrange_rig(
         shape,
         cameras,
         radius,

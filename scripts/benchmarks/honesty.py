@@ -24,7 +24,7 @@ from imgcal.association import to_observations
 from imgcal.estimation import estimate, relative_difference
 from imgcal.estimation.variance_components import KINDS
 from imgcal.evaluation.true_error import true_error
-from imgcal.fleet import Kept, workers
+from imgcal.fleet import StoredResults, workers
 from imgcal.types import CameraRig, RigPrior
 from scripts.benchmarks.honesty_attacks import ATTACKS, BENT, Attack
 from scripts.benchmarks.honesty_prediction import Case
@@ -229,7 +229,7 @@ def main() -> None:
         for s in (1, 20)
         if attack != "as said" and not (attack == "a camera turned 0.5 degrees" and s == 1)
     ]
-    kept = Kept(WORK / "honesty", Path(__file__).read_text("utf-8"))
+    kept = StoredResults(WORK / "honesty", Path(__file__).read_text("utf-8"))
     with workers(options.address, options.cores, kept) as mapped:
         wands = list(mapped(recovered, [(name, options.captures, 9000 + i) for i, name in enumerate(BENT)]))
         rows = [_told(row) for row in mapped(_row, [] if options.wand_only else tasks)]

@@ -17,8 +17,8 @@ import tyro
 
 from imgcal import PipelineOptions, RefusedError, calibrate
 from imgcal.association import associate
-from imgcal.fleet import Kept, Mapped, workers
-from imgcal.pipeline.steadiness import moves_of
+from imgcal.fleet import Mapper, StoredResults, workers
+from imgcal.pipeline.motion_check import list_moves
 from imgcal.types import Detections, MovedError
 from scripts.benchmarks import camera_faults as faults
 from scripts.output import ROOT, WORK, command, fill, markdown, read_json, surroundings, write_json
@@ -55,7 +55,7 @@ def steady(kind: str, fault: str, seed: int) -> bool:
         table.uv[:] += (draw.random((len(table), 1)) < 0.1) * draw.normal(0, 8, table.uv.shape)
     elif fault == "noise misstated":
         table = replace(table, sigma=table.sigma * draw.uniform(0.2, 5))
-    return bool(moves_of(associate(table, rig, obj), rig, obj, PipelineOptions()))
+    return bool(list_moves(associate(table, rig, obj), rig, obj, PipelineOptions()))
 
 
 def bumped(kind: str, degrees: float, share: float, seed: int) -> str:
@@ -94,7 +94,7 @@ def _damaged(table: Detections, rig: faults.CameraRig, how: str) -> Detections:
     return table if how == "lens" else faults.mirrored(table, rig, CAMERA, how)
 
 
-def measure(captures: int, steady_captures: int, mapped: Mapped = map) -> dict[str, Any]:
+def measure(captures: int, steady_captures: int, mapped: Mapper = map) -> dict[str, Any]:
     """Run everything: `captures` of each fault in a camera, `steady_captures` of each kind of steady ones."""
     items: list[tuple[Any, ...]] = []
     for fault in STEADY:
@@ -166,7 +166,7 @@ def main() -> None:
     began, before, kept = (
         time.monotonic(),
         surroundings(),
-        Kept(WORK / "honesty_moves", Path(__file__).read_text("utf-8")),
+        StoredResults(WORK / "honesty_moves", Path(__file__).read_text("utf-8")),
     )
     with workers(options.address, options.cores, kept) as mapped:
         result = measure(options.captures, options.steady_captures, mapped)

@@ -18,7 +18,7 @@ import tyro
 
 from imgcal import InputError, PipelineOptions, RefusedError, calibrate, load_object, load_rig, predicted_error
 from imgcal.evaluation.true_error import true_error
-from imgcal.fleet import Kept, Mapped, workers
+from imgcal.fleet import Mapper, StoredResults, workers
 from imgcal.io import write_text
 from imgcal.synthesis import PoseRange, Truth, simulate_volume, true_detections
 from imgcal.synthesis.rigs import sample_rig_from_object
@@ -120,7 +120,7 @@ def measure(
     snapshots: Sequence[int] = SNAPSHOTS,
     rigs: Mapping[str, str] = RIGS,
     seed: int = 1,
-    mapped: Mapped = map,
+    mapped: Mapper = map,
 ) -> dict[str, Any]:
     """Run all rigs and numbers of snapshots: rig -> snapshots -> what `judge` returns."""
     items = [
@@ -170,7 +170,7 @@ def main() -> None:
     began, before, kept = (
         time.monotonic(),
         surroundings(),
-        Kept(WORK / "honesty_prediction", Path(__file__).read_text("utf-8")),
+        StoredResults(WORK / "honesty_prediction", Path(__file__).read_text("utf-8")),
     )
     with workers(options.address, options.cores, kept) as mapped:
         chosen = {name: RIGS[name] for name in options.rigs}

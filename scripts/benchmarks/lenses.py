@@ -17,7 +17,7 @@ from torch import Tensor
 
 from imgcal import estimate, load_object, load_rig
 from imgcal.estimation import relative_covariance, relative_difference
-from imgcal.geometry import RigidTransform, lens_width, named_lenses, rotation_from_vector
+from imgcal.geometry import RigidTransform, lens_label, lens_width, rotation_from_vector
 from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 from scripts.benchmarks.effort import Effort
 from scripts.output import ROOT, command, fill, markdown, surroundings, write_json
@@ -40,7 +40,7 @@ def rig_of(kind: str) -> CameraRig:
     """Four cameras with a kind of lens, or with all of them in turn."""
     rig, size = load_rig("T4"), torch.tensor([1280, 1024])
     names = [kind if kind != MIXED else list(LENSES)[camera % len(LENSES)] for camera in range(rig.num_cameras)]
-    models = named_lenses(names)
+    models = lens_label(names)
     distortion = torch.zeros(len(names), lens_width(models), dtype=torch.float64)
     for row, name in zip(distortion, names, strict=True):
         row[: len(LENSES[name][1])] = torch.tensor(LENSES[name][1])

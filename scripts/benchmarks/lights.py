@@ -24,7 +24,7 @@ import imgcal
 from imgcal import CalibrationObject, CameraRig, Detections, Observations, RefusedError, RigPrior, estimate
 from imgcal.estimation import relative_covariance, relative_difference
 from imgcal.geometry import RigidTransform
-from imgcal.messages import listed
+from imgcal.messages import list_names
 from imgcal.synthesis import PhysicalDrift, simulate_volume
 from scripts.benchmarks.wand_recording import CALIBRATED, calibrated, recording
 from scripts.output import ROOT, WORK, command, make_folder, read_json, surroundings, write_json
@@ -212,7 +212,7 @@ def stream() -> dict[str, Any]:
     for first, second in PAIRS:
         cases[f"markers {first} and {second}"] = only(labelled, [first, second]), part_of(given.obj, [first, second])
     for line in LINES:
-        cases[f"markers {listed(map(str, line))} in a line"] = only(labelled, line), part_of(given.obj, line)
+        cases[f"markers {list_names(map(str, line))} in a line"] = only(labelled, line), part_of(given.obj, line)
     cases["all as unknown markers"] = given.chosen(CALIBRATED), LIGHTS
     rows: dict[str, Any] = {"whole wand known": {"held_out_px": reference.score(reference.calibration.rig)[0]}}
     for name, (blobs, obj) in cases.items():

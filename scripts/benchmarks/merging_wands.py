@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 import imgcal
 from imgcal import RefusedError
-from imgcal.fleet import Kept, workers
-from imgcal.synthesis import HandHeld, PhysicalDrift, Truth, arranged_rig, simulate_volume
+from imgcal.fleet import StoredResults, workers
+from imgcal.synthesis import HandHeld, PhysicalDrift, Truth, arrange_rig, simulate_volume
 from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError
 from scripts.output import ROOT, WORK, command, markdown, surroundings, write_json
 
@@ -78,7 +78,7 @@ def scene(seed: int) -> tuple[CameraRig, CalibrationObject, Truth, np.random.Gen
     shape, cameras = SHAPES[seed % 3], int(draw.choice(CAMERAS))
     height = 2500.0 if shape != "dome" else 500.0
     target = (0.0, 0.0, 1000.0) if shape != "row" else (0.0, 3500.0, 1200.0)
-    rig = arranged_rig(shape, cameras, float(draw.uniform(2500, 5000)), height=height, target=target)
+    rig = arrange_rig(shape, cameras, float(draw.uniform(2500, 5000)), height=height, target=target)
     name = str(draw.choice(list(WANDS)))
     points = torch.tensor(WANDS[name], dtype=torch.float64)
     obj = CalibrationObject(points, torch.zeros_like(points), name=name)
@@ -236,7 +236,7 @@ def measure(seeds: int, moved: int, last: int, cores: int | None) -> dict[str, A
     items = [Item(seed, False) for seed in range(seeds)] + [Item(1000 + seed, True) for seed in range(moved)]
     items += [Item(2000 + seed, True, 1 + seed % 2) for seed in range(last)]
     rows = []
-    kept = Kept(WORK / "merging_wands", Path(__file__).read_text("utf-8"))
+    kept = StoredResults(WORK / "merging_wands", Path(__file__).read_text("utf-8"))
     with workers(None, cores, kept) as mapped:
         for row in mapped(run, items):
             rows.append(row)

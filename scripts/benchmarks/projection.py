@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from imgcal.estimation import Problem, State, lm_cpu
+from imgcal.estimation import Problem, State, levenberg_marquardt_cpu
 from imgcal.geometry import RigidTransform, project_kornia
 from imgcal.io import load_object, load_rig
 from imgcal.synthesis import synthesize
@@ -228,7 +228,7 @@ def _equations(scene: Scene, upstream: Tensor) -> Run:
     problem = Problem(uv, ones, (points - centroid).contiguous(), centroid, None, rig, prior_std)
     centre = scene.rig_from_object.apply(centroid[None])
     state = State(torch.zeros_like(prior_std), scene.rig_from_object.rotation[:, None].contiguous(), centre)
-    return lambda: lm_cpu.minimize(problem, state, "squared", 1.0, 0, 0.0).equations
+    return lambda: levenberg_marquardt_cpu.minimize(problem, state, "squared", 1.0, 0, 0.0).equations
 
 
 def _measure_synthesis(effort: Effort) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from imgcal.online import RigKeeper
 from imgcal.types import CameraRig, rig_difference
-from imgcal.watch import Intake, JsonLines, Qualisys, Source
+from imgcal.watch import JsonLines, Qualisys, Source, SourceReader
 from scripts.output import ROOT, command, surroundings, write_json
 from tests.imgcal.streams import Stream
 from tests.imgcal.watch.qtm import Qtm, frame, general, packet
@@ -148,7 +148,7 @@ def watched(source: Source, stream: Stream, count: int) -> tuple[list[dict[str, 
     """Follow a source for so many snapshots: events, the rig at the end, times, unreadable packets."""
     events: list[dict[str, Any]] = []
     times: list[float] = []
-    with RigKeeper(stream.rig, stream.obj) as keeper, Intake(source, stream.rig, keep_all=True) as intake:
+    with RigKeeper(stream.rig, stream.obj) as keeper, SourceReader(source, stream.rig, keep_all=True) as intake:
         while len(times) < count:
             snapshot = intake.next(PATIENCE)
             if snapshot is None:

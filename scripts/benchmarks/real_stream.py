@@ -24,7 +24,7 @@ from typing import Any
 import tyro
 
 import imgcal
-from imgcal.fleet import Kept, workers
+from imgcal.fleet import StoredResults, workers
 from imgcal.types import UnknownLights
 from scripts.benchmarks import wand_recording
 from scripts.benchmarks.wand_recording import FOLLOWED, RATE, SEEN, calibrated, recording, turned
@@ -284,7 +284,7 @@ def main() -> None:
         for degrees in options.bumps
         for camera in options.cameras
     ]
-    with workers(None, options.cores, Kept(WORK / "real_stream", f"{rms!r}\n" + "\n".join(texts))) as mapped:
+    with workers(None, options.cores, StoredResults(WORK / "real_stream", f"{rms!r}\n" + "\n".join(texts))) as mapped:
         found = []
         for case, row in zip(cases, mapped(run, cases), strict=True):
             found.append(row)

@@ -12,7 +12,7 @@ from imgcal.estimation import (
     initial_pose,
     initial_state,
     levenberg_marquardt,
-    lm_cpu,
+    levenberg_marquardt_cpu,
     make_problem,
     squared,
 )
@@ -35,14 +35,16 @@ def measure(effort: Effort) -> dict[str, Any]:
 
     problem = make_problem(one.observations, one.factory, one.obj, one.prior_std)
     start = initial_state(problem, one.start, None)
-    compiled = lm_cpu.minimize(problem, start, "squared", 3.0, *LIMITS)
+    compiled = levenberg_marquardt_cpu.minimize(problem, start, "squared", 3.0, *LIMITS)
     tensors = levenberg_marquardt.minimize(problem, start, squared, *LIMITS)
     found = run(one)()
     rigs, snapshots = len(many), long.observations.uv.shape[1]
     cases = {
         "one snapshot, `estimate`": run(one),
         "one snapshot, start pose alone": lambda: initial_pose(one.observations, one.factory, one.obj),
-        "one snapshot, compiled solver alone": lambda: lm_cpu.minimize(problem, start, "squared", 3.0, *LIMITS),
+        "one snapshot, compiled solver alone": lambda: levenberg_marquardt_cpu.minimize(
+            problem, start, "squared", 3.0, *LIMITS
+        ),
         "one snapshot, tensor solver alone": lambda: levenberg_marquardt.minimize(problem, start, squared, *LIMITS),
         "one snapshot, covariance": lambda: camera_covariance(found),  # type: ignore[arg-type]
         f"{rigs} rigs at once, one snapshot each": run(many),

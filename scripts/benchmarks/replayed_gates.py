@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 from imgcal.errors import RefusedError
-from imgcal.fleet import Kept, workers
+from imgcal.fleet import StoredResults, workers
 from scripts.benchmarks import real_stream, replayed_noise, replayed_stream
 from scripts.benchmarks.followed_streams import SURELY, distance
 from scripts.benchmarks.real_stream import LIMIT, QUIET, RATE, SEEN, judge, plain, start
@@ -238,7 +238,7 @@ def main() -> None:
         replayed_noise.CACHE.unlink(missing_ok=True)
     noise = compared()
     modules = (__file__, real_stream.__file__, replayed_noise.__file__, replayed_stream.__file__)
-    kept = Kept(WORK / "replayed_gates", "\n".join(Path(str(name)).read_text("utf-8") for name in modules))
+    kept = StoredResults(WORK / "replayed_gates", "\n".join(Path(str(name)).read_text("utf-8") for name in modules))
     until = time.monotonic() + 60 * options.minutes
     some = takewhile(
         lambda pair: pair[0] < options.count and time.monotonic() < until,

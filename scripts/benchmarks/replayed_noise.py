@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from imgcal.association import associate, observations_of
+from imgcal.association import accepted_observations, associate
 from imgcal.errors import InputError
 from imgcal.estimation import estimate
 from scripts.benchmarks.wand_recording import CALIBRATED, calibrated, recording
@@ -180,7 +180,7 @@ def recorded_residuals() -> Floats:
     given, known = recording(), calibrated()
     calibration, frames = known.calibration, range(CALIBRATED.stop)
     labelled = associate(given.chosen(frames), calibration.rig, calibration.object)
-    observations, poses = observations_of(labelled, calibration.rig, calibration.object)
+    observations, poses = accepted_observations(labelled, calibration.rig, calibration.object)
     fixed = torch.zeros(calibration.rig.num_cameras, calibration.rig.num_parameters, dtype=torch.float64)
     fit = estimate(observations, calibration.rig, calibration.object, poses, prior_std=fixed)
     seen = observations.seen.numpy()

@@ -13,7 +13,7 @@ from torch import Tensor
 
 import imgcal
 from imgcal.geometry import RigidTransform
-from imgcal.synthesis import HandHeld, PhysicalDrift, arranged_rig, sample_path
+from imgcal.synthesis import HandHeld, PhysicalDrift, arrange_rig, sample_path
 from imgcal.types import CalibrationObject, CameraRig, Detections, Volume
 from scripts.benchmarks.replayed_noise import Replay, Series, recorded_series
 from scripts.benchmarks.rig_streams import Blobs, Bump, Conditions, Stream
@@ -68,7 +68,7 @@ def place_of(name: str, seed: int) -> Place:
         low, high = (tuple(row) for row in torch.quantile(where.detach(), ends, dim=0).tolist())
         return Place(recording().factory, calibration.rig, wand, Volume.box(low, high))
     factory = (
-        arranged_rig("ring", 8, 4000.0, height=2500.0, target=(0.0, 0.0, 1000.0))
+        arrange_rig("ring", 8, 4000.0, height=2500.0, target=(0.0, 0.0, 1000.0))
         if name == "ring8"
         else imgcal.load_rig(name)
     )

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 import imgcal
-from imgcal.association import observations_of
+from imgcal.association import accepted_observations
 from imgcal.errors import InputError
 from imgcal.estimation import estimate
 from imgcal.geometry import RigidTransform, rotation_from_vector, undistort
@@ -143,7 +143,7 @@ def calibrated(anew: bool = False) -> Calibrated:
     names = tuple(name for name, keep in zip(scored.snapshot_names, kept, strict=True) if keep)
     blobs = replace(blobs, snapshot=row[blobs.snapshot], snapshot_names=names)
     labelled = imgcal.score(blobs, calibration.rig, calibration.object).labelled
-    observations, poses = observations_of(labelled, calibration.rig, calibration.object)
+    observations, poses = accepted_observations(labelled, calibration.rig, calibration.object)
     if poses is None:
         raise InputError(f"{FOLDER}: found scored frames without a pose")
     result = Calibrated(calibration, observations, poses)

@@ -6,14 +6,12 @@ import numpy as np
 import torch
 
 import imgcal
-from imgcal.io import unplaced
+from imgcal.io import drop_poses
 from imgcal.pipeline import calibrate_from_scratch
-from imgcal.synthesis import HandHeld, Lens, PhysicalDrift, arranged_rig, simulate_volume, true_detections
+from imgcal.synthesis import HandHeld, Lens, PhysicalDrift, arrange_rig, simulate_volume, true_detections
 
 generator = torch.Generator().manual_seed(1)
-planned = arranged_rig(
-    "ring", 6, radius=3500.0, height=2200.0, target=(0.0, 0.0, 1000.0), lens=Lens((1280, 1024), 70.0)
-)
+planned = arrange_rig("ring", 6, radius=3500.0, height=2200.0, target=(0.0, 0.0, 1000.0), lens=Lens((1280, 1024), 70.0))
 wand = imgcal.load_object("wand4")
 truth = simulate_volume(planned, wand, 100, generator, PhysicalDrift(), hand=HandHeld(speed=800.0))
 
@@ -22,7 +20,7 @@ noise = np.random.default_rng(1).normal(scale=0.1, size=exact.uv.shape)  # px
 blobs = replace(exact, uv=exact.uv + noise, fiducial=np.full(len(exact), -1))  # nobody says which blob is which
 rough = replace(planned, focal_length=1.1 * planned.focal_length)
 
-result = calibrate_from_scratch(blobs, unplaced(rough), wand)
+result = calibrate_from_scratch(blobs, drop_poses(rough), wand)
 found, true = (torch.cdist(rig.positions, rig.positions) for rig in (result.rig, truth.rig))
 print(f"{len(result.labelled.used)} snapshots, identity {result.identity}, RMS {float(result.rms):.3f} px")
 print(

@@ -6,7 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-from imgcal.formats import FORMATS, Format, converted, from_camera_rig, selected
+from imgcal.formats import FORMATS, Format, convert_rig, from_camera_rig, select_cameras
 from imgcal.types import CameraRig
 
 QUALISYS = """<calibration source="x"><cameras>{cameras}</cameras></calibration>"""
@@ -43,10 +43,10 @@ def prepare_foreign(folder: Path, rig: CameraRig) -> None:
     for one in FORMATS:
         if one.write is None:
             continue
-        few = selected(bare, rig.camera_names[: one.cameras[1]])
+        few = select_cameras(bare, rig.camera_names[: one.cameras[1]])
         place = folder / one.name
         place.mkdir(parents=True)
-        for name, content in converted(few, one.name, "rig", limit=5.0).files.items():
+        for name, content in convert_rig(few, one.name, "rig", limit=5.0).files.items():
             (place / (name or _file_name(one))).write_bytes(content)
     for name, (whole, part, encoding) in WRITTEN_BY_HAND.items():
         cameras = "".join(part.format(name=f"cam{n}", place=200.0 * n) for n in range(3))

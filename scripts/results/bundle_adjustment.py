@@ -30,7 +30,7 @@ from imgcal.evaluation.protocol import Sample, draw
 from imgcal.geometry import vector_from_rotation
 from imgcal.io import load_object, load_rig
 from imgcal.networks import load_network
-from imgcal.refinement import as_prediction, observed
+from imgcal.refinement import make_observations, make_prediction
 from imgcal.synthesis import PoseRange, RelativeDrift
 from imgcal.types import CameraRig, Prediction, pack21
 from scripts.output import BLUE, GREEN, GREY, RED, RESULTS, command, figure, surroundings, write_json
@@ -97,7 +97,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def pose_by_pnp(given: Given) -> Prediction:
     """The factory rig, and a pose by PnP over all cameras: where every bundle adjustment here begins."""
-    observations = observed(given.uv, given.seen, given.sigma)
+    observations = make_observations(given.uv, given.seen, given.sigma)
     return Prediction(given.factory.expand(len(given.uv)), initial_pose(observations, given.factory, given.obj)[:, 0])
 
 
@@ -125,12 +125,12 @@ def _map(sample: Sample, iterations: int) -> Column:
     for row in range(len(sample)):
         one = slice(row, row + 1)
         given = sample.given(one)
-        observations = observed(given.uv, given.seen, given.sigma)
+        observations = make_observations(given.uv, given.seen, given.sigma)
         pose = initial_pose(observations, given.factory, given.obj)
         start = time.perf_counter()
         found = estimate(observations, given.factory, given.obj, pose, prior_std=given.prior_std, options=limits)
         seconds.append(time.perf_counter() - start)
-        errors += _errors(as_prediction(found), sample, one)
+        errors += _errors(make_prediction(found), sample, one)
     return Column(errors, seconds)
 
 
@@ -139,7 +139,7 @@ def _plain(sample: Sample, iterations: int, trials: int) -> Column:
     errors, seconds = [], []
     for row in range(trials):
         given = sample.given(slice(row, row + 1))
-        observations = observed(given.uv, given.seen, given.sigma)
+        observations = make_observations(given.uv, given.seen, given.sigma)
         pose = initial_pose(observations, given.factory, given.obj)[:, 0]
         start = numbers_of(given.factory.expand(1).from_object(pose)[0])
         points, uv = given.obj.points.numpy(), given.uv[0].numpy()

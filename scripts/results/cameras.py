@@ -22,7 +22,7 @@ from imgcal.evaluation.protocol import draw
 from imgcal.io import load_object, load_rig, write_text
 from imgcal.report import DrawnRig, rig_scene, rig_view_script
 from imgcal.synthesis import RelativeDrift
-from imgcal.training import experiment_of
+from imgcal.training import checkpoint_experiment
 from imgcal.types import CameraRig, Prediction
 from scripts.output import ROOT, command, make_folder
 
@@ -97,7 +97,7 @@ def _chosen(options: Options) -> tuple[Conditions, Method, str]:
         name = "factory, pose fitted"
         return Conditions(rig, obj, drift=RelativeDrift()), BASELINES[name], name
     [model] = load_models([options.model])
-    name = experiment_of(model.checkpoint.experiment).name + (" + refinement" if options.refined else "")
+    name = checkpoint_experiment(model.checkpoint.experiment).name + (" + refinement" if options.refined else "")
     return model.conditions, model.method, name
 
 

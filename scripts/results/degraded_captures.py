@@ -25,7 +25,7 @@ import tyro
 
 import imgcal
 from imgcal.errors import InputError, RefusedError
-from imgcal.fleet import Kept, workers
+from imgcal.fleet import StoredResults, workers
 from imgcal.pipeline import DETECTORS
 from imgcal.types import CalibrationObject, CameraRig, Detections
 from scripts.output import RESULTS, ROOT, WORK, command, fill, markdown, read_json, surroundings, write_json
@@ -238,7 +238,7 @@ def main(
             for level in DEGRADATIONS[kind].levels
             for detector in detectors
         ]
-        kept = Kept(WORK / "degraded_captures", Path(degradations.__file__).read_text())
+        kept = StoredResults(WORK / "degraded_captures", Path(degradations.__file__).read_text())
         rows = []
         with workers(cores=1, kept=kept) as mapped:
             for case, row in zip(cases, mapped(measured, cases), strict=True):

@@ -22,21 +22,21 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from imgcal.errors import InputError
-from imgcal.evaluation import refined_by_sightings, reprojection_error
+from imgcal.evaluation import refine_by_positions, reprojection_error
 from imgcal.io import data_path
 from imgcal.networks import (
     Checkpoint,
     HueCentroidNetwork,
     ImageNetwork,
     NetworkConfig,
-    Sightings,
+    Positions,
     build,
     load_checkpoint,
     warm_start,
 )
 from imgcal.refinement import (
     ImageRefinementOptions,
-    as_prediction,
+    make_prediction,
     refine_images,
     refine_points,
     refine_robustly,
@@ -153,7 +153,7 @@ def of_network(network: ImageNetwork, shown: Shown, model: Checkpoint) -> dict[s
     last = passes[-1]
     result = of_positions(sightings, shown) | {"one_pass_px": median(passes[0], shown, model)}
     result["last_pass_px"] = median(last, shown, model)
-    found = refined_by_sightings(last, sightings, model.rig, model.obj, model.drift_std)
+    found = refine_by_positions(last, sightings, model.rig, model.obj, model.drift_std)
     result |= refined("points", found, shown, model)
     few = slice(0, RENDERED)
     result |= refined("images", by_images(last[few], shown[few], model), shown[few], model)
@@ -182,7 +182,7 @@ def of_hue(network: HueCentroidNetwork, shown: Shown, model: Checkpoint) -> dict
     return result | best["points"] | best["pnp"] | images
 
 
-def looked(network: ImageNetwork | HueCentroidNetwork, shown: Shown) -> tuple[list[Prediction], Sightings]:
+def looked(network: ImageNetwork | HueCentroidNetwork, shown: Shown) -> tuple[list[Prediction], Positions]:
     """Predictions of all passes, and positions; a few rigs at a time."""
     parts, seen = [], []
     for start in range(0, len(shown.images), BATCH):
@@ -190,11 +190,11 @@ def looked(network: ImageNetwork | HueCentroidNetwork, shown: Shown) -> tuple[li
         parts.append(network.trunk(sightings.uv, sightings.weight))
         seen.append(sightings)
     passes = [Prediction.cat(part) for part in zip(*parts, strict=True)]
-    joined = Sightings(*(torch.cat([getattr(one, name) for one in seen]) for name in ("uv", "sigma", "confidence")))
+    joined = Positions(*(torch.cat([getattr(one, name) for one in seen]) for name in ("uv", "sigma", "confidence")))
     return passes, joined
 
 
-def of_positions(sightings: Sightings, shown: Shown) -> dict[str, float]:
+def of_positions(sightings: Positions, shown: Shown) -> dict[str, float]:
     """Errors of positions, in pixels of the sensor, of dots that are there; and what is claimed wrongly."""
     uv, seen = shown.drawn.views.uv, shown.drawn.views.seen
     assert uv is not None and seen is not None
@@ -213,7 +213,7 @@ def by_cauchy(
     guess: Prediction, views: Views, factory: CameraRig, obj: CalibrationObject, prior_std: Tensor, *, sigma: float
 ) -> Prediction:
     """The refinement that image networks get, with one sigma for all points."""
-    return as_prediction(refine_points(guess, views, factory, obj, prior_std, sigma))
+    return make_prediction(refine_points(guess, views, factory, obj, prior_std, sigma))
 
 
 def by_images(guess: Prediction, shown: Shown, model: Checkpoint) -> Prediction:
@@ -224,7 +224,7 @@ def by_images(guess: Prediction, shown: Shown, model: Checkpoint) -> Prediction:
         rows = slice(start, start + BATCH)
         start_at = guess[rows].detach().to(torch.float64)
         fit, _ = refine_images(start_at, shown.images[rows], model.rig, model.obj, model.drift_std, options)
-        parts.append(as_prediction(fit))
+        parts.append(make_prediction(fit))
     return Prediction.cat(parts)
 
 

@@ -24,14 +24,14 @@ from imgcal.formats import (
     ForeignRig,
     Format,
     Lens,
-    converted,
+    convert_rig,
     in_millimetres,
     known_points,
     millimetres,
     read_foreign_rig,
-    selected,
+    select_cameras,
 )
-from imgcal.formats.values import rotation_of_vector
+from imgcal.formats.values import rotation_from_vector
 from scripts.output import RESULTS, ROOT, command, fill, markdown, read_json, surroundings, write_json
 from scripts.results.format_readers import READERS
 
@@ -78,11 +78,11 @@ def reading(one: Format) -> dict[str, Any]:
 def writing(one: Format, pythons: list[str]) -> dict[str, Any]:
     """How far off the tool itself sees known points by what was written; by our own reader, too."""
     rig = sample(one)
-    made = converted(rig, one.name, "rig")
+    made = convert_rig(rig, one.name, "rig")
     row: dict[str, Any] = {"own_reader_px": made.round_trip, "reader": None, "worst_px": None}
     if one.name not in READERS:
         return row
-    placed = rig.seen_from_first() if one.from_first else rig
+    placed = rig.in_camera_frame() if one.from_first else rig
     points = {camera.name: at for camera, at in zip(placed.cameras, known_points(placed), strict=True)}
     scale = 1.0 / millimetres(one.unit)
     with tempfile.TemporaryDirectory() as folder:
@@ -123,11 +123,11 @@ def sample(one: Format) -> ForeignRig:
         lenses[1] = Lens((800.0, 801.0), (639.0, 470.0), (0.05, -0.02, 0.001, 0.002))
     cameras = []
     for number, lens in enumerate(lenses):
-        rotation = rotation_of_vector(np.array([0.05, -0.12 + 0.1 * number, 0.02 * number]))
+        rotation = rotation_from_vector(np.array([0.05, -0.12 + 0.1 * number, 0.02 * number]))
         centre = np.array([300.0 * number - 90.0, 12.0 * number, 40.0 + 25.0 * number])
         cameras.append(ForeignCamera(str(number), lens, (1280, 960), rotation, -rotation @ centre))
     rig = ForeignRig("sample", tuple(cameras), "mm", "its own")
-    return selected(rig, tuple(rig.names[: one.cameras[1]]))
+    return select_cameras(rig, tuple(rig.names[: one.cameras[1]]))
 
 
 def table(result: dict[str, Any]) -> str:

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import imgcal
-from imgcal.association import IdentityOptions, Proposer, Snapshot, judge, matched_to_rig, track
+from imgcal.association import IdentityOptions, Proposer, Snapshot, judge, match_to_rig, track
 from imgcal.detection import detect_snapshot, to_detections
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.matching import MatchedFilter
 from imgcal.networks import InfraredNetwork, Measurer, Queries, load_infrared, load_measurer
-from imgcal.pipeline.learned import LearnedProposer
+from imgcal.pipeline.learned_proposer import LearnedProposer
 from imgcal.synthesis import DIFFICULTIES, Difficulty, FrameModel, PhysicalDrift, simulate_shots, simulate_truth
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 from scripts.output import RESULTS, ROOT, command, markdown, read_json, replaced, surroundings, write_json
@@ -140,7 +140,7 @@ def cases(rig: CameraRig, obj: CalibrationObject, difficulty: Difficulty, count:
     for _ in range(count):
         truth = simulate_truth(rig, obj, 1, draw, PhysicalDrift())
         shot = next(iter(simulate_shots(truth, obj, FrameModel(difficulty=difficulty), draw)))
-        blobs = matched_to_rig(
+        blobs = match_to_rig(
             to_detections([detect_snapshot(shot.frames, imgcal.DetectionOptions())], rig.camera_names, ("0",)), rig
         )
         snapshot = Snapshot(shot.frames, blobs, rig, obj, (rig.prior or RigPrior()).std(rig))

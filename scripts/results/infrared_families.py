@@ -27,9 +27,9 @@ from imgcal.association import Snapshot
 from imgcal.errors import InputError
 from imgcal.networks import InfraredNetwork, load_infrared
 from imgcal.networks.infrared_encoders import ENCODERS
-from imgcal.pipeline.learned import LearnedProposer
+from imgcal.pipeline.learned_proposer import LearnedProposer
 from imgcal.synthesis import DIFFICULTIES
-from imgcal.training import InfraredTask, changed, load_experiment
+from imgcal.training import InfraredTask, change_experiment, load_experiment
 from imgcal.types import Detections
 from scripts.output import (
     BLUE,
@@ -130,7 +130,7 @@ def size_of(network: InfraredNetwork) -> dict[str, Any]:
 def on_crops(network: InfraredNetwork, crops: int) -> dict[str, float]:
     """Right of the visible, wrong of the claimed, NEES: crops as bad as the training's, the same for all."""
     values = [f"network.encoder={network.config.encoder}", f"training.validation_rigs={crops}"]
-    experiment = changed(load_experiment(EXPERIMENT), *values)
+    experiment = change_experiment(load_experiment(EXPERIMENT), *values)
     task = experiment.make_task(torch.device("cpu"), BATCH, torch.Generator(), fresh=False)
     assert isinstance(task, InfraredTask)
     said = task.validate(lambda batch: task.predict(network, batch))

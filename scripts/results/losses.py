@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from imgcal.errors import InputError
 from imgcal.nn import project_fiducials
-from imgcal.training import RigExperiment, RigTask, changed, load_experiment, prepare, train_step
+from imgcal.training import RigExperiment, RigTask, change_experiment, load_experiment, prepare, train_step
 from imgcal.training.engine import check_finite
 from imgcal.training.losses import (
     distortion_size,
@@ -59,7 +59,7 @@ def main(arguments: list[str] | None = None) -> None:
         raise InputError(f"--minutes: found {options.minutes:g}, expected more than 0")
     loss = f"loss={{kind: paper, paper: {{reprojection_from: {NEVER}}}}}"
     chosen = load_experiment(options.experiment, kind=RigExperiment)
-    experiment = changed(chosen, *options.set, loss, "training.validation_rigs=0")
+    experiment = change_experiment(chosen, *options.set, loss, "training.validation_rigs=0")
     result = surroundings() | watched(experiment, options)
     write_json(options.out / "losses.json", result)
     draw(result, options.out / "losses.png")
@@ -92,7 +92,7 @@ def watched(experiment: RigExperiment, options: Options) -> dict[str, Any]:
     while (part := (monotonic() - began) / (60 * options.minutes)) < 1:
         if part > 1 / 3 and second_stage is None:
             second_stage = run.step
-            task.experiment = changed(task.experiment, f"loss.paper.reprojection_from={run.step}")
+            task.experiment = change_experiment(task.experiment, f"loss.paper.reprojection_from={run.step}")
         run.schedule.set_progress(part)
         train_step(run)
         if run.step % options.every == 0:

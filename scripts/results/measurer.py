@@ -142,7 +142,7 @@ def judged(views: list[Seen], measurer: LearnedMeasurer | None, alone: bool) -> 
     for view in views:
         blobs = view.blobs
         if measurer is not None and len(blobs.uv):
-            said = measurer.measured(view.frames, blobs, DetectionOptions())
+            said = measurer.measure(view.frames, blobs, DetectionOptions())
             kinds.append(said.kind.argmax(1)[view.row])
             blobs = measurer(view.frames, blobs, DetectionOptions())
             if alone:

@@ -31,11 +31,11 @@ from imgcal.evaluation import (
     load_models,
     sweep,
 )
-from imgcal.fleet import Mapped
+from imgcal.fleet import Mapper
 from imgcal.io import read_metrics, read_texts
 from imgcal.networks.checkpoint import FORMAT
 from imgcal.synthesis import Corruption, RelativeDrift
-from imgcal.training import RigExperiment, experiment_of
+from imgcal.training import RigExperiment, checkpoint_experiment
 from scripts.output import surroundings
 
 NOISE = Corruption(noise=0.1)
@@ -95,7 +95,7 @@ def find(runs: Path, models: Path) -> list[Source]:
 
 
 def measure(
-    source: Source, effort: Effort, device: str, trained_on: str, mapped: Mapped = map, known: Mapping[str, Any] = {}
+    source: Source, effort: Effort, device: str, trained_on: str, mapped: Mapper = map, known: Mapping[str, Any] = {}
 ) -> dict[str, Any]:
     """Evaluate one network.
 
@@ -108,7 +108,7 @@ def measure(
         known: what was measured of the same weights before: times, training and its history stay as they are.
     """
     [model] = load_models([source.path], device=device)
-    name, images = experiment_of(model.checkpoint.experiment).name, model.method.images is not None
+    name, images = checkpoint_experiment(model.checkpoint.experiment).name, model.method.images is not None
     count = min(effort.count, effort.image_count) if images else effort.count
     exact = Protocol(count, effort.trials)
     few = Protocol(min(effort.extra, count), effort.trials)
@@ -117,7 +117,7 @@ def measure(
     check = check_encoder(model.checkpoint.network, model.conditions)
     result = {
         "experiment": name,
-        "label": label(experiment_of(model.checkpoint.experiment)),
+        "label": label(checkpoint_experiment(model.checkpoint.experiment)),
         "seed": source.seed,
         "encoder": None if check is None else vars(check) | {"rise": check.rise, "used": check.used},
         "sha256": source.sha256,
@@ -168,7 +168,7 @@ def swept(source: Source, count: int, device: str) -> dict[str, Any]:
     methods = {NETWORK: model.method, WITHOUT: BASELINES[WITHOUT]}
     drift = model.conditions.drift
     result: dict[str, Any] = {
-        "experiment": experiment_of(model.checkpoint.experiment).name,
+        "experiment": checkpoint_experiment(model.checkpoint.experiment).name,
         "sha256": source.sha256,
         "rigs": count,
         "trained_kappa": drift.kappa_intrinsics if isinstance(drift, RelativeDrift) else None,
@@ -197,7 +197,7 @@ def label(experiment: RigExperiment) -> str:
 
 def training_of(model: Model, trained_on: str) -> dict[str, Any]:
     """What a training took."""
-    metrics, experiment = model.checkpoint.metrics, experiment_of(model.checkpoint.experiment)
+    metrics, experiment = model.checkpoint.metrics, checkpoint_experiment(model.checkpoint.experiment)
     start = experiment.training.init_from
     starts = [start] if isinstance(start, str) else start or []
     return {
@@ -259,7 +259,7 @@ def _scores(scores: Scores) -> dict[str, Any]:
 
 
 def evaluated(
-    methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol, what: str, mapped: Mapped = map
+    methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol, what: str, mapped: Mapper = map
 ) -> Evaluation:
     """Evaluate, and say on standard error how far it is and how long it took."""
     began = monotonic()

@@ -19,7 +19,7 @@ import tyro
 from imgcal.cli.training_folder import STATE, train_in
 from imgcal.errors import InputError
 from imgcal.io import shipped_names
-from imgcal.training import RigExperiment, changed, finished, load_experiment
+from imgcal.training import RigExperiment, change_experiment, is_finished, load_experiment
 from scripts.output import command
 
 Size = Literal["full", "reduced", "toy"]
@@ -119,7 +119,7 @@ def train(options: Options) -> list[str]:
                 if experiment.training.threads is not None:
                     torch.set_num_threads(experiment.training.threads)
                 run = train_in(folder, experiment, (folder / STATE).exists(), out_of_time)
-                if finished(run, run.seconds):
+                if is_finished(run, run.seconds):
                     (folder / "done").touch()
                     continue
             left.append(folder.name)
@@ -159,7 +159,7 @@ def sized(row: str, options: Options, seed: int) -> RigExperiment:
     if options.size != "full" or options.steps is not None:
         # The paper's second stage begins after 10,000 of its 300,000 steps.
         changes.append(f"loss.paper.reprojection_from={steps // 3}")
-    return changed(experiment, *changes, f"training.steps={steps}")
+    return change_experiment(experiment, *changes, f"training.steps={steps}")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import tyro
 from torch import Tensor
 
 from imgcal.networks import InfraredNetwork, load_infrared
-from imgcal.training import InfraredTask, changed, load_experiment
+from imgcal.training import InfraredTask, change_experiment, load_experiment
 from imgcal.training.infrared_task import CropBatch
 from scripts.output import RED, RESULTS, ROOT, command, figure, fill, markdown, surroundings, write_json
 
@@ -57,7 +57,7 @@ def main(options: Options) -> None:
 
 def crops_of(network: InfraredNetwork, count: int) -> CropBatch:
     """Crops that no training has seen."""
-    experiment = changed(load_experiment("ir-cnn"), f"network.encoder={network.config.encoder}")
+    experiment = change_experiment(load_experiment("ir-cnn"), f"network.encoder={network.config.encoder}")
     task = experiment.make_task(torch.device("cpu"), count, torch.Generator(), fresh=False)
     assert isinstance(task, InfraredTask)
     return task.batch(count, torch.Generator().manual_seed(SEED))

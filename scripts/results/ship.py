@@ -17,7 +17,7 @@ from imgcal.errors import InputError
 from imgcal.evaluation import reprojection_error
 from imgcal.networks import Checkpoint, load_checkpoint, save_checkpoint
 from imgcal.synthesis import render_views, synthesize
-from imgcal.training import RigExperiment, changed, experiment_of
+from imgcal.training import RigExperiment, change_experiment, checkpoint_experiment
 from imgcal.types import Views
 from scripts.output import command, make_folder
 
@@ -42,7 +42,7 @@ def main(arguments: list[str]) -> None:
     make_folder(options.out)
     for run in options.runs:
         trained = load_checkpoint(run / "model.safetensors", trusted=options.trust)
-        experiment = portable(experiment_of(trained.experiment))
+        experiment = portable(checkpoint_experiment(trained.experiment))
         kind = experiment.name.split("-")[1]
         path = options.out / f"{kind}-{experiment.rig}-{experiment.object}.safetensors"
         save_checkpoint(path, replace(trained, experiment=experiment), torch.bfloat16)
@@ -56,7 +56,7 @@ def portable(experiment: RigExperiment) -> RigExperiment:
     if start is None:
         return experiment
     names = [_name(path) for path in ([start] if isinstance(start, str) else start)]
-    return changed(experiment, f"training.init_from=[{', '.join(names)}]")
+    return change_experiment(experiment, f"training.init_from=[{', '.join(names)}]")
 
 
 def _name(path: str) -> str:

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import tyro
 
 from imgcal.errors import InputError
-from imgcal.fleet import Kept, workers
+from imgcal.fleet import StoredResults, workers
 from imgcal.io import shipped_names, write_text
 from imgcal.training import RigExperiment, load_experiment
 from scripts.output import RESULTS, ROOT, WORK, command, read_json, replaced, write_json
@@ -129,7 +129,7 @@ def _measure(options: Options, source: Source, place: Path) -> None:
     """Evaluate a network; what a stopped call has done is kept beside the runs until all is."""
     known = read_json(place) if place.is_file() else {}
     same = known if known.get("sha256") == source.sha256 else {}
-    kept = Kept(options.work / source.sha256[:16], source.sha256)
+    kept = StoredResults(options.work / source.sha256[:16], source.sha256)
     with workers(options.address, options.cores, kept) as mapped:
         write_json(place, measure(source, options.effort, options.device, options.machine, mapped, same))
     kept.clear()

@@ -31,16 +31,16 @@ from imgcal.formats import (
     ForeignRig,
     Lens,
     Updated,
-    converted,
+    convert_rig,
+    fill_image_sizes,
     from_camera_rig,
     in_millimetres,
     known_points,
     millimetres,
     read_foreign_rig,
     to_camera_rig,
-    with_image_sizes,
     worst_difference,
-    written_back,
+    write_into,
 )
 from imgcal.formats.limits import HELD_DISTORTION
 from imgcal.synthesis import PhysicalDrift, simulate_volume, true_detections
@@ -128,14 +128,14 @@ def by_hand(name: str) -> bytes:
     rig = rigs.rig_of(*[lens] * 4, names=("0", "1", "2", "3"))
     if name == "vicon":
         return originals.vicon(rig)
-    return next(iter(converted(rig, name, "rig").files.values()))
+    return next(iter(convert_rig(rig, name, "rig").files.values()))
 
 
 def write_and_compare(one: Original, folder: Path) -> dict[str, Any]:
     """Drift, calibrate, write back, read again: a row of the table; leaves the recalibrated rig in `rig.yaml`."""
     old = read_foreign_rig(one.path, one.name)
     known = in_millimetres(old, str(one.path), one.unit)
-    known = with_image_sizes(known, str(one.path), sizes_of(one, known))
+    known = fill_image_sizes(known, str(one.path), sizes_of(one, known))
     rig = to_camera_rig(converted_lenses(known), "rig")
     made, how, limit = recalibrate_into(one, rig, folder)
     ours = from_camera_rig(load_rig(folder / "rig.yaml"))
@@ -195,14 +195,14 @@ def put_back(one: Original, folder: Path, limit: float) -> Updated:
         RefusedError: the lens of the file is off by more than the limit.
     """
     ours = from_camera_rig(load_rig(folder / "rig.yaml"))
-    return written_back(ours, [one.path], datetime.now(), name=one.name, unit=one.unit, limit=limit)
+    return write_into(ours, [one.path], datetime.now(), name=one.name, unit=one.unit, limit=limit)
 
 
 def converted_lenses(rig: ForeignRig) -> ForeignRig:
     """The rig with lenses that a rig file of ours can say, as `imgcal convert` makes it."""
-    from imgcal.formats.conversion import NATIVE, held_by
+    from imgcal.formats.conversion import NATIVE, fit_to_target
 
-    return held_by(rig, NATIVE, "imgcal rig").rig
+    return fit_to_target(rig, NATIVE, "imgcal rig").rig
 
 
 def sizes_of(one: Original, rig: ForeignRig) -> dict[str, tuple[int, int]]:
@@ -251,7 +251,7 @@ def moved(before: ForeignRig, after: ForeignRig) -> float:
 def by_plain_reader(one: Original, out: Path, old: ForeignRig, ours: ForeignRig) -> float:
     """The worst distance between where an independent reader and the rig project known points: px."""
     alone = len(old.cameras) == 1  # and has no pose
-    placed = ours.seen_from_first(old.root or 0) if alone or old.root is not None else ours
+    placed = ours.in_camera_frame(old.root or 0) if alone or old.root is not None else ours
     scale = 1.0 / millimetres(one.unit or old.unit or "mm")
     projections = READERS[one.name][1](out)
     worst = 0.0

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from imgcal.geometry import lens_width, named_lenses
+from imgcal.geometry import lens_label, lens_width
 from imgcal.types import CameraRig
 
 LENSES = {
@@ -27,4 +27,4 @@ def lensed(rig: CameraRig, kind: str) -> CameraRig:
     distortion = torch.zeros(len(names), lens_width(tuple(names)), dtype=rig.distortion.dtype)
     for row, name in zip(distortion, names, strict=True):
         row[: len(LENSES[name])] = torch.tensor(LENSES[name])
-    return replace(rig, distortion=distortion, lens_model=named_lenses(names), name=f"{rig.name}-{kind}")
+    return replace(rig, distortion=distortion, lens_model=lens_label(names), name=f"{rig.name}-{kind}")

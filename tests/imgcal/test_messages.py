@@ -6,27 +6,27 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.messages import LONGEST, MOST_QUOTED, brief_repr, listed, one_line, quoted, shortened
+from imgcal.messages import LONGEST, MOST_QUOTED, brief_repr, list_names, one_line, quote, shorten
 
 
 @pytest.mark.parametrize("length", [0, 1, 40, 41, 10_000])
 def test_names_are_kept_or_cut(length: int) -> None:
-    found = shortened("n" * length)
+    found = shorten("n" * length)
     assert found == "n" * length if length <= 40 else found == "n" * 37 + "..."
 
 
 @pytest.mark.parametrize("length", [0, MOST_QUOTED, MOST_QUOTED + 1, 10**6])
 def test_quotes_are_kept_or_cut(length: int) -> None:
-    found = quoted("q" * length)
+    found = quote("q" * length)
     assert len(found) == min(length, MOST_QUOTED) and found.endswith("...") == (length > MOST_QUOTED)
 
 
 def test_lists_say_how_many_they_leave_out() -> None:
-    assert listed([]) == "" and listed(["a", "b"]) == "a, b"
+    assert list_names([]) == "" and list_names(["a", "b"]) == "a, b"
     names = [f"camera{n:03}" for n in range(300)]
-    found = listed(iter(names))
+    found = list_names(iter(names))
     assert found == "camera000, camera001, camera002, camera003, ... (300 in all)"
-    assert len(listed(["x" * 5000] * 5000)) < MOST_QUOTED + 50
+    assert len(list_names(["x" * 5000] * 5000)) < MOST_QUOTED + 50
 
 
 def test_one_line_is_one_line_of_text() -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from renderers import NO_BLOBS, BlobRange, ClutterModel, draped, render_blobs, sample_clutter
+from renderers import NO_BLOBS, BlobRange, ClutterModel, drape_spots, render_blobs, sample_clutter
 from tests.renderers.scenes import blobs, centroid, tilted
 
 SIZE = (64, 80)
@@ -70,12 +70,12 @@ def test_drapes_hide_what_lies_behind_them():
     offsets = torch.tensor([40.0, 50.0, -20.0, -10.0])  # 20 <= u <= 40, 10 <= v <= 50
     drapes = torch.cat([normals, offsets[:, None]], dim=-1)[None]
     spots = blobs(torch.tensor([[30.0, 30.0], [40.0, 30.0], [60.0, 30.0], [20.0, 20.0]]), 4.0)
-    cut = draped(spots, drapes)
+    cut = drape_spots(spots, drapes)
     light, seen = render_blobs(cut, SIZE, 0.5)
     torch.testing.assert_close(seen, torch.tensor([0.0, 0.5, 1.0, 0.5]), atol=2e-3, rtol=0)
     assert light[10:50, 22:38].max() < 1e-3
     assert light[30, 42] > 0.99
-    twice = draped(replace(cut, visible=cut.visible), drapes)
+    twice = drape_spots(replace(cut, visible=cut.visible), drapes)
     torch.testing.assert_close(render_blobs(twice, SIZE, 0.5)[0], light)
 
 

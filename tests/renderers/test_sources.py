@@ -4,17 +4,17 @@ from pathlib import Path
 
 import pytest
 
-from renderers.sources import _digest, _imported, _source, source_digest
+from renderers.sources import _digest, _imported_modules, _source, source_digest
 
 
 @pytest.fixture(autouse=True)
 def _read_again():
     for name in ("estimation.linearization_cpu", "geometry.projection_cpu", "geometry.transforms"):
         importlib.import_module(f"imgcal.{name}")
-    for cached in (_digest, _imported, _source):
+    for cached in (_digest, _imported_modules, _source):
         cached.cache_clear()
     yield
-    for cached in (_digest, _imported, _source):
+    for cached in (_digest, _imported_modules, _source):
         cached.cache_clear()
 
 
@@ -35,14 +35,14 @@ def test_a_digest_changes_with_all_that_is_imported(
     edited = tmp_path / "edited.py"
     edited.write_text(Path(module.__file__ or "").read_text() + "\n")
     monkeypatch.setattr(module, "__file__", str(edited))
-    for cached in (_digest, _imported, _source):
+    for cached in (_digest, _imported_modules, _source):
         cached.cache_clear()
     assert (source_digest("imgcal.geometry.lens_kernels") != before) == counts
 
 
 def test_a_name_that_a_package_lends_is_that_of_its_module() -> None:
-    assert "imgcal.geometry.kernels" in _imported("imgcal.estimation.linearization_cpu")
-    assert "imgcal.geometry.lens_kernels" in _imported("imgcal.geometry.projection_cpu")
+    assert "imgcal.geometry.kernels" in _imported_modules("imgcal.estimation.linearization_cpu")
+    assert "imgcal.geometry.lens_kernels" in _imported_modules("imgcal.geometry.projection_cpu")
 
 
 def test_what_has_no_file_has_a_digest_nevertheless() -> None:

@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 import imgcal
-from imgcal.synthesis import arranged_rig
+from imgcal.synthesis import arrange_rig
 from scripts.benchmarks.replayed_noise import BRIDGED, LEAST_RUN, Replay, Series, series_of, statistics
 from scripts.benchmarks.replayed_stream import REPLAYED, Disturbances, Place, ReplayedStream, calibrated_stream
 from scripts.benchmarks.rig_streams import Bump
@@ -66,7 +66,7 @@ def test_more_markers_than_were_recorded_share_the_shift_and_nothing_else():
 
 @pytest.fixture
 def place():
-    rig = arranged_rig("ring", 4, 3000.0, height=2000.0, target=(0.0, 0.0, 1000.0))
+    rig = arrange_rig("ring", 4, 3000.0, height=2000.0, target=(0.0, 0.0, 1000.0))
     assert rig.volume is not None
     return Place(rig, rig, imgcal.load_object("wand4"), rig.volume)
 

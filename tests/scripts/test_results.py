@@ -10,7 +10,7 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.networks import Checkpoint, build_network, save_checkpoint
-from imgcal.training import changed, load_experiment
+from imgcal.training import change_experiment, load_experiment
 
 FOLDER = Path(__file__).parents[2] / "scripts" / "results"
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "tables.md"
@@ -29,7 +29,7 @@ def trained(tmp_path):
     """Pretend that an experiment was trained; returns its file."""
 
     def make(name, *changes, folder=None):
-        experiment = changed(load_experiment(name), *changes)
+        experiment = change_experiment(load_experiment(name), *changes)
         rig, obj = experiment.load_rig(), experiment.load_object()
         torch.manual_seed(1)
         run = tmp_path / "runs" / (folder or name)

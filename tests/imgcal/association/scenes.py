@@ -7,7 +7,7 @@ import torch
 
 from imgcal.association.blobs import PaddedBlobs, gather
 from imgcal.association.hypotheses import Poses
-from imgcal.association.verify import Scene
+from imgcal.association.verification import Scene
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.synthesis.rigs import RelativeDrift, synthesize
 from imgcal.types.calibration_object import CalibrationObject

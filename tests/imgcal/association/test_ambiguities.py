@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from imgcal.association.ambiguities import conflicts, differ, lattice_shifts, near_turns, relabelled
+from imgcal.association.ambiguities import conflicts, differ, lattice_shifts, near_symmetries, relabel
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io import load_object
 from imgcal.io.resources import data_path
@@ -31,7 +31,7 @@ def test_steps_of_a_lattice_are_found() -> None:
 def test_an_asymmetric_object_has_no_motion() -> None:
     obj = load_object(data_path("objects", "asymmetric8.csv"))
     assert lattice_shifts(obj) == []
-    assert near_turns(obj, 1.0) == []
+    assert near_symmetries(obj, 1.0) == []
 
 
 def test_moved_labels_and_pose_explain_the_same_blobs() -> None:
@@ -39,7 +39,7 @@ def test_moved_labels_and_pose_explain_the_same_blobs() -> None:
     pose = RigidTransform(torch.eye(3, dtype=torch.float64), torch.tensor([1.0, 2, 500], dtype=torch.float64))
     labels = np.arange(30)[None]
     motion = lattice_shifts(obj)[0]
-    poses, changed = relabelled(pose, labels, [motion])
+    poses, changed = relabel(pose, labels, [motion])
     before = pose.apply(obj.points).numpy()
     after = obj.points.numpy() @ poses.rotation[0].T + poses.translation[0]
     named = changed[0, 0] >= 0

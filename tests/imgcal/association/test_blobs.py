@@ -55,7 +55,7 @@ def test_labels_of_blobs_become_labels_of_rows(o10, asymmetric8) -> None:
     snapshot = take(o10, asymmetric8, 1, false=2, missing=1)
     blobs = gather(snapshot.detections, o10)
     np.testing.assert_array_equal(blobs.to_rows(snapshot.labels(blobs, 8)), snapshot.truth)
-    one = blobs.only(3)
+    one = blobs.select_camera(3)
     alone = one.to_rows(snapshot.labels(blobs, 8)[[3]])
     np.testing.assert_array_equal(alone, np.where(snapshot.detections.camera == 3, snapshot.truth, -1))
 

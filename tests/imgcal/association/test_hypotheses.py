@@ -15,8 +15,8 @@ from imgcal.association.hypotheses import (
     _rasterize,
     blob_triples,
     fiducial_triples,
+    has_many_triples,
     likely_blobs,
-    many,
     single_camera_poses,
 )
 from imgcal.io import load_object
@@ -73,7 +73,7 @@ def test_triples_in_line_are_left_out() -> None:
 def test_of_many_fiducials_the_outer_ones_are_tried() -> None:
     points = rng(1).normal(size=(120, 3)) * 50
     obj = make_object(points)
-    assert many(obj) and not many(make_object(points[:35]))
+    assert has_many_triples(obj) and not has_many_triples(make_object(points[:35]))
     found = fiducial_triples(obj, rng())
     assert set(found.triples.ravel()) <= set(ConvexHull(points).vertices)
     assert len(found.triples) <= MOST_FIDUCIAL_TRIPLES

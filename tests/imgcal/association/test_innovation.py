@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from imgcal.association.blobs import gather
-from imgcal.association.innovation import THRESHOLD, contested, innovations
-from imgcal.association.verify import fit, problem_of, rig_and_pose, start
-from imgcal.estimation import lm_cpu
+from imgcal.association.innovation import THRESHOLD, find_contested, innovations
+from imgcal.association.verification import fit, make_problem, rig_and_pose, start
+from imgcal.estimation import levenberg_marquardt_cpu
 from imgcal.estimation.levenberg_marquardt import Solution
 from imgcal.estimation.linearization import Problem, State, linearize, pose_at, retract, rig_at
 from imgcal.io import load_object, load_rig
@@ -90,7 +90,7 @@ def left_out(scene, labels, fits, camera, fiducial):
 
     Weights of the robust loss and derivatives are those of the fit with all labels: nothing is iterated again.
     """
-    problem, state = problem_of(scene, fits), fits.state
+    problem, state = make_problem(scene, fits), fits.state
     noise = 1 / problem.root_weight[0, 0]  # (C, N) px, inf where there is no label
 
     def pixels(parameters):
@@ -153,7 +153,9 @@ def test_residuals_and_freedom_are_those_of_the_fit(noisy) -> None:
 
 def test_complexity_is_the_determinant_of_the_information(noisy) -> None:
     scene, _, fits = noisy
-    equations = lm_cpu.minimize(problem_of(scene, fits), fits.state, "cauchy", THRESHOLD, 8, 1e-3).equations
+    equations = levenberg_marquardt_cpu.minimize(
+        make_problem(scene, fits), fits.state, "cauchy", THRESHOLD, 8, 1e-3
+    ).equations
     dense = torch.zeros(36, 36, dtype=torch.float64)
     dense[30:, 30:] = equations.pose[0, 0]
     for c in range(2):
@@ -177,5 +179,5 @@ def test_contested_labels_are_those_that_a_change_or_an_exchange_costs_little(no
                 if labels[c, j] >= 0:
                     change += cost[c, i, labels[c, j]] - cost[c, j, labels[c, j]]
                 expected[c, i] |= change < undecided
-        np.testing.assert_array_equal(contested(labels[None], found, undecided)[0], expected)
+        np.testing.assert_array_equal(find_contested(labels[None], found, undecided)[0], expected)
         assert undecided == 13.8 or expected.any()

@@ -11,10 +11,10 @@ from imgcal.association.series import Associations
 from imgcal.association.tracker import SnapshotIdentity
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import load_object
-from imgcal.synthesis.arrangements import arranged_rig
+from imgcal.synthesis.arrangements import arrange_rig
 from imgcal.types.observations import BlobFlag, Detections
 
-RIG = arranged_rig("ring", 3, 3000.0, height=0.0)
+RIG = arrange_rig("ring", 3, 3000.0, height=0.0)
 WAND = load_object("wand4")
 SIGMA = 0.02
 TURN = rotation_from_vector(torch.tensor([0.0, 0.0, 0.02], dtype=torch.float64))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.p3p import three_point_pose, towards
+from imgcal.association.p3p import rotation_towards, three_point_pose
 from imgcal.geometry.rotations import rotation_from_vector
 from tests.imgcal.association.scenes import degrees_between
 
@@ -39,7 +39,7 @@ def sides_of(points):
 def solutions(points, rays):
     """Both mirror images: rotation cam_from_object, and the points in the camera (3, 3)."""
     found = []
-    turned, directions = towards(rays)
+    turned, directions = rotation_towards(rays)
     for mirror in (1.0, -1.0):
         frame, depths = np.empty((3, 3)), np.empty(3)
         if three_point_pose(turned, directions, sides_of(points), mirror, frame, depths):
@@ -119,7 +119,7 @@ def test_a_camera_turned_towards_its_rays_sees_them_about_its_axis() -> None:
     rays = np.random.default_rng(6).uniform(-1.5, 1.5, (40, 1, 2)) + np.random.default_rng(7).normal(
         0, 0.05, (40, 3, 2)
     )
-    turned, directions = towards(rays)
+    turned, directions = rotation_towards(rays)
     assert np.abs(turned.mean(1)).max() < 0.01
     np.testing.assert_allclose(directions[..., :2] / directions[..., 2:], rays, atol=1e-12)
     # A turn keeps lengths and angles.

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association import IdentityOptions, Proposal, Sight, Snapshot, associate, judge, rows_of
-from imgcal.association.proposals import together
+from imgcal.association import IdentityOptions, Proposal, Sight, Snapshot, associate, judge, proposal_rows
+from imgcal.association.proposals import merge_proposal
 from imgcal.geometry import RigidTransform, geodesic_angle, rotation_from_vector
 from imgcal.io import load_object
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
@@ -33,7 +33,7 @@ class Oracle:
         uv = uv if self.labels is None else uv[:, self.labels]
         noise = np.random.default_rng(number).normal(0, 0.1, uv.shape)
         some = np.full(uv.shape[:2], 0.1)
-        rows = rows_of(uv + noise, some, some > 0, 30 * some, snapshot.blobs)
+        rows = proposal_rows(uv + noise, some, some > 0, 30 * some, snapshot.blobs)
         return Proposal(rows, self.truth.rig_from_object[number], self.margin)
 
 
@@ -86,16 +86,18 @@ def test_where_both_see_one_thing_the_better_measured_stays(truth, o10, asymmetr
     blobs = blobs_of(truth, share=1.0)
     snapshot = Snapshot(frames(0), blobs, o10, asymmetric8, o10.prior.std(o10))
     proposed = Oracle(truth).propose(snapshot).detections
-    sharp, labels = together(replace(proposed, sigma=proposed.sigma / 10), blobs)
+    sharp, labels = merge_proposal(replace(proposed, sigma=proposed.sigma / 10), blobs)
     assert len(sharp) == 80 and np.allclose(sharp.sigma, 0.01) and (labels == proposed.fiducial).all()
-    dull, labels = together(replace(proposed, sigma=proposed.sigma * 5), blobs)
+    dull, labels = merge_proposal(replace(proposed, sigma=proposed.sigma * 5), blobs)
     assert len(dull) == 80 and np.allclose(dull.sigma, 0.1) and (np.sort(labels) == np.sort(proposed.fiducial)).all()
-    doubted, _ = together(replace(proposed, sigma=proposed.sigma * 20), blobs)  # half hidden, says who looked
+    doubted, _ = merge_proposal(replace(proposed, sigma=proposed.sigma * 20), blobs)  # half hidden, says who looked
     assert len(doubted) == 80 and np.allclose(doubted.sigma, 2.0)
-    differing, _ = together(replace(proposed, uv=proposed.uv + np.array([0.6, 0.8]), sigma=np.full(80, 0.9)), blobs)
+    differing, _ = merge_proposal(
+        replace(proposed, uv=proposed.uv + np.array([0.6, 0.8]), sigma=np.full(80, 0.9)), blobs
+    )
     assert len(differing) == 80 and (differing.sigma > 0.5).all()  # one of the two is wrong, whatever blobs claim
     apart = replace(proposed, uv=proposed.uv + 12, sigma=np.full(80, 30.0))
-    assert len(together(apart, blobs)[0]) > 150  # a large sigma hides no blobs that contradict
+    assert len(merge_proposal(apart, blobs)[0]) > 150  # a large sigma hides no blobs that contradict
 
 
 @pytest.mark.parametrize("where_blobs_fail", [False, True])
@@ -136,7 +138,7 @@ class NearSighted(Oracle):
         pose = self.truth.rig_from_object[int(snapshot.frames["number"][0, 0])]
         off = [float(geodesic_angle(pose.rotation, known.rotation)) for known in snapshot.candidates]
         near = np.degrees(min(off, default=np.pi)) < self.degrees
-        return super().propose(snapshot) if near else Proposal.declined(snapshot, "found nothing")
+        return super().propose(snapshot) if near else Proposal.decline(snapshot, "found nothing")
 
 
 @pytest.mark.parametrize(("degrees", "name"), [(3.0, "oracle"), (0.0, "classical")])

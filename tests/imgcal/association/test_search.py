@@ -8,7 +8,7 @@ import pytest
 from imgcal.association.ambiguities import conflicts
 from imgcal.association.hypotheses import fiducial_triples
 from imgcal.association.search import PLANAR_EFFORT, VERIFIED, Search, distinct
-from imgcal.association.verify import evidence
+from imgcal.association.verification import evidence
 from imgcal.io import load_object
 from tests.imgcal.association.scenes import make_object, scene_of, take
 
@@ -24,7 +24,7 @@ def test_a_round_finds_the_labels(seed, o10, asymmetric8) -> None:
     snapshot = take(rig, asymmetric8, seed, false=1, missing=1)
     scene = scene_of(snapshot, rig, asymmetric8)
     search = search_of(scene, [0, 1, 2])
-    fits = search.round(5000, np.random.default_rng(seed))
+    fits = search.run_round(5000, np.random.default_rng(seed))
     assert fits is not None and len(fits.labels) <= VERIFIED
     best = fits.labels[evidence(scene, fits).argmax()]
     assert conflicts(asymmetric8, snapshot.labels(scene.blobs, 8), best) < 0.1
@@ -37,12 +37,12 @@ def test_the_same_seed_finds_the_same_and_effort_is_counted(o10, asymmetric8) ->
     found = []
     for _ in range(2):
         search = search_of(scene, [0, 1])
-        fits = search.round(3000, np.random.default_rng(9))
+        fits = search.run_round(3000, np.random.default_rng(9))
         found.append((search.hypotheses, fits.labels))
     assert found[0][0] == found[1][0]
     np.testing.assert_array_equal(found[0][1], found[1][1])
     before = search.hypotheses
-    search.round(3000, np.random.default_rng(10))
+    search.run_round(3000, np.random.default_rng(10))
     assert search.hypotheses > 1.5 * before
 
 
@@ -53,7 +53,7 @@ def test_planar_objects_with_many_fiducials_are_searched_as_planes(o10) -> None:
     snapshot = take(rig, obj, 1)
     scene = scene_of(snapshot, rig, obj)
     search = search_of(scene, [0, 1])
-    fits = search.round(1, random)
+    fits = search.run_round(1, random)
     assert search.hypotheses >= 2 * PLANAR_EFFORT
     assert min(conflicts(obj, snapshot.labels(scene.blobs, 60), labels) for labels in fits.labels) < 0.05
 
@@ -65,7 +65,7 @@ def test_a_round_without_poses_finds_nothing(o10) -> None:
     scene = scene_of(take(rig, obj, 1), rig, obj)
     elsewhere = random.uniform(-600, 600, scene.blobs.ideal.shape).astype(np.float32)
     elsewhere[0, :30] *= 0.01
-    assert search_of(replace(scene, blobs=replace(scene.blobs, ideal=elsewhere)), [0]).round(1, random) is None
+    assert search_of(replace(scene, blobs=replace(scene.blobs, ideal=elsewhere)), [0]).run_round(1, random) is None
 
 
 def testdistinct_labellings_are_kept_the_fullest_first() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association import associate, identify, matched_to_rig, series, to_observations, tracker
+from imgcal.association import associate, identify, match_to_rig, series, to_observations, tracker
 from imgcal.errors import InputError, RefusedError
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
@@ -43,9 +43,9 @@ def test_nothing_seen_is_refused(seen, o10, asymmetric8):
 def test_cameras_are_put_in_the_order_of_the_rig(seen, o10):
     reordered = tuple(reversed(seen.camera_names))
     other = replace(seen, camera_names=reordered, camera=9 - seen.camera)
-    assert np.array_equal(matched_to_rig(other, o10).camera, seen.camera)
+    assert np.array_equal(match_to_rig(other, o10).camera, seen.camera)
     with pytest.raises(InputError, match="cam99"):
-        matched_to_rig(replace(seen, camera_names=("cam99", *seen.camera_names[1:])), o10)
+        match_to_rig(replace(seen, camera_names=("cam99", *seen.camera_names[1:])), o10)
 
 
 def test_observations_are_dense(seen, o10, asymmetric8):

@@ -6,7 +6,7 @@ import torch
 from imgcal.association import PipelineOptions, Tracker, identify
 from imgcal.association.blobs import gather
 from imgcal.association.stick_poses import fit_sticks
-from imgcal.association.verify import Scene, rig_and_pose
+from imgcal.association.verification import Scene, rig_and_pose
 from imgcal.types import CalibrationObject, RigPrior
 from tests.imgcal.association.stick_scenes import PAIR, TRIPLE, capture, one_snapshot
 

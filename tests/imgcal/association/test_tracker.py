@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from imgcal.association import PipelineOptions, Tracker, associate
-from imgcal.synthesis import PhysicalDrift, arranged_rig, simulate_truth, simulate_volume, true_detections
+from imgcal.synthesis import PhysicalDrift, arrange_rig, simulate_truth, simulate_volume, true_detections
 from imgcal.types import CalibrationObject
 
 
@@ -39,7 +39,7 @@ def test_too_few_fiducials_teach_nothing(seen, o10, asymmetric8):
 
 def test_snapshots_that_show_a_line_alone_teach_the_rig_nothing():
     """They say nothing of how the object is turned about that line: no rig can be estimated with them."""
-    rig, bar = arranged_rig("ring", 6, 3000.0, height=1500.0), [(x, 0.0, 0.0) for x in (-200.0, -80.0, 0.0, 200.0)]
+    rig, bar = arrange_rig("ring", 6, 3000.0, height=1500.0), [(x, 0.0, 0.0) for x in (-200.0, -80.0, 0.0, 200.0)]
     points = torch.tensor([*bar, (0.0, -380.0, 0.0)], dtype=torch.float64)
     wand = CalibrationObject(points, torch.zeros_like(points))
     blobs = true_detections(simulate_volume(rig, wand, 6, torch.Generator().manual_seed(1), None))

@@ -5,7 +5,7 @@ import torch
 
 from imgcal.cli.main import main
 from imgcal.io import load_object, load_rig, load_rig_covariance, save_cameras, save_detections
-from imgcal.synthesis import arranged_rig, simulate_volume
+from imgcal.synthesis import arrange_rig, simulate_volume
 from imgcal.synthesis.captures import true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
 from tests.imgcal.cli.calibrating import one_line
@@ -15,7 +15,7 @@ from tests.imgcal.cli.calibrating import one_line
 def wand_capture(tmp_path_factory):
     """Labelled blobs of a wand in a small room, and a file of cameras of which little is known."""
     folder = tmp_path_factory.mktemp("wand")
-    rig = arranged_rig("ring", 3, 2500.0, height=1200.0, target=(0.0, 0.0, 700.0))
+    rig = arrange_rig("ring", 3, 2500.0, height=1200.0, target=(0.0, 0.0, 700.0))
     truth = simulate_volume(rig, load_object("wand4"), 40, torch.Generator().manual_seed(0), PhysicalDrift())
     save_detections(true_detections(truth), folder / "blobs.csv")
     save_cameras(dict.fromkeys(rig.camera_names, (1280, 1024)), 60.0, folder / "cameras.yaml")

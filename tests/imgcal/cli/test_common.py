@@ -9,12 +9,12 @@ import torch
 
 from imgcal.cli.common import (
     check_folder,
-    only_cameras,
+    drop_cameras,
     parse_range,
     progress,
     read_detections,
+    select_cameras,
     start_pose,
-    without_cameras,
 )
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError
@@ -70,23 +70,23 @@ def test_a_start_pose_is_a_rotation_vector_and_a_shift() -> None:
 
 
 def test_cameras_are_left_out_of_rigs_and_tables(o10, asymmetric8) -> None:
-    rig = without_cameras(o10, ("cam02", "cam09"))
+    rig = drop_cameras(o10, ("cam02", "cam09"))
     assert rig.num_cameras == 8 and "cam02" not in rig.camera_names
     table = true_detections(simulate_truth(o10, asymmetric8, 2, torch.Generator().manual_seed(0), None))
-    some = only_cameras(table, rig)
+    some = select_cameras(table, rig)
     assert some.camera_names == rig.camera_names
     names = np.array(table.camera_names)[table.camera]
     kept = np.isin(names, rig.camera_names)
     np.testing.assert_array_equal(np.array(some.camera_names)[some.camera], names[kept])
     np.testing.assert_array_equal(some.uv, table.uv[kept])
-    assert len(only_cameras(table.select(np.zeros(len(table), bool)), rig)) == 0
+    assert len(select_cameras(table.select(np.zeros(len(table), bool)), rig)) == 0
 
 
 def test_cameras_that_are_not_there_or_all_of_them_cannot_be_left_out(o10) -> None:
     with pytest.raises(InputError, match="--without: found cam11, expected cameras of the rig: cam01"):
-        without_cameras(o10, ("cam02", "cam11"))
+        drop_cameras(o10, ("cam02", "cam11"))
     with pytest.raises(InputError, match="found all 10 cameras"):
-        without_cameras(o10, o10.camera_names)
+        drop_cameras(o10, o10.camera_names)
 
 
 def test_a_file_in_the_place_of_a_folder_is_refused(tmp_path: Path) -> None:

@@ -8,17 +8,17 @@ from numba import config
 
 import renderers.compiling
 from imgcal.cli import compiling
-from imgcal.cli.compiling import HINT, NEEDED_LAST, tells_of_compiling
-from imgcal.estimation import lm_cpu
+from imgcal.cli.compiling import HINT, NEEDED_LAST, announce_compilation
+from imgcal.estimation import levenberg_marquardt_cpu
 
 
 def test_compiling_is_told_once_and_counted(capsys):
-    with tells_of_compiling() as compiled:
+    with announce_compilation() as compiled:
         for plus in (1, 2):
             numba.njit(lambda x, plus=plus: x + plus)(1)
     assert len(compiled) == 2
     assert capsys.readouterr().err == f"imgcal: {HINT}\n"
-    with tells_of_compiling():
+    with announce_compilation():
         pass
     numba.njit(lambda x: x + 3)(1)
     assert capsys.readouterr().err == ""
@@ -40,7 +40,7 @@ def test_a_second_process_helps_once_and_ends_with_the_command(cache, monkeypatc
     started = []
     start = compiling.start_helper
     monkeypatch.setattr(compiling, "start_helper", lambda: started.append(start()) or started[-1])
-    with tells_of_compiling(helped=True):
+    with announce_compilation(helped=True):
         for plus in (1, 2):
             numba.njit(lambda x, plus=plus: x + plus)(1)
         deadline = time.monotonic() + 120
@@ -53,20 +53,20 @@ def test_a_second_process_helps_once_and_ends_with_the_command(cache, monkeypatc
 
 
 def test_no_help_where_it_is_of_no_use(cache, monkeypatch):
-    assert compiling.is_of_use() == (renderers.compiling.fcntl is not None)
+    assert compiling.is_useful() == (renderers.compiling.fcntl is not None)
     with monkeypatch.context() as one:
         one.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)
-        assert not compiling.is_of_use()
+        assert not compiling.is_useful()
     with monkeypatch.context() as busy:
         busy.setattr(os, "getloadavg", lambda: (1.5, 0.5, 0.5), raising=False)
-        assert not compiling.is_of_use()
+        assert not compiling.is_useful()
     with monkeypatch.context() as elsewhere:  # a folder of this process alone
         elsewhere.setattr(renderers.compiling, "cache_folder", lambda: "/tmp/imgcal-compiled-x")
-        assert not compiling.is_of_use()
+        assert not compiling.is_useful()
     (cache / "estimation_0").mkdir()
-    (cache / "estimation_0" / "lm_cpu._minimize_rig-1.py311.nbi").touch()
-    assert not compiling.is_of_use()
+    (cache / "estimation_0" / "levenberg_marquardt_cpu._minimize_rig-1.py311.nbi").touch()
+    assert not compiling.is_useful()
 
 
 def test_what_shows_that_no_help_is_needed_is_a_module_of_compiled_functions():
-    assert lm_cpu.__file__ and Path(lm_cpu.__file__).match(NEEDED_LAST)
+    assert levenberg_marquardt_cpu.__file__ and Path(levenberg_marquardt_cpu.__file__).match(NEEDED_LAST)

@@ -21,12 +21,12 @@ from imgcal.formats import (
     ForeignCamera,
     ForeignRig,
     Format,
+    fill_image_sizes,
     in_millimetres,
     load_rig,
-    with_image_sizes,
 )
 from imgcal.formats.conversion import NATIVE
-from imgcal.formats.fitting import fitted
+from imgcal.formats.fitting import fit_lens
 from imgcal.formats.registry import read_foreign_rig
 from tests.imgcal.formats.test_registry import SAMPLES
 
@@ -55,7 +55,7 @@ def test_real_files_are_verified_in_every_format_or_refused_for_a_true_reason(
     named = zip(rig.cameras, sizes, strict=True)
     lacking = {camera.name: size for camera, size in named if camera.image_size is None}
     given += ["--image-size", *(f"{camera}={w}x{h}" for camera, (w, h) in lacking.items())] if lacking else []
-    rig = with_image_sizes(in_millimetres(rig, name, unit), name, lacking)
+    rig = fill_image_sizes(in_millimetres(rig, name, unit), name, lacking)
     for to, target in TARGETS.items():
         least, most = (1, 256) if target is None else target.cameras
         asked = [source, "--to", to, "--out", tmp_path / to / "x", *given]
@@ -69,7 +69,7 @@ def test_real_files_are_verified_in_every_format_or_refused_for_a_true_reason(
             some = some[:most]
             names = ["--cameras", *(camera.name for camera in some)]
         holds = NATIVE if target is None else target.holds
-        fits = {camera.name: fitted(camera.lens, camera.image_size or (0, 0), holds) for camera in some}
+        fits = {camera.name: fit_lens(camera.lens, camera.image_size or (0, 0), holds) for camera in some}
         code, said, wrong = run(capsys, *asked, *names)
         if code == 3:
             (camera,) = re.findall(r"camera (\S+): .* cannot say its lens", wrong)

@@ -1,13 +1,13 @@
 from imgcal.cli.experiment_keys import table
 from imgcal.cli.main import main
-from imgcal.io import Key, keys_of
+from imgcal.io import Key, list_keys
 from imgcal.networks import PRESETS
 from imgcal.training import KINDS, load_experiment
 
 
 def test_every_key_has_a_meaning() -> None:
     records = [*KINDS.values(), *dict.fromkeys(type(variant) for variant in PRESETS.values())]
-    silent = [f"{record.__name__}: {key.path}" for record in records for key in keys_of(record) if not key.meaning]
+    silent = [f"{record.__name__}: {key.path}" for record in records for key in list_keys(record) if not key.meaning]
     assert not silent, silent
 
 

@@ -6,7 +6,7 @@ import torch
 from imgcal.cli.findings import Findings
 from imgcal.cli.outcome import predicted_line, print_outcome
 from imgcal.estimation import Gauge
-from imgcal.pipeline import Knowledge, Motion
+from imgcal.pipeline import Coverage, Motion
 
 PREDICTED = {"median_mm": 0.1234, "p95_mm": 0.5, "median_px": 0.05, "p95_px": 0.111}
 RESULT = {
@@ -29,7 +29,7 @@ RESULT = {
     "object_lost": [6],
 }
 
-KNOWN = Knowledge(("a",), (0.9,), {}, ())
+KNOWN = Coverage(("a",), (0.9,), {}, ())
 
 
 def test_the_predicted_error_is_one_line_of_what_is_known() -> None:
@@ -41,7 +41,7 @@ def test_the_predicted_error_is_one_line_of_what_is_known() -> None:
 
 
 def test_results_go_to_standard_output_and_notes_to_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
-    found = Findings(Motion(Gauge.of_camera(0, 1), ("a",), torch.zeros(1, 15), torch.ones(1, 15)), KNOWN, True)
+    found = Findings(Motion(Gauge.from_camera(0, 1), ("a",), torch.zeros(1, 15), torch.ones(1, 15)), KNOWN, True)
     print_outcome(RESULT, found, Path("out"), report=True)
     said = capsys.readouterr()
     assert said.out.splitlines() == [

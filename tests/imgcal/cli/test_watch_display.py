@@ -9,8 +9,8 @@ from rich.console import Console
 from imgcal.cli import watch_display as module
 from imgcal.cli.watch_display import Display
 from imgcal.watch.exposures import Unreadable
-from imgcal.watch.intake import Intake
 from imgcal.watch.metrics import Tally
+from imgcal.watch.source_reader import SourceReader
 from tests.imgcal.watch.states import RIG, event, some_state
 
 
@@ -23,7 +23,7 @@ class Nothing:
 
 def display(monkeypatch, terminal):
     text = io.StringIO()
-    with Intake(Nothing(), RIG) as intake:
+    with SourceReader(Nothing(), RIG) as intake:
         intake.next(1.0)
     monkeypatch.setattr(module, "SAID_EVERY", 0.0)
     monkeypatch.setattr(module, "DRAWN_EVERY", 0.0)
@@ -32,9 +32,9 @@ def display(monkeypatch, terminal):
 
 def test_plain_lines_where_nobody_looks(monkeypatch):
     shown, text, tally = display(monkeypatch, False)
-    with shown.of(tally):
+    with shown.show_tally(tally):
         shown.draw()
-        shown.tell(event(3, "camera_lost", message="cam02 [red]is lost[/red]"))
+        shown.show_event(event(3, "camera_lost", message="cam02 [red]is lost[/red]"))
         shown.warn("state.json: disk\nfull")
         tally.latest, tally.snapshots, tally.refused = some_state(), 5, 2
         shown.draw()
@@ -46,7 +46,7 @@ def test_plain_lines_where_nobody_looks(monkeypatch):
 
 def test_what_did_not_go_as_it_should_is_told_at_the_end(monkeypatch):
     shown, _, tally = display(monkeypatch, False)
-    with shown.of(tally):
+    with shown.show_tally(tally):
         tally.snapshots, tally.refused = 5, 2
         shown._intake.dropped = 3
         shown._hook = SimpleNamespace(failed=4, dropped=0)
@@ -56,9 +56,9 @@ def test_what_did_not_go_as_it_should_is_told_at_the_end(monkeypatch):
 
 def test_one_line_that_changes_in_a_terminal(monkeypatch):
     shown, text, tally = display(monkeypatch, True)
-    with shown.of(tally):
+    with shown.show_tally(tally):
         shown.draw()
-        shown.tell(event())
+        shown.show_event(event())
         shown.draw()
     assert "\x1b" in text.getvalue() and text.getvalue().count("moved: cam02 moved") == 1
 
@@ -66,7 +66,7 @@ def test_one_line_that_changes_in_a_terminal(monkeypatch):
 def test_cameras_whose_stamps_go_with_no_other_are_named(monkeypatch):
     shown, _, tally = display(monkeypatch, False)
     shown._intake.synchronizer.alone, shown._intake.synchronizer.leaps = ("cam02",), 3
-    with shown.of(tally):
+    with shown.show_tally(tally):
         said = "cam02: time stamps more than 5 ms (--tolerance) beside the other cameras': set their clocks"
         assert "| 3 leaps of all clocks |" in shown.line() and shown.line().endswith(f"| {said}")
 
@@ -74,7 +74,7 @@ def test_cameras_whose_stamps_go_with_no_other_are_named(monkeypatch):
 def test_a_camera_that_trembles_is_named(monkeypatch):
     shown, _, tally = display(monkeypatch, False)
     tally.latest = replace(some_state(), shake=np.array([0.0, 0.1532, 0.0, 0.0]))
-    with shown.of(tally):
+    with shown.show_tally(tally):
         assert shown.line().endswith("| cam02 trembles by 0.15 px")
 
 
@@ -83,5 +83,5 @@ def test_a_clock_that_is_off_is_named(monkeypatch):
     offset, sigma = np.array([0.0, 0.004, np.nan, 0.001]), np.array([1e-4, 1e-4, np.nan, 1e-3])
     tally.latest = replace(some_state(), clock_offset=offset, clock_offset_sigma=sigma)
     tally.stamps = {"cam02": -0.0005}
-    with shown.of(tally):
+    with shown.show_tally(tally):
         assert shown.line().endswith("| cam02 exposes +4.5 ms beside its time stamps")

@@ -98,7 +98,7 @@ def measure(frame, labels, label, box, half, saturation, invert=None, parted=Fal
     if two_peaked or saddle > (kernels.CROWDED_CLIPPED if clipped and parted else kernels.CROWDED) * top:
         flags |= BlobFlag.MERGED
     else:
-        start = fitting.start_of(grey[core].max(), radius, clipped, moments, middle)
+        start = fitting.start_ellipse(grey[core].max(), radius, clipped, moments, middle)
         rows = territory & (quadratic(start, x, y) >= max(start[1] - fitting.BAND, 0) ** 2 - 1)
         rows &= (raw < saturation) | (not clipped)
         x0, y0, known, residual = fit(x[rows], y[rows], grey[rows], start, clipped, noise)

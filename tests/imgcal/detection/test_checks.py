@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from imgcal.detection.checks import checked_frame, checked_mask, full_scale
+from imgcal.detection.checks import check_frame, check_mask, full_scale
 from imgcal.errors import InputError
 
 
@@ -16,20 +16,20 @@ from imgcal.errors import InputError
 )
 def test_frames_that_cannot_be_are_named(frame, message) -> None:
     with pytest.raises(InputError, match=f"camera left: .*{message}"):
-        checked_frame(frame, "left")
+        check_frame(frame, "left")
 
 
 def test_frames_are_taken_as_they_are_and_masks_as_bits() -> None:
     frame = np.zeros((16, 20), np.uint16)
-    assert checked_frame(frame, "left") is frame
+    assert check_frame(frame, "left") is frame
     mask = np.zeros((16, 20), np.uint8)
     mask[3, 4] = 255
-    found = checked_mask(mask, frame, "left")
+    found = check_mask(mask, frame, "left")
     assert found.dtype == np.bool_ and found.sum() == 1 and found[3, 4]
-    assert checked_mask(found, frame, "left") is found
+    assert check_mask(found, frame, "left") is found
     for wrong in (mask[:8], "mask"):
         with pytest.raises(InputError, match="camera left: found a mask of"):
-            checked_mask(wrong, frame, "left")
+            check_mask(wrong, frame, "left")
 
 
 @pytest.mark.parametrize(("brightest", "expected"), [(0, 1023), (1023, 1023), (1024, 4095), (4096, 65535)])

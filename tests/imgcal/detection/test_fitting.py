@@ -6,7 +6,7 @@ from scipy.optimize import least_squares
 from scipy.special import ndtr
 
 from imgcal.detection import fitting
-from imgcal.detection.fitting import MOST, PARAMETERS, ROWS, fit_centre, start_of
+from imgcal.detection.fitting import MOST, PARAMETERS, ROWS, fit_centre, start_ellipse
 from tests.imgcal.detection import reference
 from tests.imgcal.detection.discs import draw_discs
 
@@ -33,7 +33,7 @@ def begin(grey, radius, centre, clipped=False):
     mass = np.minimum(grey, grey.max() / 2)
     dx, dy = X - centre[0], Y - centre[1]
     moments = [(mass * a * b).sum() / mass.sum() for a, b in ((dx, dx), (dx, dy), (dy, dy))]
-    return start_of(grey.max(), radius, clipped, tuple(moments), tuple(centre))
+    return start_ellipse(grey.max(), radius, clipped, tuple(moments), tuple(centre))
 
 
 def model(p):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from imgcal import InputError, PipelineOptions, calibrate, estimate, predicted_error
-from imgcal.cli.common import only_cameras
+from imgcal.cli.common import select_cameras
 from imgcal.estimation.accuracy import (
     GRID,
     MAP_DEPTHS,
@@ -138,7 +138,7 @@ def test_a_blind_camera_has_the_factorys_errors(o10, asymmetric8):
     # All cameras alike in the triangulation: the blind one spoils it, and without it all is well.
     assert [found.camera_names[i] for i in found.exceptions] == ["cam07"]
     nine = o10.select([i for i in range(10) if i != 6])
-    others = predicted_error(calibrate(only_cameras(table, nine), nine, asymmetric8).estimate)
+    others = predicted_error(calibrate(select_cameras(table, nine), nine, asymmetric8).estimate)
     without = float(found.mm_without_exceptions.median())
     assert without == pytest.approx(others.median_mm, rel=0.02)
     assert without < found.median_mm / 10

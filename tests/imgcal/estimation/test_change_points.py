@@ -5,16 +5,16 @@ import pytest
 import torch
 from scipy.stats import chi2
 
-from imgcal.association.series import associate, observations_of
+from imgcal.association.series import accepted_observations, associate
 from imgcal.estimation import estimate
 from imgcal.estimation.change_points import (
     LEAST_SNAPSHOTS,
     STEP,
-    blocks_of,
     dispersion,
     is_significant,
     least_significant,
     likeliest_step,
+    linearize_snapshots,
 )
 from imgcal.estimation.linearization import jacobian_at
 from imgcal.types.rig import PARAMETERS
@@ -26,7 +26,7 @@ def fitted(make, snapshots, seed=0, change=None, first=0, camera=3):
     if change is not None:
         truth = damage.changed_from(truth, obj, camera, first, change)
     table = damage.blobs(truth, seed, labelled=True)
-    observations, _ = observations_of(associate(table, rig, obj), rig, obj)
+    observations, _ = accepted_observations(associate(table, rig, obj), rig, obj)
     return estimate(observations, rig, obj), observations.seen.any(-1).numpy()
 
 
@@ -58,7 +58,7 @@ def dense_statistic(fit, camera, row):
 
 def test_statistics_are_those_of_the_dense_system():
     fit, _ = fitted(damage.wand_in_a_room, 6, change=lambda r: damage.turned(r, 3, 0.01), first=3)
-    blocks = blocks_of(fit.problem, fit.solution.state)
+    blocks = linearize_snapshots(fit.problem, fit.solution.state)
     rows = np.array([2, 3, 4])
     for camera in (0, 3):
         expected = [dense_statistic(fit, camera, row) for row in rows]
@@ -67,7 +67,7 @@ def test_statistics_are_those_of_the_dense_system():
 
 def test_a_step_is_found_in_its_camera_at_its_time():
     fit, seen = fitted(damage.wand_in_a_room, 24, change=lambda r: damage.turned(r, 3, 0.02), first=15)
-    step = likeliest_step(blocks_of(fit.problem, fit.solution.state), seen)
+    step = likeliest_step(linearize_snapshots(fit.problem, fit.solution.state), seen)
     assert (step.camera, step.row) == (3, 15)
     assert is_significant(step.statistic, 240, 1e-5)
     assert np.delete(step.rivals, 3).max() < 0.5 * step.statistic
@@ -76,7 +76,7 @@ def test_a_step_is_found_in_its_camera_at_its_time():
 @pytest.mark.parametrize(("first", "size"), [(2, 0.3), (9, 0.03), (30, 0.02), (57, 0.3)])
 def test_a_step_that_matters_is_found_among_few_places(first, size):
     fit, seen = fitted(damage.wand_in_a_room, 60, first, lambda r: damage.turned(r, 3, size), first)
-    blocks = blocks_of(fit.problem, fit.solution.state)
+    blocks = linearize_snapshots(fit.problem, fit.solution.state)
     whole = likeliest_step(blocks, seen)
     assert whole.statistic > 60
     least = least_significant(600, 1e-5)
@@ -89,7 +89,7 @@ def test_a_step_that_matters_is_found_among_few_places(first, size):
 
 def test_long_captures_are_searched_in_two_passes(monkeypatch):
     fit, seen = fitted(damage.wand_in_a_room, 40, change=lambda r: damage.turned(r, 3, 0.05), first=29)
-    blocks = blocks_of(fit.problem, fit.solution.state)
+    blocks = linearize_snapshots(fit.problem, fit.solution.state)
     whole = likeliest_step(blocks, seen)
     monkeypatch.setattr("imgcal.estimation.change_points.MOST_TIMES", 5)
     coarse = likeliest_step(blocks, seen)
@@ -100,7 +100,7 @@ def test_statistics_where_nothing_steps_are_chi_squared():
     found = []
     for seed in range(12):
         fit, seen = fitted(damage.wand_in_a_room, 10, seed)
-        blocks = blocks_of(fit.problem, fit.solution.state)
+        blocks = linearize_snapshots(fit.problem, fit.solution.state)
         found += blocks.statistics(range(10), np.array([5])).ravel().tolist()
         assert dispersion(blocks, seen) < 2
     assert np.mean(found) == pytest.approx(STEP, rel=0.15)
@@ -109,13 +109,13 @@ def test_statistics_where_nothing_steps_are_chi_squared():
 
 def test_too_few_snapshots_have_no_step():
     fit, seen = fitted(damage.wand_in_a_room, 2 * LEAST_SNAPSHOTS - 1)
-    assert likeliest_step(blocks_of(fit.problem, fit.solution.state), seen) is None
+    assert likeliest_step(linearize_snapshots(fit.problem, fit.solution.state), seen) is None
 
 
 def test_errors_that_go_with_time_disperse_the_statistics():
     fit, seen = fitted(damage.wand_in_a_room, 30)
-    blocks = blocks_of(fit.problem, fit.solution.state)
+    blocks = linearize_snapshots(fit.problem, fit.solution.state)
     wave = torch.sin(torch.linspace(0, 9, 30, dtype=torch.float64))[None, :, None, None, None]
     problem = fit.problem
     wavy = type(problem)(**{**vars(problem), "uv": problem.uv + 0.3 * wave * torch.ones_like(problem.uv)})
-    assert dispersion(blocks_of(wavy, fit.solution.state), seen) > 2 * dispersion(blocks, seen)
+    assert dispersion(linearize_snapshots(wavy, fit.solution.state), seen) > 2 * dispersion(blocks, seen)

@@ -8,7 +8,7 @@ from imgcal.estimation import (
     EstimationOptions,
     camera_covariance,
     estimate,
-    lm_cpu,
+    levenberg_marquardt_cpu,
     relative_covariance,
     relative_difference,
 )
@@ -84,7 +84,11 @@ def test_beginning_again_leaves_the_others_alone(simulate) -> None:
     case = simulate(40, snapshots=1, noise=0.05, drift=PhysicalDrift(4, 40, 0.15, 40, 0.02))
     together = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std, options=SQUARED)
     problem, start = case.problem(), initial_state(case.problem(), together.rig_from_object, None)
-    assert 0 < int((~lm_cpu.minimize(problem, start, "squared", 3.0, PATIENCE, 1e-4).converged).sum()) < 40
+    assert (
+        0
+        < int((~levenberg_marquardt_cpu.minimize(problem, start, "squared", 3.0, PATIENCE, 1e-4).converged).sum())
+        < 40
+    )
     for row in range(0, 40, 5):
         observations = case.observations.of_snapshots(row)
         alone = estimate(observations, case.factory, case.obj, prior_std=case.prior_std, options=SQUARED)

@@ -1,6 +1,6 @@
 import torch
 
-from imgcal.estimation.gauge import aligned
+from imgcal.estimation.gauge import align
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
 
@@ -15,11 +15,11 @@ def test_a_motion_of_the_whole_rig_is_taken_out(o10, asymmetric8):
     other = o10.retract(step)
     other = other.__class__(**{**vars(other), "cam_from_rig": other.cam_from_rig @ there})
     points = asymmetric8.points + torch.tensor([0.0, 0.0, 800.0], dtype=torch.float64)
-    back = aligned(other, o10, points, [0, 1, 2, 3, 4, 5])
+    back = align(other, o10, points, [0, 1, 2, 3, 4, 5])
     rest = [c for c in range(10) if c not in (3, 6)]
     assert (back.select(rest).project(points).uv - o10.select(rest).project(points).uv).abs().max() < 0.05
     assert torch.allclose(back.local(o10)[6, 3:6], step[6, 3:6], atol=0.1)
 
 
 def test_without_common_cameras_nothing_is_moved(o10, asymmetric8):
-    assert aligned(o10, o10, asymmetric8.points, []) is o10
+    assert align(o10, o10, asymmetric8.points, []) is o10

@@ -5,6 +5,7 @@ from functools import partial
 
 import pytest
 import torch
+from tests.imgcal.estimation.test_levenberg_marquardt_cpu import CASES, seen_only
 
 import imgcal
 from imgcal.estimation import (
@@ -12,17 +13,16 @@ from imgcal.estimation import (
     has_poses,
     initial_pose,
     initial_state,
+    levenberg_marquardt_cpu,
     linearize,
-    lm_cpu,
     make_problem,
     rig_at,
 )
-from imgcal.estimation.levenberg_marquardt import taken
+from imgcal.estimation.levenberg_marquardt import select_rows
 from imgcal.estimation.linearization import retract
 from imgcal.estimation.robust_losses import LOSSES, NamedLoss
 from imgcal.synthesis import simulate_truth
 from imgcal.types import CalibrationObject, Observations
-from tests.imgcal.estimation.test_lm_cpu import CASES, seen_only
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.4])
@@ -37,7 +37,7 @@ def test_linearization_is_that_of_tensors(
     state = replace(state, offset=state.offset + 0.3)
     if state.object_offset is not None:
         state = replace(state, object_offset=state.object_offset - 0.2)
-    compiled = seen_only(lm_cpu.linearize(problem, state, "huber", 3.0), seen)
+    compiled = seen_only(levenberg_marquardt_cpu.linearize(problem, state, "huber", 3.0), seen)
     tensors = seen_only(linearize(problem, state, NamedLoss("huber", 3.0)), seen)
     for name in ("cost", "camera", "coupling", "pose", "camera_gradient", "pose_gradient", "residual"):
         a, b = getattr(compiled, name), getattr(tensors, name)
@@ -54,7 +54,7 @@ def test_rig_at_equals_the_one_in_tensors(simulate, batch: tuple[int, ...]) -> N
     problem = case.problem()
     offset = torch.randn(problem.prior_std.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     offset[0, 1, :3] = 0
-    compiled, tensors = lm_cpu.rig_at(problem, offset), rig_at(problem, offset)
+    compiled, tensors = levenberg_marquardt_cpu.rig_at(problem, offset), rig_at(problem, offset)
     torch.testing.assert_close(compiled.cam_from_rig.rotation, tensors.cam_from_rig.rotation, rtol=0, atol=1e-14)
     torch.testing.assert_close(compiled.cam_from_rig.translation, tensors.cam_from_rig.translation, rtol=0, atol=1e-11)
     assert torch.equal(compiled.focal_length, tensors.focal_length)
@@ -68,7 +68,7 @@ def test_every_loss_has_the_same_equations(simulate, name: str) -> None:
     problem = case.problem()
     state = case.start(problem, 0.5, case.truth)
     loss = LOSSES["squared"] if name == "squared" else partial(LOSSES[name], threshold=4.0)
-    compiled, tensors = lm_cpu.linearize(problem, state, name, 4.0), linearize(problem, state, loss)
+    compiled, tensors = levenberg_marquardt_cpu.linearize(problem, state, name, 4.0), linearize(problem, state, loss)
     for part in ("cost", "camera", "pose", "camera_gradient"):
         torch.testing.assert_close(getattr(compiled, part), getattr(tensors, part), rtol=1e-9, atol=1e-9, msg=part)
 
@@ -78,10 +78,10 @@ def test_rigs_do_not_mix(simulate, snapshots: int) -> None:
     case = simulate(3, snapshots=snapshots, cameras=3, fiducials=6, missing=0.1)
     problem = case.problem()
     state = case.start(problem)
-    together = lm_cpu.linearize(problem, state, "cauchy", 3.0)
+    together = levenberg_marquardt_cpu.linearize(problem, state, "cauchy", 3.0)
     for row in range(3):
         one = torch.tensor([row])
-        alone = lm_cpu.linearize(problem.select(one), taken(state, one), "cauchy", 3.0)
+        alone = levenberg_marquardt_cpu.linearize(problem.select(one), select_rows(state, one), "cauchy", 3.0)
         for part in ("cost", "camera", "coupling", "pose"):
             torch.testing.assert_close(getattr(alone, part)[0], getattr(together, part)[row], rtol=1e-12, atol=1e-12)
 
@@ -93,9 +93,11 @@ def test_a_small_step_changes_the_cost_as_the_gradient_says(simulate) -> None:
     generator = torch.Generator().manual_seed(0)
     shapes = (2, 3, 15), (2, 2, 6)
     camera, pose = (1e-6 * torch.randn(shape, generator=generator, dtype=torch.float64) for shape in shapes)
-    at = lm_cpu.linearize(problem, state, "squared", 1.0)
+    at = levenberg_marquardt_cpu.linearize(problem, state, "squared", 1.0)
     ahead, behind = (
-        lm_cpu.linearize(problem, retract(problem, state, sign * camera, sign * pose), "squared", 1.0).cost
+        levenberg_marquardt_cpu.linearize(
+            problem, retract(problem, state, sign * camera, sign * pose), "squared", 1.0
+        ).cost
         for sign in (1, -1)
     )
     expected = (at.camera_gradient * camera).sum((1, 2)) + (at.pose_gradient * pose).sum((1, 2))
@@ -118,7 +120,7 @@ def test_rows_of_several_objects_have_the_free_turns_of_their_own() -> None:
     problem = make_problem(observations, rig, obj, None)
     state = initial_state(problem, initial_pose(observations, rig, obj), None)
     assert problem.pose_freedom.tolist() == [6 + 5 + 3 + 5]
-    compiled = lm_cpu.linearize(problem, state, "squared", 1.0)
+    compiled = levenberg_marquardt_cpu.linearize(problem, state, "squared", 1.0)
     tensors = linearize(problem, state, LOSSES["squared"])
     torch.testing.assert_close(compiled.pose, tensors.pose)
     assert float(torch.linalg.eigvalsh(compiled.pose).min()) > 1e-3

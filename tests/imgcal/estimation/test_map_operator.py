@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from imgcal.estimation import EstimationOptions, encoded, initial_state, make_problem, map_operator, map_state
+from imgcal.estimation import EstimationOptions, encode_options, initial_state, make_problem, map_operator, map_state
 from imgcal.geometry import RigidTransform
 from imgcal.io import load_rig
 from imgcal.synthesis import PhysicalDrift, simulate_truth
@@ -25,7 +25,7 @@ def test_is_sound(asymmetric8, monkeypatch):
 
     monkeypatch.setattr(map_operator, "OPERATOR", spy)
     start = RigidTransform(truth.rig_from_object.rotation, truth.rig_from_object.translation)
-    _, converged = map_state(problem, initial_state(problem, start, None), encoded(EstimationOptions()))
+    _, converged = map_state(problem, initial_state(problem, start, None), encode_options(EstimationOptions()))
     assert converged.all()
     named = zip(operator.inputs, calls[0][:-1], strict=True)
     inputs = [x.clone().requires_grad_(name in ("uv", "focal_length", "prior_std")) for name, x in named]

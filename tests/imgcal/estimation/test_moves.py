@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.series import associate, observations_of
+from imgcal.association.series import accepted_observations, associate
 from imgcal.estimation import EstimationOptions, estimate
 from imgcal.estimation.change_points import Step
 from imgcal.estimation.moves import Change, Places, _outlasts_an_episode, find_moves
@@ -22,16 +22,16 @@ def bumped():
     """A rig estimated from a capture in which a camera was turned by 0.1 degrees."""
     rig, wand, truth = faults.wand_in_a_room(COUNT, 1)
     truth = faults.changed_from(truth, wand, CAMERA, FIRST, lambda r: faults.turned(r, CAMERA, 0.1))
-    observations, _ = observations_of(associate(faults.blobs(truth, 1, labelled=True), rig, wand), rig, wand)
+    observations, _ = accepted_observations(associate(faults.blobs(truth, 1, labelled=True), rig, wand), rig, wand)
     fit = estimate(observations, rig, wand)
     return Places(fit.problem, fit.solution.state, tuple(range(10)), (0,) * 10), rig
 
 
 def test_a_second_place_takes_the_labels_from_its_snapshot_on(bumped):
     places, _ = bumped
-    divided = places.divided(Step(CAMERA, FIRST, 0.0, np.zeros(10)), OPTIONS)
+    divided = places.divide(Step(CAMERA, FIRST, 0.0, np.zeros(10)), OPTIONS)
     assert divided.camera[-1] == CAMERA and divided.first[-1] == FIRST
-    assert divided.places_of(CAMERA) == [CAMERA, 10]
+    assert divided.camera_places(CAMERA) == [CAMERA, 10]
     assert not divided.seen[FIRST:, CAMERA].any() and not divided.seen[:FIRST, 10].any()
     assert np.array_equal(divided.seen[:, CAMERA] | divided.seen[:, 10], places.seen[:, CAMERA])
     assert divided.shift(CAMERA, 10) == pytest.approx(1000 * np.radians(0.1), rel=0.2)  # px, focal length some 1000
@@ -64,12 +64,12 @@ def stepping(first: int, size: float) -> tuple[Places, Places, float]:
     """
     rig, wand, truth = faults.wand_in_a_room(60, 1)
     truth = faults.changed_from(truth, wand, CAMERA, first, lambda r: faults.turned(r, CAMERA, 0.05))
-    observations, _ = observations_of(associate(faults.blobs(truth, 1, labelled=True), rig, wand), rig, wand)
+    observations, _ = accepted_observations(associate(faults.blobs(truth, 1, labelled=True), rig, wand), rig, wand)
     sigma = torch.full_like(observations.sigma, 0.06)
     fit = estimate(replace(observations, uv=lasting(observations.uv, size), sigma=sigma), rig, wand)
     places = Places(fit.problem, fit.solution.state, tuple(range(10)), (0,) * 10)
     statistic = float(places.blocks.statistics([CAMERA], np.array([first]))[0, 0])
-    return places, places.divided(Step(CAMERA, first, statistic, np.zeros(10)), OPTIONS), statistic
+    return places, places.divide(Step(CAMERA, first, statistic, np.zeros(10)), OPTIONS), statistic
 
 
 @pytest.mark.parametrize("first", [6, 54])
@@ -97,7 +97,7 @@ def test_where_errors_do_not_last_every_snapshot_counts():
 
 def test_errors_that_do_not_last_have_no_episode(bumped):
     places, _ = bumped
-    divided = places.divided(Step(CAMERA, FIRST, 0.0, np.zeros(10)), OPTIONS)
+    divided = places.divide(Step(CAMERA, FIRST, 0.0, np.zeros(10)), OPTIONS)
     assert [divided.episode(camera) for camera in range(10)] == [0] * 10
 
 

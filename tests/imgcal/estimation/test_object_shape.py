@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.estimation import EstimationOptions, estimate, modes, object_shape
+from imgcal.estimation import EstimationOptions, estimate, object_shape, shape_modes
 from imgcal.estimation.object_shape import (
     ScaleEvidence,
     ShapeEvidence,
@@ -106,7 +106,7 @@ def test_one_camera_does_not_know_the_scale(simulate) -> None:
 
 @pytest.mark.parametrize(("snapshots", "cameras", "together"), [(1, 5, 2**16), (7, 3, 1), (4, 4, 60)])
 def test_the_scale_by_itself_is_that_of_the_whole_shape(monkeypatch, simulate, snapshots, cameras, together) -> None:
-    monkeypatch.setattr(modes, "POINTS_AT_ONCE", together)
+    monkeypatch.setattr(shape_modes, "POINTS_AT_ONCE", together)
     case = simulate(2, snapshots=snapshots, cameras=cameras, missing=0.1)
     uv = case.observations.uv.clone()
     uv[:, 0, 0, 0] += 9.0  # for the loss to weigh

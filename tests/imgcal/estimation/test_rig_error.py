@@ -3,7 +3,7 @@
 import torch
 
 import imgcal
-from imgcal.estimation import displaced, error_between, step_by_error
+from imgcal.estimation import displace, error_between, step_by_error
 from imgcal.types import CameraRig
 
 UNITS = torch.tensor((0.02,) * 3 + (10.0,) * 3 + (20.0,) * 4 + (0.02,) * 5, dtype=torch.float64)
@@ -20,7 +20,7 @@ def drifted(seed: int) -> CameraRig:
 
 def test_error_between_inverts_displaced() -> None:
     rig, error = drifted(0), errors(4, 1)
-    torch.testing.assert_close(error_between(displaced(rig, error), rig), error)
+    torch.testing.assert_close(error_between(displace(rig, error), rig), error)
     assert error_between(rig, rig).abs().max() < 1e-12
 
 
@@ -28,7 +28,7 @@ def test_a_motion_of_the_whole_rig_is_the_same_error_for_all_cameras_and_moves_n
     rig = drifted(2)
     whole = torch.zeros(4, 15, dtype=torch.float64)
     whole[:, :6] = torch.tensor([0.1, -0.2, 0.05, 30.0, -20.0, 10.0])
-    moved = displaced(rig, whole)
+    moved = displace(rig, whole)
     points = torch.tensor([[0.0, 0.0, 850.0], [100.0, -50.0, 900.0]], dtype=torch.float64)
     turn = moved.cam_from_rig.rotation[0].mT @ rig.cam_from_rig.rotation[0]
     there = points @ turn.mT + whole[0, 3:6]
@@ -39,7 +39,7 @@ def test_step_by_error_is_the_derivative_of_the_step() -> None:
     rig = drifted(3)
 
     def step(error: torch.Tensor) -> torch.Tensor:
-        return displaced(rig, error).local(rig)
+        return displace(rig, error).local(rig)
 
     found = torch.autograd.functional.jacobian(step, 1e-6 * errors(4, 4))
     expected = torch.stack([found[c, :, c] for c in range(4)])
@@ -52,7 +52,7 @@ def test_step_by_error_follows_steps_from_another_rig() -> None:
     rig = factory.retract(offset)
 
     def step(error: torch.Tensor) -> torch.Tensor:
-        return displaced(rig, error).local(factory)
+        return displace(rig, error).local(factory)
 
     found = torch.autograd.functional.jacobian(step, 1e-6 * errors(4, 6))
     expected = torch.stack([found[c, :, c] for c in range(4)])

@@ -8,7 +8,7 @@ import torch
 
 import imgcal
 from imgcal import RefusedError
-from imgcal.estimation import PointStart, cold_start_from_points, in_frame_of_pair
+from imgcal.estimation import PointStart, cold_start_from_points, move_to_pair_frame
 from imgcal.synthesis import simulate_volume
 from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 
@@ -71,7 +71,7 @@ def test_cameras_without_common_points_are_refused(rig: CameraRig) -> None:
 
 
 def test_frame_of_a_pair_changes_no_image(rig: CameraRig) -> None:
-    moved, pair = in_frame_of_pair(rig, None)
+    moved, pair = move_to_pair_frame(rig, None)
     assert pair[0] == 0
     factor = 1000 / float((rig.positions[pair[1]] - rig.positions[0]).norm())
     points = torch.tensor([[100.0, 200.0, 900.0], [-300.0, 50.0, 1200.0]]).double()

@@ -7,7 +7,7 @@ import torch
 from imgcal.errors import RefusedError
 from imgcal.estimation.rig_initialization import cold_start
 from imgcal.io import load_object, load_rig
-from imgcal.synthesis import PhysicalDrift, arranged_rig, simulate_volume
+from imgcal.synthesis import PhysicalDrift, arrange_rig, simulate_volume
 from imgcal.types import Observations, RigPrior
 
 
@@ -32,7 +32,7 @@ def relative_error(found, truth):
 
 @pytest.mark.parametrize(("shape", "factor"), [("ring", 1.25), ("dome", 0.8), ("row", 1.15)])
 def test_a_rig_is_found_from_a_wand_and_rough_focal_lengths(shape, factor):
-    rig = arranged_rig(shape, 5, 3000.0, height=1500.0, target=(0, 2500.0 if shape == "row" else 0, 900))
+    rig = arrange_rig(shape, 5, 3000.0, height=1500.0, target=(0, 2500.0 if shape == "row" else 0, 900))
     truth, observations = seen_by(rig, load_object("wand4"), 40)
     found = cold_start(observations, rough(truth.rig, factor), load_object("wand4"))
     assert relative_error(found.rig, truth.rig) < 0.01
@@ -50,7 +50,7 @@ def test_wrong_labels_do_little():
 
 
 def test_each_camera_may_have_labelled_another_turn_of_a_cube():
-    rig = arranged_rig("ring", 4, 2000.0, height=800.0, target=(0, 0, 500))
+    rig = arrange_rig("ring", 4, 2000.0, height=800.0, target=(0, 0, 500))
     cube = load_object("cube8")
     cube = replace(cube, points=1.5 * cube.points)
     truth, observations = seen_by(rig, cube, 20)

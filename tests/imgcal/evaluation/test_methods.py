@@ -6,16 +6,16 @@ import torch
 from imgcal.evaluation.methods import (
     BASELINES,
     QUICK_BASELINES,
-    factory_alone,
     factory_from_pnp,
+    keep_factory_rig,
     map_from_pnp,
     network_method,
     pnp,
-    refined_by_sightings,
+    refine_by_positions,
     steps_from_factory,
 )
 from imgcal.evaluation.metrics import errors
-from imgcal.networks import Sightings
+from imgcal.networks import Positions
 from imgcal.synthesis.colour_coding import ImageOptions
 from imgcal.types.prediction import Prediction
 from tests.imgcal.evaluation.conftest import Fake, disturbed
@@ -69,7 +69,7 @@ def test_every_table_has_four_numbers_of_steps():
 
 def test_the_factory_rig_stays_as_it_is(sample):
     some = sample(3)
-    found = factory_alone(some.given())
+    found = keep_factory_rig(some.given())
     assert torch.equal(found.rig.distortion, some.conditions.rig.distortion.expand(3, 4, 5))
     # Fitting the pose is never worse than knowing it, as far as the image goes.
     true_pose = Prediction(some.conditions.rig.expand(3), some.truth.rig_from_object)
@@ -80,7 +80,7 @@ def test_pnp_moves_each_camera_on_its_own(sample):
     some = sample(3)
     found = pnp(some.given()).cameras_from_object
     assert torch.allclose(found.focal_length, some.conditions.rig.focal_length.expand(3, 4, 2))
-    assert (re(pnp(some.given()), some) < re(factory_alone(some.given()), some)).all()
+    assert (re(pnp(some.given()), some) < re(keep_factory_rig(some.given()), some)).all()
 
 
 def test_opencv_with_eight_points_explains_them_all(sample):
@@ -149,9 +149,9 @@ def test_sightings_are_refined_with_their_own_sigma(sample):
     uv[:, 1, 3] += 40.0  # a stray
     uv[:, 2, 5] += 3.0
     sigma[:, 2, 5] = 5.0
-    sightings = Sightings(uv, sigma, given.seen.double())
+    sightings = Positions(uv, sigma, given.seen.double())
     start = disturbed(some.truth, given.prior_std)
-    found = refined_by_sightings(start, sightings, given.factory, given.obj, given.prior_std)
+    found = refine_by_positions(start, sightings, given.factory, given.obj, given.prior_std)
     assert (re(found, some) < 0.1).all()
 
 
@@ -181,7 +181,7 @@ def test_where_images_confirm_no_rig_positions_of_the_network_decide(sample, mon
         image_options = ImageOptions(size=32, dot=1.0)
 
         def sight(self, images):
-            return Sightings(given.uv[: len(images)], torch.full_like(given.uv[..., 0], 0.05), given.seen.double())
+            return Positions(given.uv[: len(images)], torch.full_like(given.uv[..., 0], 0.05), given.seen.double())
 
     monkeypatch.setattr("imgcal.evaluation.methods.ImageNetwork", Sees)
     given.drawn[ImageOptions(size=32, dot=1.0)] = torch.zeros(3, 4, 3, 32, 32)  # nothing to be seen

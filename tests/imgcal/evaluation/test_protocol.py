@@ -6,13 +6,13 @@ import torch
 
 from imgcal.errors import InputError, RefusedError
 from imgcal.evaluation import BASELINES, Conditions, Method, Protocol, evaluate, network_method
-from imgcal.evaluation.methods import Refined, factory_alone
+from imgcal.evaluation.methods import Refined, keep_factory_rig
 from imgcal.evaluation.metrics import KINDS, Errors
 from imgcal.evaluation.protocol import LEAST_SIGMA, Scores, draw
 from imgcal.synthesis import LEVELS, Degradation, ImageOptions
 from tests.imgcal.evaluation.conftest import Fake, straight_down
 
-FACTORY = {"factory": Method(factory_alone)}
+FACTORY = {"factory": Method(keep_factory_rig)}
 
 
 def of_re(values: list[float]) -> Errors:
@@ -154,7 +154,7 @@ def test_methods_are_told_the_noise(conditions):
 
     def listen(given):
         told.append((given.sigma, given.prior_std))
-        return factory_alone(given)
+        return keep_factory_rig(given)
 
     for noise in (0.0, 0.3):
         known: Conditions = conditions(noise=noise, kappa=0.01)

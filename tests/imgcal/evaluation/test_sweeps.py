@@ -3,10 +3,10 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.evaluation import AXES, Method, Protocol, sweep
-from imgcal.evaluation.methods import factory_alone
+from imgcal.evaluation.methods import keep_factory_rig
 from imgcal.synthesis.rigs import RelativeDrift
 
-FACTORY = {"factory": Method(factory_alone)}
+FACTORY = {"factory": Method(keep_factory_rig)}
 FEW = Protocol(count=6, trials=1)
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from imgcal.evaluation import EncoderCheck, Evaluation, Method, Protocol, Row, Scores, evaluate, network_method, sweep
-from imgcal.evaluation.methods import factory_alone
+from imgcal.evaluation.methods import keep_factory_rig
 from imgcal.evaluation.plots import draw_latency, draw_sweep, draw_training
 from imgcal.evaluation.summary import Facts, Summary, as_values
 from imgcal.evaluation.tables import Table, as_tables, describe, markdown, write
@@ -18,7 +18,7 @@ HISTORY = ({"step": 10, "re_px": 9.0}, {"step": 20, "re_px": 5.0, "validation_re
 @pytest.fixture(scope="module")
 def summary(conditions) -> Summary:
     known = straight_down(conditions(kappa=0.002, noise=0.1))
-    methods = {"fake": network_method(Fake(known)), "factory": Method(factory_alone)}
+    methods = {"fake": network_method(Fake(known)), "factory": Method(keep_factory_rig)}
     few = Protocol(count=4, trials=2)
     return Summary(
         evaluate(methods, known, few),

@@ -1,12 +1,12 @@
 from imgcal.evaluation import Method, network_method
-from imgcal.evaluation.methods import factory_alone
+from imgcal.evaluation.methods import keep_factory_rig
 from imgcal.evaluation.timing import WARM, latency
 from tests.imgcal.evaluation.conftest import Fake, straight_down
 
 
 def test_latency_has_a_second_figure_where_there_is_a_refinement(conditions):
     known = straight_down(conditions(kappa=0.002))
-    alone = latency(Method(factory_alone), known, repeats=2)
+    alone = latency(Method(keep_factory_rig), known, repeats=2)
     assert 0 < alone.alone_p50 <= alone.alone_p99
     assert alone.refined_p50 is None
     both = latency(network_method(Fake(known)), known, repeats=2)
@@ -23,7 +23,7 @@ def test_every_rig_is_predicted_alone_and_the_first_ones_do_not_count(conditions
         if len(sizes) <= WARM:
             for _ in range(1000):  # slow at first
                 next(clock)
-        return factory_alone(given)
+        return keep_factory_rig(given)
 
     found = latency(Method(predict), straight_down(conditions(kappa=0.002)), repeats=4)
     assert sizes == [1] * (4 + WARM)

@@ -17,7 +17,7 @@ def information(prior: RigPrior, lens: str = "") -> DriftInformation:
     seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
     observations = Observations(truth.uv, torch.full(seen.shape, 0.1), seen)
     options = imgcal.EstimationOptions(loss="squared", tolerance=1e-10)
-    return DriftInformation.of(
+    return DriftInformation.from_estimates(
         imgcal.estimate(observations, factory, obj, prior_std=prior.std(factory), options=options)
     )
 
@@ -48,11 +48,11 @@ def test_a_motion_of_the_whole_rig_has_no_information() -> None:
 def test_parts_of_other_cameras_are_not_joined() -> None:
     one = DriftInformation(("a",), torch.zeros(1, 15, 15), torch.zeros(1, 15))
     other = DriftInformation(("b",), torch.zeros(1, 15, 15), torch.zeros(1, 15))
-    assert len(DriftInformation.joined([one, one])) == 2
+    assert len(DriftInformation.concatenate([one, one])) == 2
     with pytest.raises(imgcal.InputError, match="same cameras"):
-        DriftInformation.joined([one, other])
+        DriftInformation.concatenate([one, other])
     wide = DriftInformation(("a",), torch.zeros(1, 18, 18), torch.zeros(1, 18))
     with pytest.raises(imgcal.InputError, match="same cameras"):
-        DriftInformation.joined([one, wide])
+        DriftInformation.concatenate([one, wide])
     with pytest.raises(imgcal.InputError, match="expected"):
         DriftInformation(("a",), torch.zeros(1, 15, 14), torch.zeros(1, 15))

@@ -32,7 +32,7 @@ def misbehaving(items: Sequence[str]) -> list[str]:
 
 def test_results_come_in_the_order_of_the_items(engine: Engine) -> None:
     ray.cloudpickle.register_pickle_by_value(__import__(__name__, fromlist=["square"]))
-    assert list(engine.mapped(square, range(20))) == [n * n for n in range(20)]
+    assert list(engine.map(square, range(20))) == [n * n for n in range(20)]
 
 
 def test_only_the_item_that_kills_its_process_is_lost(engine: Engine) -> None:
@@ -69,7 +69,7 @@ def test_no_more_is_read_than_is_needed(engine: Engine) -> None:
 
 def test_an_error_of_the_function_is_raised(engine: Engine) -> None:
     with pytest.raises(TypeError):
-        list(engine.mapped(len, [1]))
+        list(engine.map(len, [1]))
 
 
 def test_an_address_where_nobody_is_ends_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from imgcal.fleet import Item, Settings
 from imgcal.fleet import job as jobs
-from imgcal.fleet.job import content_key, processed
+from imgcal.fleet.job import content_key, process
 from tests.imgcal.fleet.small_captures import write_capture
 
 
@@ -24,12 +24,12 @@ def capture(tmp_path: Path) -> Path:
 
 
 def test_a_capture_becomes_a_row(capture: Path) -> None:
-    row = processed(item(capture), Settings(keep_rig=True))
+    row = process(item(capture), Settings(keep_rig=True))
     assert row is not None and row["status"] == "ok" and row["snapshots"] == 2
     assert row["cpu_seconds"] > 0
     assert len(row["offset"]) == 60 and len(row["information_factor"]) == 60 * 61 // 2
     assert row["rms_px"] < 0.2 and row["rig_file"].startswith("format: imgcal-rig/1")
-    assert processed(item(capture), Settings(), frozenset({row["key"]})) is None
+    assert process(item(capture), Settings(), frozenset({row["key"]})) is None
 
 
 def test_the_key_says_what_a_result_depends_on(capture: Path, tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_the_key_says_what_a_result_depends_on(capture: Path, tmp_path: Path) ->
 )
 def test_what_is_wrong_is_said_in_the_row(capture: Path, changes: dict[str, Any], status: str, reason: str) -> None:
     path = changes.pop("capture", capture)
-    row = processed(item(path, **changes), Settings())
+    row = process(item(path, **changes), Settings())
     assert row is not None
     if changes.get("rig") == "O10":  # six cameras of it see nothing: sound, but it cannot decide
         assert row["status"] in ("unusable", "refused")
@@ -76,8 +76,8 @@ def test_what_is_wrong_is_said_in_the_row(capture: Path, changes: dict[str, Any]
 def test_captures_that_hang_or_grow(
     capture: Path, behaviour: Any, status: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(jobs, "_recalibrated", behaviour)
-    row = processed(item(capture), Settings(seconds=0.5, memory_mb=500))
+    monkeypatch.setattr(jobs, "_recalibrate", behaviour)
+    row = process(item(capture), Settings(seconds=0.5, memory_mb=500))
     assert row is not None and row["status"] == status
     assert row["seconds"] < 10 and row["key"]
 
@@ -87,7 +87,7 @@ def test_devices_and_pipes_are_not_waited_for(capture: Path, tmp_path: Path) -> 
     started = time.perf_counter()
     for place in ("/dev/zero", str(tmp_path / "pipe")):
         for changes in ({"capture": place}, {"rig": place}, {"object": place}):
-            row = processed(replace(item(capture), **changes), Settings(seconds=5.0))
+            row = process(replace(item(capture), **changes), Settings(seconds=5.0))
             assert row is not None and row["status"] == "unusable"
             assert row["reason"].startswith(f"{place}: found a device or pipe, expected")
     assert time.perf_counter() - started < 5.0
@@ -102,7 +102,7 @@ def test_the_limit_holds_where_every_exception_is_caught(capture: Path, monkeypa
                 continue
 
     monkeypatch.setattr(jobs, "calibrate", stubborn)
-    row = processed(item(capture), Settings(seconds=0.5))
+    row = process(item(capture), Settings(seconds=0.5))
     assert row is not None and row["status"] == "timed_out" and row["seconds"] < 30
 
 
@@ -111,5 +111,5 @@ def test_a_system_that_can_limit_nothing_still_calibrates(capture: Path, monkeyp
     monkeypatch.setattr(jobs, "resource", None)
     monkeypatch.delattr(signal, "setitimer")
     monkeypatch.delattr(signal, "SIGALRM")
-    row = processed(item(capture), Settings(seconds=0.0))
+    row = process(item(capture), Settings(seconds=0.0))
     assert row is not None and row["status"] == "ok"

@@ -7,7 +7,7 @@ import pytest
 
 import imgcal
 from imgcal.fleet import Manifest, Settings, write_manifest
-from imgcal.fleet.job import processed
+from imgcal.fleet.job import process
 
 
 def items(path: Path, **kwargs: str) -> list[object]:
@@ -93,7 +93,7 @@ def test_a_time_out_of_range_is_a_fault_of_its_row(time: str, tmp_path: Path) ->
     one, two = items(tmp_path / "m.csv", rig="T4", object="cube8")
     assert one.fault.startswith("row 0: found time") and one.time is None
     assert two.fault is None
-    assert processed(one, Settings())["status"] == "unusable"
+    assert process(one, Settings())["status"] == "unusable"
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_a_value_of_any_type_ends_nothing(column: str, value: object, fault: str
     pyarrow.parquet.write_table(pa.table({"capture": ["a"]} | {column: [value]}), tmp_path / "m.parquet")
     (item,) = items(tmp_path / "m.parquet", rig="T4", object="cube8")
     assert (item.fault is None) == (fault is None) and (fault or "") in (item.fault or "")
-    assert processed(item, Settings())["status"] == "unusable"
+    assert process(item, Settings())["status"] == "unusable"
 
 
 def test_a_missing_manifest(tmp_path: Path) -> None:

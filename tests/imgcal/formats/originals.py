@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from imgcal.formats import ForeignRig
-from imgcal.formats.values import quaternion_of_rotation, rotation_of_vector
+from imgcal.formats.values import quaternion_from_rotation, rotation_from_vector
 
 UPWARD = np.diag([1.0, -1.0, -1.0])
 
@@ -15,7 +15,7 @@ def vicon(rig: ForeignRig) -> bytes:
     """Windows line ends, thresholds, comments, single and double quotes, exponents with three digits."""
     cameras = []
     for camera in rig.cameras:
-        w, x, y, z = quaternion_of_rotation(camera.rotation)
+        w, x, y, z = quaternion_from_rotation(camera.rotation)
         (fx, _), (cx, cy) = camera.lens.focal_length, camera.lens.principal_point
         place = " ".join(f"{value:.12f}" for value in camera.centre)
         radial = f"{cx:.12f} {cy:.12f} -2.9612345678901e-08 1.1212345678901e-014 0"
@@ -40,7 +40,7 @@ def motive(rig: ForeignRig) -> bytes:
         turned = " ".join(f'OrientMatrix{n}="{value:.15f}"' for n, value in enumerate(axes))
         x, y, z = camera.centre / 1000
         (fx, fy), (cx, cy) = camera.lens.focal_length, camera.lens.principal_point
-        k1, k2, p1, p2, k3 = camera.lens.padded(5)
+        k1, k2, p1, p2, k3 = camera.lens.pad(5)
         cameras.append(
             f'<Camera Serial="{camera.name}"\nExposure="250"\nName="Prime 13"\nLed="1"\n>'
             '<Attributes ImagerPixelWidth="1280" '
@@ -64,7 +64,7 @@ def qualisys(rig: ForeignRig) -> bytes:
         axes = UPWARD @ camera.rotation
         x, y, z = camera.centre
         (fx, fy), (cx, cy) = camera.lens.focal_length, camera.lens.principal_point
-        k1, k2, p1, p2, k3 = camera.lens.padded(5)
+        k1, k2, p1, p2, k3 = camera.lens.pad(5)
         turned = " ".join(f'r{r + 1}{c + 1}="{axes[r, c]:.9f}"' for r in range(3) for c in range(3))
         cameras.append(
             f'<camera active="1" serial="{camera.name}" avg-residual="0.402" viewrotation="0"><fov_video bottom="959" '
@@ -88,7 +88,7 @@ def drifted(rig: ForeignRig, seed: int = 0, names: Sequence[str] = ()) -> Foreig
         if names and camera.name not in names:
             cameras.append(camera)
             continue
-        rotation = rotation_of_vector(1e-3 * turn) @ camera.rotation
+        rotation = rotation_from_vector(1e-3 * turn) @ camera.rotation
         size = max(1.0, float(np.linalg.norm(camera.translation)))
         lens = camera.lens
         focal = (lens.focal_length[0] + 0.3 * zoom[0], lens.focal_length[1] + 0.3 * zoom[0] + 0.01 * zoom[1])

@@ -7,14 +7,14 @@ import numpy as np
 
 from imgcal.formats import ForeignCamera, ForeignRig, Lens, in_millimetres, read_foreign_rig, worst_difference
 from imgcal.formats.format import Files
-from imgcal.formats.values import rotation_of_vector
+from imgcal.formats.values import rotation_from_vector
 
 
 def rig_of(*lenses: Lens, size: tuple[int, int] = (1280, 960), names: tuple[str, ...] = ()) -> ForeignRig:
     """Cameras on an arc that look inwards, in mm; the first one is not at the origin."""
     cameras = []
     for number, lens in enumerate(lenses):
-        rotation = rotation_of_vector(np.array([0.05, -0.12 + 0.2 * number, 0.02 * number]))
+        rotation = rotation_from_vector(np.array([0.05, -0.12 + 0.2 * number, 0.02 * number]))
         centre = np.array([300.0 * number - 90.0, 12.0 * number, 40.0 + 25.0 * number])
         name = names[number] if names else f"side{number}"
         cameras.append(ForeignCamera(name, lens, size, rotation, -rotation @ centre))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats import converted, read_foreign_rig
+from imgcal.formats import convert_rig, read_foreign_rig
 from tests.imgcal.formats.rigs import apart, brown, fisheye, put, put_files, read_in_mm, rig_of
 
 TEXT = """
@@ -42,7 +42,7 @@ def test_the_unit_is_asked_for(tmp_path: Path) -> None:
 def test_aniposelib_reads_what_is_written(tmp_path: Path) -> None:
     cameras = pytest.importorskip("aniposelib.cameras", exc_type=ImportError)
     rig = rig_of(brown(-0.1, 0.02, 0.001, 0.0, 0.01), fisheye(0.01, 0.02), brown())
-    path = put_files(tmp_path, converted(rig, "anipose", "x").files)
+    path = put_files(tmp_path, convert_rig(rig, "anipose", "x").files)
     group = cameras.CameraGroup.load(str(path))
     points = np.array([[10.0, 20.0, 900.0], [-100.0, 100.0, 1500.0]])
     for camera, other in zip(rig.cameras, group.cameras, strict=True):
@@ -52,6 +52,6 @@ def test_aniposelib_reads_what_is_written(tmp_path: Path) -> None:
 
 def test_written_and_read(tmp_path: Path) -> None:
     rig = rig_of(brown(-0.1, 0.02, 0.001, 0.0, 0.01), fisheye(0.01, 0.02), brown())
-    back = read_in_mm(put_files(tmp_path, converted(rig, "anipose", "x", unit="cm").files), "cm")
+    back = read_in_mm(put_files(tmp_path, convert_rig(rig, "anipose", "x", unit="cm").files), "cm")
     assert apart(rig, back) < 1e-8
     assert back.names == rig.names

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats import converted, read_foreign_rig
-from imgcal.formats.values import rotation_of_vector
+from imgcal.formats import convert_rig, read_foreign_rig
+from imgcal.formats.values import rotation_from_vector
 from tests.imgcal.formats.rigs import apart, brown, fisheye, put, put_files, read_in_mm, rig_of
 
 CAMERA = """
@@ -31,7 +31,7 @@ def text(
 
 
 def test_vectors_and_matrices_new_and_old(tmp_path: Path) -> None:
-    matrix = rotation_of_vector(np.array(VECTOR)).tolist()
+    matrix = rotation_from_vector(np.array(VECTOR)).tolist()
     for new in (True, False):
         for rotation in (VECTOR, matrix):
             content = "".join(text(new, n, rotation) for n in (1, 10, 2))
@@ -55,7 +55,7 @@ def test_turned_images_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["caliscope", "caliscope-config"])
 def test_written_and_read(tmp_path: Path, name: str) -> None:
     rig = rig_of(brown(-0.1, 0.02, 0.001, 0, 0.01), fisheye(0.01), brown(), names=("1", "10", "2"))
-    path = put_files(tmp_path, converted(rig, name, "x").files)
+    path = put_files(tmp_path, convert_rig(rig, name, "x").files)
     back = read_in_mm(path)
     assert (back.format, back.names) == ("caliscope", rig.names)
     assert apart(rig, back) < 1e-8
@@ -65,14 +65,14 @@ def test_written_and_read(tmp_path: Path, name: str) -> None:
 
 
 def test_cameras_with_other_names_are_numbered() -> None:
-    made = converted(rig_of(brown(), brown()), "caliscope", "x")
+    made = convert_rig(rig_of(brown(), brown()), "caliscope", "x")
     assert any("cameras are called otherwise there, in this order: 0, 1" in note for note in made.notes)
 
 
 def test_caliscope_reads_what_is_written(tmp_path: Path) -> None:
     array = pytest.importorskip("caliscope.cameras.camera_array", exc_type=ImportError)
     rig = rig_of(brown(-0.1, 0.02, 0.001, 0, 0.01), brown(), names=("1", "7"))
-    path = put_files(tmp_path, converted(rig, "caliscope", "x").files)
+    path = put_files(tmp_path, convert_rig(rig, "caliscope", "x").files)
     found = array.CameraArray.from_toml(path)
     for camera in rig.cameras:
         other = found.cameras[int(camera.name)]

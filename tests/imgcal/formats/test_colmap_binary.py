@@ -4,12 +4,12 @@ from pathlib import Path
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats import converted, read_foreign_rig
+from imgcal.formats import convert_rig, read_foreign_rig
 from tests.imgcal.formats.rigs import apart, brown, fisheye, put_files, read_in_mm, rig_of
 
 
 def folder_of(tmp_path: Path, without: str = "") -> Path:
-    files = converted(rig_of(brown(-0.1, 0.02), fisheye(0.01), brown(0, 0, 0, 0, 0.01)), "colmap-binary", "x").files
+    files = convert_rig(rig_of(brown(-0.1, 0.02), fisheye(0.01), brown(0, 0, 0, 0, 0.01)), "colmap-binary", "x").files
     return put_files(tmp_path / "model", {name: content for name, content in files.items() if name != without})
 
 

@@ -2,9 +2,17 @@ import numpy as np
 import pytest
 
 from imgcal.formats.chains import compose, inverse
-from imgcal.formats.colmap_model import COUNTS, ColmapCamera, ColmapImage, ColmapRig, model_of_rig, rig_of_model, seven
+from imgcal.formats.colmap_model import (
+    COUNTS,
+    ColmapCamera,
+    ColmapImage,
+    ColmapRig,
+    model_from_rig,
+    rig_from_model,
+    seven,
+)
 from imgcal.formats.foreign_rig import FormatError
-from imgcal.formats.values import rotation_of_vector
+from imgcal.formats.values import rotation_from_vector
 from tests.imgcal.formats.rigs import brown, rig_of
 
 DRAW = np.random.default_rng(3)
@@ -12,7 +20,7 @@ CAMERAS = [ColmapCamera(n, "PINHOLE", (1280, 800), (900.0, 901.0, 640.0, 400.0))
 
 
 def pose() -> tuple[np.ndarray, np.ndarray]:
-    return rotation_of_vector(DRAW.normal(size=3) * 0.3), DRAW.normal(size=3)
+    return rotation_from_vector(DRAW.normal(size=3) * 0.3), DRAW.normal(size=3)
 
 
 @pytest.mark.parametrize(
@@ -52,44 +60,44 @@ def test_images_of_fixed_cameras_are_a_rig() -> None:
         "b/1.png": compose(b_from_a, later),
         "a/1.png": later,
     }
-    rig = rig_of_model("colmap", CAMERAS, images(taken), [])
+    rig = rig_from_model("colmap", CAMERAS, images(taken), [])
     assert (rig.names, rig.unit) == (["a", "b"], None)
     assert np.allclose(rig.cameras[1].translation, compose(b_from_a, first)[1])  # the world, at the first frame
     taken["b/1.png"] = pose()
     with pytest.raises(FormatError, match="camera b stands otherwise to a in '1'"):
-        rig_of_model("colmap", CAMERAS, images(taken), [])
+        rig_from_model("colmap", CAMERAS, images(taken), [])
 
 
 def test_images_of_one_moment_are_a_rig() -> None:
     taken = {"a_left.png": pose(), "b_right.png": pose()}
-    rig = rig_of_model("colmap", CAMERAS, images(taken), [ColmapRig(1, {1: None}), ColmapRig(2, {2: None})])
+    rig = rig_from_model("colmap", CAMERAS, images(taken), [ColmapRig(1, {1: None}), ColmapRig(2, {2: None})])
     assert rig.names == ["a_left", "b_right"]
     with pytest.raises(FormatError, match="found no rig and 1 images"):
-        rig_of_model("colmap", CAMERAS, images(taken)[:1], [])
+        rig_from_model("colmap", CAMERAS, images(taken)[:1], [])
 
 
 def test_a_rig_names_cameras_by_the_folders_of_their_images() -> None:
     rigs = [ColmapRig(1, {1: (np.eye(3), np.zeros(3)), 2: pose()})]
     taken = {"a/left/0.png": pose(), "b/right/0.png": pose()}
-    assert rig_of_model("colmap", CAMERAS, images(taken), rigs).names == ["left", "right"]
-    assert rig_of_model("colmap", CAMERAS, [], rigs).names == ["1", "2"]
+    assert rig_from_model("colmap", CAMERAS, images(taken), rigs).names == ["left", "right"]
+    assert rig_from_model("colmap", CAMERAS, [], rigs).names == ["1", "2"]
     with pytest.raises(FormatError, match="camera 2 without a pose"):
-        rig_of_model("colmap", CAMERAS, [], [ColmapRig(1, {1: (np.eye(3), np.zeros(3)), 2: None})])
+        rig_from_model("colmap", CAMERAS, [], [ColmapRig(1, {1: (np.eye(3), np.zeros(3)), 2: None})])
 
 
 def test_one_of_several_rigs_is_chosen_by_name() -> None:
     eye = (np.eye(3), np.zeros(3))
     rigs = [ColmapRig(1, {1: eye, 2: pose()}), ColmapRig(5, {2: eye, 1: pose()})]
     with pytest.raises(FormatError, match=r"found 2 rigs .*: choose one with --source-rig 1 \(of 1, 5\)"):
-        rig_of_model("colmap", CAMERAS, [], rigs)
-    assert rig_of_model("colmap", CAMERAS, [], rigs, "5").frame == "rig 5 (its reference camera)"
+        rig_from_model("colmap", CAMERAS, [], rigs)
+    assert rig_from_model("colmap", CAMERAS, [], rigs, "5").frame == "rig 5 (its reference camera)"
     with pytest.raises(FormatError, match="--source-rig: found 7, expected one of 1, 5"):
-        rig_of_model("colmap", CAMERAS, [], rigs, "7")
+        rig_from_model("colmap", CAMERAS, [], rigs, "7")
 
 
 def test_a_rig_taken_apart() -> None:
     rig = rig_of(brown(-0.1), brown(0, 0, 0, 0, 0, 0.1), brown())
-    cameras, images_, colmap_rig, rig_from_world = model_of_rig(rig)
+    cameras, images_, colmap_rig, rig_from_world = model_from_rig(rig)
     assert [camera.model for camera in cameras] == ["OPENCV", "FULL_OPENCV", "PINHOLE"]
     assert cameras[0].parameters[2] == rig.cameras[0].lens.principal_point[0] + 0.5
     sensor = colmap_rig.sensors[3]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats import converted, read_foreign_rig
+from imgcal.formats import convert_rig, read_foreign_rig
 from tests.imgcal.formats.rigs import apart, brown, fisheye, put, put_files, read_in_mm, rig_of
 
 CAMERAS = "# x\n1 PINHOLE 1280 800 900 901 640 400\n2 SIMPLE_RADIAL 1280 800 900 640 400 0.01\n"
@@ -62,7 +62,7 @@ def test_a_rig_config_without_intrinsics_or_poses(tmp_path: Path) -> None:
 def test_pycolmap_reads_what_is_written(tmp_path: Path, name: str) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     rig = rig_of(brown(-0.1, 0.02), fisheye(0.01, 0.02), brown(0, 0, 0, 0, 0.01), names=("left", "mid", "right"))
-    made = converted(rig, name, "x", unit="cm")
+    made = convert_rig(rig, name, "x", unit="cm")
     folder = put_files(tmp_path / "model", made.files)
     model = pycolmap.Reconstruction(str(folder))
     points = np.array([[10.0, 20.0, 900.0], [-100.0, 100.0, 1500.0]])

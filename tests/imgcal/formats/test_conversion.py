@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.formats import Holds, from_camera_rig, held_by, to_camera_rig, with_image_sizes
+from imgcal.formats import Holds, fill_image_sizes, fit_to_target, from_camera_rig, to_camera_rig
 from imgcal.formats.conversion import NATIVE, describe_lens
 from imgcal.types import CameraRig
 from tests.imgcal.formats.rigs import apart, brown, fisheye, rig_of
@@ -20,7 +20,7 @@ def test_ours_projects_as_theirs_does() -> None:
 
 def test_there_and_back(o10: CameraRig) -> None:
     there = from_camera_rig(o10)
-    back = to_camera_rig(held_by(there, NATIVE, "ours").rig, "O10")
+    back = to_camera_rig(fit_to_target(there, NATIVE, "ours").rig, "O10")
     assert torch.equal(back.distortion, o10.distortion)
     assert torch.equal(back.cam_from_rig.translation, o10.cam_from_rig.translation)
     assert back.camera_names == o10.camera_names
@@ -30,7 +30,7 @@ def test_there_and_back(o10: CameraRig) -> None:
 
 def test_each_camera_keeps_its_own_lens_model() -> None:
     rig = rig_of(brown(-0.1, 0.02), fisheye(0.01, -0.02, 0.003, -0.001), brown(0.1, 0, 0, 0, 0, 0.2))
-    ours = to_camera_rig(held_by(rig, NATIVE, "ours").rig, "x")
+    ours = to_camera_rig(fit_to_target(rig, NATIVE, "ours").rig, "x")
     assert ours.lens_models == ("brown_conrady", "equidistant", "rational")
     points = torch.tensor([[100.0, 20.0, 1200.0], [250.0, 100.0, 900.0]], dtype=torch.float64)
     for uv, camera in zip(ours.project(points).uv.numpy(), rig.cameras, strict=True):
@@ -44,22 +44,22 @@ def test_image_sizes_are_asked_for_by_name() -> None:
         "x", tuple(type(c)(c.name, c.lens, None, c.rotation, c.translation) for c in rig.cameras), "mm", "f"
     )
     with pytest.raises(InputError, match=r"cameras side0, side1: the size of the images is not said.*side0=1280x720"):
-        with_image_sizes(unknown, "file", {})
+        fill_image_sizes(unknown, "file", {})
     with pytest.raises(InputError, match="camera side1: the size"):
-        with_image_sizes(unknown, "file", {"side0": (640, 480)})
-    found = with_image_sizes(unknown, "file", {"": (1280, 960), "side1": (640, 480)})
+        fill_image_sizes(unknown, "file", {"side0": (640, 480)})
+    found = fill_image_sizes(unknown, "file", {"": (1280, 960), "side1": (640, 480)})
     assert [camera.image_size for camera in found.cameras] == [(1280, 960), (640, 480)]
     with pytest.raises(InputError, match="found camera side7"):
-        with_image_sizes(unknown, "file", {"side7": (640, 480)})
+        fill_image_sizes(unknown, "file", {"side7": (640, 480)})
     with pytest.raises(InputError, match="found 640x480 pixels, --image-size says 1x1"):
-        with_image_sizes(found, "file", {"side1": (1, 1)})
+        fill_image_sizes(found, "file", {"side1": (1, 1)})
 
 
 def test_a_lens_that_cannot_be_said_is_refused() -> None:
     rig = rig_of(brown(0.1, 0, 0, 0, 0, 0.3), brown())
     with pytest.raises(RefusedError, match=r"camera side0: it cannot say its lens \(OpenCV, 6 coefficients\).* px"):
-        held_by(rig, Holds((4,)), "it", 1e-3)
-    held = held_by(rig, Holds((4,)), "it", 10.0)
+        fit_to_target(rig, Holds((4,)), "it", 1e-3)
+    held = fit_to_target(rig, Holds((4,)), "it", 10.0)
     assert 0 < held.worst < 10
     assert held.fits[1].exact
     assert held.rig.cameras[0].lens.length == 4
@@ -67,6 +67,6 @@ def test_a_lens_that_cannot_be_said_is_refused() -> None:
 
 
 def test_values_that_no_rig_has() -> None:
-    rig = rig_of(brown(), brown()).scaled(1e9, "mm")
+    rig = rig_of(brown(), brown()).scale(1e9, "mm")
     with pytest.raises(InputError, match="translation"):
         to_camera_rig(rig, "x")

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats import converted, read_foreign_rig
+from imgcal.formats import convert_rig, read_foreign_rig
 from imgcal.formats.file_storage import storage_text
-from imgcal.formats.values import rotation_of_vector
+from imgcal.formats.values import rotation_from_vector
 from tests.imgcal.formats.rigs import apart, brown, put, put_files, read_in_mm, rig_of
 
 K = np.array([[900.5, 0, 640], [0, 905, 400], [0, 0, 1.0]])
 TURN = np.array([[0.1], [0.2], [0.3]])
-R = rotation_of_vector(TURN[:, 0])
+R = rotation_from_vector(TURN[:, 0])
 
 
 def files(
@@ -49,6 +49,6 @@ def test_one_of_two_files(tmp_path: Path) -> None:
 
 def test_written_and_read(tmp_path: Path) -> None:
     rig = rig_of(brown(-0.1, 0.02, 0, 0, 0.01), brown())
-    back = read_in_mm(put_files(tmp_path / "out", converted(rig, "easymocap", "x").files))
+    back = read_in_mm(put_files(tmp_path / "out", convert_rig(rig, "easymocap", "x").files))
     assert apart(rig, back) < 1e-8
     assert back.cameras[0].image_size == (1280, 960)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from imgcal.formats.file_storage import matrix, merged, storage_text
+from imgcal.formats.file_storage import matrix, merge_storages, storage_text
 from imgcal.formats.foreign_rig import FormatError
 from imgcal.formats.source import Source
 
@@ -42,7 +42,7 @@ def test_what_opencv_writes_is_read(tmp_path: Path, suffix: str) -> None:
     storage.write("", "right")
     storage.endWriteStruct()
     storage.release()
-    found = merged(Source([path]))
+    found = merge_storages(Source([path]))
     assert np.array_equal(matrix(found["K"], "K"), CONTENT["K"])
     assert np.array_equal(matrix(found["three"], "three").ravel(), np.arange(12.0))
     assert matrix(found["whole"], "whole").tolist() == [[1, 2]]

@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 
 from imgcal.formats import Holds, Lens
-from imgcal.formats.fitting import fitted, pixels_of
+from imgcal.formats.fitting import fit_lens, pixel_grid
 
 SIZE = (1280, 960)
 
 
 def test_what_can_be_said_is_said_exactly() -> None:
     lens = Lens((900.0, 905.0), (640.0, 480.0), (-0.1, 0.02, 0.001, 0.0, 0.0, 0.0, 0.0, 0.0))
-    fit = fitted(lens, SIZE, Holds((4,)))
+    fit = fit_lens(lens, SIZE, Holds((4,)))
     assert (fit.lens, fit.worst, fit.exact) == (lens, 0.0, True)
 
 
@@ -24,9 +24,9 @@ def test_what_can_be_said_is_said_exactly() -> None:
     ],
 )
 def test_another_model_takes_its_place(lens: Lens, holds: Holds, limit: float) -> None:
-    fit = fitted(lens, SIZE, holds)
+    fit = fit_lens(lens, SIZE, holds)
     assert not fit.exact
-    uv = pixels_of(SIZE, 50)  # points that the fit has not seen
+    uv = pixel_grid(SIZE, 50)  # points that the fit has not seen
     away = np.linalg.norm(fit.lens.project(lens.rays(uv)) - uv, axis=-1)
     assert away.max() < limit
     assert abs(away.max() - fit.worst) < 0.1 * fit.worst + 1e-6
@@ -35,19 +35,19 @@ def test_another_model_takes_its_place(lens: Lens, holds: Holds, limit: float) -
 
 def test_the_nearest_of_several_models_is_taken() -> None:
     lens = Lens((500.0, 500.0), (640.0, 480.0), (-0.25, 0.06, 0, 0, -0.006))
-    alone, both = fitted(lens, SIZE, Holds((4,))), fitted(lens, SIZE, Holds((4,), fisheye=True))
+    alone, both = fit_lens(lens, SIZE, Holds((4,))), fit_lens(lens, SIZE, Holds((4,), fisheye=True))
     assert both.worst <= alone.worst
 
 
 def test_a_lens_without_rays_in_a_corner_has_no_place() -> None:
     folded = Lens((500.0, 500.0), (640.0, 480.0), (-0.4,))
-    assert fitted(folded, SIZE, Holds((4,))).exact  # said as it is
+    assert fit_lens(folded, SIZE, Holds((4,))).exact  # said as it is
     wide = Lens((300.0, 300.0), (640.0, 480.0), (), "fisheye")  # 150 degrees across the diagonal
-    assert fitted(wide, (1600, 1200), Holds((5,))).worst == np.inf
+    assert fit_lens(wide, (1600, 1200), Holds((5,))).worst == np.inf
 
 
 def test_skew_is_not_said_by_a_lens_without() -> None:
     skewed = Lens((900.0, 900.0), (640.0, 480.0), (), skew=5.0)
-    fit = fitted(skewed, SIZE, Holds((5,)))
+    fit = fit_lens(skewed, SIZE, Holds((5,)))
     assert not fit.exact
     assert fit.worst > 0.5

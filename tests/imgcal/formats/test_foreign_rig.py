@@ -5,7 +5,7 @@ from tests.imgcal.formats.rigs import apart, brown, rig_of
 
 def test_the_frame_of_the_first_camera() -> None:
     rig = rig_of(brown(-0.1), brown(0.05), brown())
-    moved = rig.seen_from_first()
+    moved = rig.in_camera_frame()
     assert np.array_equal(moved.cameras[0].rotation, np.eye(3))
     assert not moved.cameras[0].translation.any()
     assert apart(rig, moved) < 1e-9
@@ -17,7 +17,7 @@ def test_the_frame_of_the_first_camera() -> None:
 
 def test_another_unit() -> None:
     rig = rig_of(brown(-0.1), brown())
-    metres = rig.scaled(1e-3, "m")
+    metres = rig.scale(1e-3, "m")
     assert metres.unit == "m"
     points = np.array([[10.0, -20.0, 900.0]])
     assert np.allclose(metres.cameras[1].project(points * 1e-3), rig.cameras[1].project(points), atol=1e-9)

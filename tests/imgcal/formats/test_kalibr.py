@@ -5,9 +5,9 @@ import pytest
 import yaml
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.formats import converted, read_foreign_rig
+from imgcal.formats import convert_rig, read_foreign_rig
 from imgcal.formats.chains import compose, inverse
-from imgcal.formats.values import rotation_of_vector
+from imgcal.formats.values import rotation_from_vector
 from tests.imgcal.formats.rigs import apart, brown, fisheye, put, put_files, read_in_mm, rig_of
 
 DRAW = np.random.default_rng(8)
@@ -21,7 +21,7 @@ def camera(**more: object) -> dict[str, object]:
 
 
 def pose() -> tuple[np.ndarray, np.ndarray]:
-    return rotation_of_vector(DRAW.normal(size=3) * 0.3), DRAW.normal(size=3) * 0.2
+    return rotation_from_vector(DRAW.normal(size=3) * 0.3), DRAW.normal(size=3) * 0.2
 
 
 def rows(one: tuple[np.ndarray, np.ndarray]) -> list[list[float]]:
@@ -88,7 +88,7 @@ def test_a_camera_without_a_link_is_named(tmp_path: Path) -> None:
 
 def test_written_and_read(tmp_path: Path) -> None:
     rig = rig_of(brown(-0.1, 0.02, 0.001, -0.0004), fisheye(0.01, -0.02, 0.003, -0.001), brown())
-    made = converted(rig, "kalibr", "x")
+    made = convert_rig(rig, "kalibr", "x")
     path = put_files(tmp_path, made.files)
     content = yaml.safe_load(path.read_text())
     assert list(content) == ["cam0", "cam1", "cam2"]
@@ -101,6 +101,6 @@ def test_written_and_read(tmp_path: Path) -> None:
 
 def test_a_fifth_coefficient_is_fitted_or_refused() -> None:
     slight, strong = brown(-0.1, 0.02, 0, 0, 0.0002), brown(-0.3, 0.1, 0, 0, -0.05)
-    assert 0 < converted(rig_of(slight, brown()), "kalibr", "x").between_models < 0.05
+    assert 0 < convert_rig(rig_of(slight, brown()), "kalibr", "x").between_models < 0.05
     with pytest.raises(RefusedError, match="Kalibr camchain cannot say its lens"):
-        converted(rig_of(strong, brown()), "kalibr", "x")
+        convert_rig(rig_of(strong, brown()), "kalibr", "x")

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from imgcal.formats import Lens
-from imgcal.formats.fitting import pixels_of
+from imgcal.formats.fitting import pixel_grid
 
 DRAW = np.random.default_rng(4)
 POINTS = DRAW.normal(size=(300, 3)) * [0.4, 0.3, 0.1] + [0, 0, 1.5]
@@ -53,7 +53,7 @@ def test_there_are_no_rays_beyond_the_fold() -> None:
 
 
 def test_every_pixel_comes_back() -> None:
-    uv = pixels_of((1280, 800), 21)
+    uv = pixel_grid((1280, 800), 21)
     for lens in (
         Lens((900.0, 905.0), (640.0, 400.0), NUMBERS, skew=1.5),
         Lens((500.0, 505.0), (640.0, 400.0), (0.02, -0.01), "fisheye"),
@@ -65,4 +65,4 @@ def test_every_pixel_comes_back() -> None:
 def test_how_many_coefficients_count() -> None:
     assert Lens((1, 1), (0, 0), (0.1, 0.0, 0.0, 0.0, 0.0)).length == 1
     assert Lens((1, 1), (0, 0), (0.0,) * 14).length == 0
-    assert Lens((1, 1), (0, 0), (0.1, 0.2)).padded(4) == [0.1, 0.2, 0.0, 0.0]
+    assert Lens((1, 1), (0, 0), (0.1, 0.2)).pad(4) == [0.1, 0.2, 0.0, 0.0]

@@ -6,7 +6,7 @@ import yaml
 
 import imgcal
 from imgcal.errors import InputError, RefusedError
-from imgcal.formats import converted, load_cameras, load_rig
+from imgcal.formats import convert_rig, load_cameras, load_rig
 from imgcal.io import save_cameras, save_rig
 from imgcal.types import CameraRig
 from tests.imgcal.formats.rigs import brown, put, put_files, rig_of
@@ -27,7 +27,7 @@ def test_ours_as_ever(tmp_path: Path, o10: CameraRig) -> None:
 
 def test_another_tool_s_is_simply_read(tmp_path: Path) -> None:
     rig = rig_of(brown(-0.1, 0.02), brown(0.05), names=("cam0", "cam1"))
-    path = put_files(tmp_path, converted(rig, "kalibr", "x").files)
+    path = put_files(tmp_path, convert_rig(rig, "kalibr", "x").files)
     ours = load_rig(path)
     assert (ours.name, ours.camera_names) == ("calibration", ("cam0", "cam1"))
     apart = torch.linalg.vector_norm(ours.positions[1] - ours.positions[0])
@@ -35,7 +35,7 @@ def test_another_tool_s_is_simply_read(tmp_path: Path) -> None:
 
 
 def test_what_it_does_not_say_is_asked_for(tmp_path: Path) -> None:
-    folder = put_files(tmp_path / "pair", converted(rig_of(brown(-0.1), brown()), "opencv-stereo", "x").files)
+    folder = put_files(tmp_path / "pair", convert_rig(rig_of(brown(-0.1), brown()), "opencv-stereo", "x").files)
     with pytest.raises(InputError, match=r'in Python load_rig.*unit="mm"'):
         load_rig(folder)
     assert load_rig(folder, unit="mm").name == "pair"
@@ -57,7 +57,7 @@ def test_cameras_need_neither_places_nor_a_unit(tmp_path: Path) -> None:
     cameras = load_cameras(file)
     assert cameras.camera_names == ("0", "1", "2") and not cameras.positions.any()
     assert cameras.focal_length.tolist() == [[900.0, 901.0]] * 3 and cameras.prior is not None
-    anipose = put_files(tmp_path / "a", converted(rig_of(brown(-0.1), brown()), "anipose", "x").files)
+    anipose = put_files(tmp_path / "a", convert_rig(rig_of(brown(-0.1), brown()), "anipose", "x").files)
     with pytest.raises(InputError, match="unit"):
         load_rig(anipose)
     assert load_cameras(anipose).num_cameras == 2
@@ -68,7 +68,7 @@ def test_cameras_need_neither_places_nor_a_unit(tmp_path: Path) -> None:
 
 def test_cameras_of_ros_are_files_of_one_camera_each(tmp_path: Path) -> None:
     for number in range(3):
-        files = converted(rig_of(brown(0.1 * number), names=(f"cam{number}",)), "ros", "x").files
+        files = convert_rig(rig_of(brown(0.1 * number), names=(f"cam{number}",)), "ros", "x").files
         put_files(tmp_path / "ros", files)
     with pytest.raises(InputError, match="3 files: ROS says in them where two cameras are"):
         load_rig(tmp_path / "ros")
@@ -82,7 +82,7 @@ def test_cameras_of_our_own_as_ever(tmp_path: Path) -> None:
     assert load_cameras(tmp_path / "cameras.yaml").camera_names == ("left",)
     with pytest.raises(InputError, match="absent"):
         load_cameras(tmp_path / "absent.yaml")
-    pair = put_files(tmp_path / "pair", converted(rig_of(brown(), brown()), "opencv-stereo", "x").files)
+    pair = put_files(tmp_path / "pair", convert_rig(rig_of(brown(), brown()), "opencv-stereo", "x").files)
     text = (pair / "intrinsics.yml").read_text().replace("image_width", "x").replace("image_height", "y")
     (pair / "intrinsics.yml").write_text(text)
     with pytest.raises(InputError, match=r"image_size=\(1280, 720\)"):
@@ -93,7 +93,7 @@ def test_cameras_of_our_own_as_ever(tmp_path: Path) -> None:
 def test_two_calibrations_in_one_folder_are_not_mixed(tmp_path: Path) -> None:
     for to, name in (("kalibr", "yaml"), ("pose2sim", "toml")):
         for number in (1, 2):
-            files = converted(rig_of(brown(-0.1 * number), brown(), names=("cam0", "cam1")), to, "x").files
+            files = convert_rig(rig_of(brown(-0.1 * number), brown(), names=("cam0", "cam1")), to, "x").files
             put(tmp_path / to, **{f"calibration{number}__{name}": files[""]})
         with pytest.raises(InputError, match=rf"calibration1.{name}, calibration2.{name}.*give one of these files"):
             load_rig(tmp_path / to)
@@ -107,7 +107,7 @@ def test_a_lens_that_is_not_ours(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="this is a Kalibr camchain: cam0: an omnidirectional"):
         load_rig(put(tmp_path, a__yaml=yaml.safe_dump(cameras)) / "a.yaml")
     odd = brown(*([0.01] * 12))
-    path = put_files(tmp_path / "b", converted(rig_of(odd, brown()), "multical", "x").files)
+    path = put_files(tmp_path / "b", convert_rig(rig_of(odd, brown()), "multical", "x").files)
     with pytest.raises(RefusedError, match="`fit_limit` allows more"):
         load_rig(path)
     assert load_rig(path, fit_limit=50.0).num_cameras == 2

@@ -5,10 +5,10 @@ import pytest
 
 from imgcal.errors import InputError
 from imgcal.formats import read_foreign_rig
-from imgcal.formats.values import rotation_of_vector
+from imgcal.formats.values import rotation_from_vector
 from tests.imgcal.formats.rigs import put
 
-WORLD_FROM_CAMERA = rotation_of_vector(np.array([0.2, 1.1, -0.3]))
+WORLD_FROM_CAMERA = rotation_from_vector(np.array([0.2, 1.1, -0.3]))
 HEAD = '<?xml version="1.0" encoding="UTF-16LE"?>\n'
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats import converted, read_foreign_rig
-from imgcal.formats.values import rotation_of_vector
+from imgcal.formats import convert_rig, read_foreign_rig
+from imgcal.formats.values import rotation_from_vector
 from tests.imgcal.formats.rigs import brown, put, put_files, read_in_mm, rig_of
 
 TEXT = """
@@ -30,7 +30,7 @@ def test_both_names_of_extrinsics(tmp_path: Path) -> None:
         folder = put(tmp_path, left__cameramodel=text(key=key), right__cameramodel=text("LENSMODEL_PINHOLE", ""))
         rig = read_foreign_rig(folder)
         assert (rig.format, rig.unit, rig.names) == ("mrcal", None, ["left", "right"])
-        assert np.allclose(rig.cameras[0].rotation, rotation_of_vector(np.array([0.1, 0.2, 0.3])))
+        assert np.allclose(rig.cameras[0].rotation, rotation_from_vector(np.array([0.1, 0.2, 0.3])))
         assert rig.cameras[0].translation.tolist() == [1, 2, -3]
     one = read_foreign_rig(folder / "left.cameramodel")
     assert any("their folder" in note for note in one.notes)
@@ -53,7 +53,7 @@ def test_what_is_refused(tmp_path: Path, model: str, said: str) -> None:
 
 def test_written_and_read(tmp_path: Path) -> None:
     rig = rig_of(brown(-0.1, 0.02), brown(0, 0, 0, 0, 0, 0.1), brown(), names=("b", "a", "c"))
-    folder = put_files(tmp_path / "out", converted(rig, "mrcal", "x").files)
+    folder = put_files(tmp_path / "out", convert_rig(rig, "mrcal", "x").files)
     back = read_in_mm(folder, "m")
     assert back.names == ["a", "b", "c"]  # files come by name
     for camera in rig.cameras:
@@ -66,7 +66,7 @@ def test_written_and_read(tmp_path: Path) -> None:
 def test_mrcal_reads_what_is_written(tmp_path: Path) -> None:
     mrcal = pytest.importorskip("mrcal", exc_type=ImportError)
     rig = rig_of(brown(-0.1, 0.02), brown(0, 0, 0, 0, 0, 0.1), brown())
-    folder = put_files(tmp_path / "out", converted(rig, "mrcal", "x").files)
+    folder = put_files(tmp_path / "out", convert_rig(rig, "mrcal", "x").files)
     points = np.array([[10.0, 20.0, 900.0], [-100.0, 100.0, 1500.0]])
     for camera in rig.cameras:
         model = mrcal.cameramodel(str(folder / f"{camera.name}.cameramodel"))

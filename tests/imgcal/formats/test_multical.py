@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats import converted, read_foreign_rig
-from imgcal.formats.values import rotation_of_vector
+from imgcal.formats import convert_rig, read_foreign_rig
+from imgcal.formats.values import rotation_from_vector
 from tests.imgcal.formats.rigs import apart, brown, put, put_files, read_in_mm, rig_of
 
 LENS = {"model": "standard", "image_size": [1280, 800], "K": [[900, 0, 640], [0, 901, 400], [0, 0, 1]],
         "dist": [[-0.1, 0.02, 0, 0, 0.01]]}  # fmt: skip
-POSE = {"R": rotation_of_vector(np.array([0.1, 0.2, 0.3])).tolist(), "T": [-0.2, 0.01, 0.02]}
+POSE = {"R": rotation_from_vector(np.array([0.1, 0.2, 0.3])).tolist(), "T": [-0.2, 0.01, 0.02]}
 ZERO = {"R": np.eye(3).tolist(), "T": [0, 0, 0]}
 
 
@@ -42,7 +42,7 @@ def test_what_is_no_rig_is_said(tmp_path: Path) -> None:
 
 def test_written_and_read(tmp_path: Path) -> None:
     rig = rig_of(brown(-0.1, 0.02), brown(0, 0, 0, 0, 0, 0.1), brown(*[0.001] * 14), names=("m", "b", "c"))
-    path = put_files(tmp_path, converted(rig, "multical", "x").files)
+    path = put_files(tmp_path, convert_rig(rig, "multical", "x").files)
     content = json.loads(path.read_text())
     assert list(content["camera_poses"]) == ["m", "b_to_m", "c_to_m"]
     assert [camera["model"] for camera in content["cameras"].values()] == ["standard", "rational", "tilted"]

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats import converted, read_foreign_rig
+from imgcal.formats import convert_rig, read_foreign_rig
 from imgcal.formats.file_storage import storage_text
-from imgcal.formats.values import rotation_of_vector
+from imgcal.formats.values import rotation_from_vector
 from tests.imgcal.formats.rigs import apart, brown, fisheye, put, put_files, read_in_mm, rig_of
 
 K = np.array([[900.5, 0, 640], [0, 905, 400], [0, 0, 1.0]])
@@ -21,7 +21,7 @@ CONTENT = {
 
 @pytest.mark.parametrize("as_matrices", [False, True])
 def test_rotations_are_vectors_or_matrices(tmp_path: Path, as_matrices: bool) -> None:
-    turns = [rotation_of_vector(turn).ravel() for turn in TURNS] if as_matrices else TURNS
+    turns = [rotation_from_vector(turn).ravel() for turn in TURNS] if as_matrices else TURNS
     rig = read_foreign_rig(put(tmp_path, a__yaml=storage_text({**CONTENT, "Rs": np.array(turns)})))
     assert (rig.format, rig.unit, rig.names) == ("opencv-multiview", None, ["0", "1"])
     points = np.array([[0.01, 0.02, 0.9], [-0.2, 0.1, 1.5]])
@@ -40,7 +40,7 @@ def test_what_does_not_fit_together_is_said(tmp_path: Path) -> None:
 
 def test_opencv_reads_what_is_written(tmp_path: Path) -> None:
     rig = rig_of(brown(-0.1, 0.02), fisheye(0.01, -0.02), brown(0.1, 0, 0, 0, 0, 0.2))
-    path = put_files(tmp_path, converted(rig, "opencv-multiview", "x", unit="mm").files)
+    path = put_files(tmp_path, convert_rig(rig, "opencv-multiview", "x", unit="mm").files)
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     turns, shifts = (storage.getNode(key).mat().reshape(3, 3) for key in ("Rs", "Ts"))
     matrices, bent = storage.getNode("Ks").mat().reshape(3, 3, 3), storage.getNode("distortions").mat().reshape(3, -1)

@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats import Lens, converted, read_foreign_rig
+from imgcal.formats import Lens, convert_rig, read_foreign_rig
 from imgcal.formats.file_storage import storage_text
-from imgcal.formats.values import rotation_of_vector
+from imgcal.formats.values import rotation_from_vector
 from tests.imgcal.formats.rigs import apart, brown, put, put_files, read_in_mm, rig_of
 
 K = np.array([[900.5, 0, 640], [0, 905, 400], [0, 0, 1.0]])
 D = np.array([[-0.1, 0.05, 0.001, -0.002, 0.01]])
 K2 = K + np.array([[1, 0, 2], [0, 1, 3], [0, 0, 0]])
-R = rotation_of_vector(np.array([0.01, 0.2, -0.03]))
+R = rotation_from_vector(np.array([0.01, 0.2, -0.03]))
 T = np.array([[-120.0], [3.0], [5.0]])
 
 
@@ -65,7 +65,7 @@ def test_a_rotation_vector_and_four_coefficients(tmp_path: Path) -> None:
 
 def test_opencv_reads_what_is_written(tmp_path: Path) -> None:
     rig = rig_of(brown(-0.1, 0.02, 0, 0, 0.001, 0.1), brown(0.1))
-    folder = put_files(tmp_path / "out", converted(rig, "opencv-stereo", "x").files)
+    folder = put_files(tmp_path / "out", convert_rig(rig, "opencv-stereo", "x").files)
     inside = cv2.FileStorage(str(folder / "intrinsics.yml"), cv2.FILE_STORAGE_READ)
     outside = cv2.FileStorage(str(folder / "extrinsics.yml"), cv2.FILE_STORAGE_READ)
     points = np.array([[10.0, 20.0, 900.0], [-100.0, 100.0, 1500.0]])
@@ -79,4 +79,4 @@ def test_opencv_reads_what_is_written(tmp_path: Path) -> None:
 
 def test_a_pair_is_two(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds 2 cameras, found 3"):
-        converted(rig_of(brown(), brown(), Lens((900, 900), (640, 480))), "opencv-stereo", "x")
+        convert_rig(rig_of(brown(), brown(), Lens((900, 900), (640, 480))), "opencv-stereo", "x")

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from imgcal.formats.foreign_rig import FormatError
-from imgcal.formats.patching import Change, Style, TextFile, like, style_of
+from imgcal.formats.patching import Change, Style, TextFile, number_style, write_like
 
 
 @pytest.mark.parametrize(
@@ -22,25 +22,25 @@ from imgcal.formats.patching import Change, Style, TextFile, like, style_of
     ],
 )
 def test_a_number_keeps_its_form(token: str, value: float, digits: int, expected: str) -> None:
-    assert like(token, value, digits=digits) == expected
+    assert write_like(token, value, digits=digits) == expected
 
 
 def test_the_style_of_a_file() -> None:
-    assert style_of(["0.1234567890123456", "0.55", "0.0"]) == Style(shortest=True)
-    assert like("0.0", 1e-5, Style(shortest=True)) == "1.0e-05"  # without a point it is a text to YAML
-    assert style_of(["0.123", "7.500", "0"]) == Style(usual="0.123")
-    assert like("0", 0.25, Style(usual="0.123")) == "0.250"
+    assert number_style(["0.1234567890123456", "0.55", "0.0"]) == Style(shortest=True)
+    assert write_like("0.0", 1e-5, Style(shortest=True)) == "1.0e-05"  # without a point it is a text to YAML
+    assert number_style(["0.123", "7.500", "0"]) == Style(usual="0.123")
+    assert write_like("0", 0.25, Style(usual="0.123")) == "0.250"
 
 
 def test_bytes_around_numbers_stay() -> None:
     content = b"\xef\xbb\xbf# \xc3\xa9 1.0\r\na: [1.00, 2.00]   # 3\r\nb: &x 1.0\r\nc: *x\r\n"
     file = TextFile(content, Path("a.yaml"))
-    made = file.patched([Change(("a",), [1.0, 2.0], [1.5, 2.0])], 0)
+    made = file.patch([Change(("a",), [1.0, 2.0], [1.5, 2.0])], 0)
     assert made == content.replace(b"1.00", b"1.50")
     with pytest.raises(FormatError, match=re.escape("a.yaml: a: found 2 plain numbers, expected 3")):
-        file.patched([Change(("a",), [1.0, 2.0, 3.0], [1.5, 2.0, 3.0])], 0)
+        file.patch([Change(("a",), [1.0, 2.0, 3.0], [1.5, 2.0, 3.0])], 0)
     with pytest.raises(FormatError, match="stands for several values"):
-        file.patched([Change(("b",), [1.0], [1.5]), Change(("c",), [1.0], [1.7])], 0)
+        file.patch([Change(("b",), [1.0], [1.5]), Change(("c",), [1.0], [1.7])], 0)
 
 
 @pytest.mark.parametrize(
@@ -54,6 +54,6 @@ def test_bytes_around_numbers_stay() -> None:
 )
 def test_times(before: str, after: str) -> None:
     file = TextFile(f'calibration_time: "{before}"\nother: "{before}"\n'.encode(), Path("a.yaml"))
-    made, replaced, left = file.stamped(datetime(2026, 11, 24, 3, 30, 5))
+    made, replaced, left = file.stamp(datetime(2026, 11, 24, 3, 30, 5))
     assert made.decode() == f'calibration_time: "{after}"\nother: "{before}"\n'
     assert bool(replaced) != bool(left)

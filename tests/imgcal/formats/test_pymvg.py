@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats import converted, read_foreign_rig
-from imgcal.formats.values import rotation_of_vector
+from imgcal.formats import convert_rig, read_foreign_rig
+from imgcal.formats.values import rotation_from_vector
 from tests.imgcal.formats.rigs import apart, brown, put, put_files, read_in_mm, rig_of
 
 K = np.array([[900.5, 0, 640], [0, 905, 400], [0, 0, 1.0]])
-Q = rotation_of_vector(np.array([0.1, 0.2, 0.3]))
-RECTIFIED = rotation_of_vector(np.array([0.02, -0.03, 0.01]))
+Q = rotation_from_vector(np.array([0.1, 0.2, 0.3]))
+RECTIFIED = rotation_from_vector(np.array([0.02, -0.03, 0.01]))
 P = np.array([[800.0, 0, 600, -90], [0, 820, 410, 8], [0, 0, 1, 0]])
 
 
@@ -55,4 +55,4 @@ def test_what_is_refused(tmp_path: Path) -> None:
 
 def test_written_and_read(tmp_path: Path) -> None:
     rig = rig_of(brown(-0.1, 0.02, 0, 0, 0.01), brown())
-    assert apart(rig, read_in_mm(put_files(tmp_path, converted(rig, "pymvg", "x").files), "m")) < 1e-8
+    assert apart(rig, read_in_mm(put_files(tmp_path, convert_rig(rig, "pymvg", "x").files), "m")) < 1e-8

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats import converted, read_foreign_rig
-from imgcal.formats.values import rotation_of_vector
+from imgcal.formats import convert_rig, read_foreign_rig
+from imgcal.formats.values import rotation_from_vector
 from tests.imgcal.formats.rigs import brown, put, rig_of
 
-AXES = rotation_of_vector(np.array([1.2, 0.3, -0.4]))  # rows: camera axes in the world; x right, y up, back
+AXES = rotation_from_vector(np.array([1.2, 0.3, -0.4]))  # rows: camera axes in the world; x right, y up, back
 PLACE = np.array([1000.0, -2000.0, 1500.0])
 
 
@@ -61,7 +61,7 @@ def test_theia_s_variant_has_plain_pixels(tmp_path: Path) -> None:
 
 def test_it_is_only_read(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="Qualisys calibration is only read"):
-        converted(rig_of(brown(), brown()), "qualisys", "x")
+        convert_rig(rig_of(brown(), brown()), "qualisys", "x")
     with pytest.raises(InputError, match="this is a Qualisys calibration: 17: no focalLengthU"):
         read(tmp_path, camera().replace("focalLengthU", "x"))
     with pytest.raises(InputError, match="no active camera"):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats import FORMATS, format_named, is_foreign, read_foreign_rig
+from imgcal.formats import FORMATS, find_format, is_foreign, read_foreign_rig
 from imgcal.formats.file_storage import storage_text
 from imgcal.io import data_path
 from imgcal.types import limits
@@ -69,10 +69,10 @@ def test_a_format_that_the_user_names_must_be_possible(tmp_path: Path, name: str
 
 
 def test_formats_by_name() -> None:
-    assert format_named("kalibr").title == "Kalibr camchain"
+    assert find_format("kalibr").title == "Kalibr camchain"
     assert len({one.name for one in FORMATS}) == len(FORMATS)
     with pytest.raises(InputError, match=r"found the format 'calibr', expected one of imgcal, anipose"):
-        format_named("calibr")
+        find_format("calibr")
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,8 @@ import pytest
 import yaml
 
 from imgcal.errors import InputError
-from imgcal.formats import converted, read_foreign_rig
-from imgcal.formats.values import rotation_of_vector
+from imgcal.formats import convert_rig, read_foreign_rig
+from imgcal.formats.values import rotation_from_vector
 from tests.imgcal.formats.rigs import apart, brown, fisheye, put, put_files, read_in_mm, rig_of
 
 K1, K2 = (
@@ -15,7 +15,7 @@ K1, K2 = (
     np.array([[910.5, 0, 630], [0, 915, 410], [0, 0, 1.0]]),
 )
 D1, D2 = np.array([-0.1, 0.05, 0.001, -0.002, 0.01]), np.array([-0.12, 0.04, 0.0, 0.001, 0.0])
-R, T = rotation_of_vector(np.array([0.01, 0.05, -0.03])), np.array([-0.12, 0.003, 0.005])
+R, T = rotation_from_vector(np.array([0.01, 0.05, -0.03])), np.array([-0.12, 0.003, 0.005])
 
 
 def info(name: str, k: np.ndarray, d: np.ndarray, r: np.ndarray, p: np.ndarray, model: str = "plumb_bob") -> str:
@@ -80,7 +80,7 @@ def test_written_as_a_rectified_pair(tmp_path: Path, backwards: bool) -> None:
     rig = rig_of(brown(-0.1, 0.02, 0.001, 0, 0.003), brown(0.05, 0, 0, 0, 0, 0.1), names=("a", "b"))
     if backwards:
         rig = type(rig)(rig.format, rig.cameras[::-1], rig.unit, rig.frame)
-    folder = put_files(tmp_path, converted(rig, "ros", "x").files)
+    folder = put_files(tmp_path, convert_rig(rig, "ros", "x").files)
     contents = [yaml.safe_load((folder / f"{name}.yaml").read_text()) for name in rig.names]
     points = np.array([[150.0, 30.0, 1200.0], [50.0, -80.0, 1000.0], [100.0, 160.0, 2500.0]])
     left_r = np.array(contents[0]["rectification_matrix"]["data"]).reshape(3, 3)
@@ -106,7 +106,7 @@ def test_written_as_a_rectified_pair(tmp_path: Path, backwards: bool) -> None:
 
 def test_a_fisheye_is_equidistant(tmp_path: Path) -> None:
     rig = rig_of(fisheye(0.01, -0.02), fisheye(0.02))
-    folder = put_files(tmp_path, converted(rig, "ros", "x").files)
+    folder = put_files(tmp_path, convert_rig(rig, "ros", "x").files)
     assert yaml.safe_load((folder / "side0.yaml").read_text())["distortion_model"] == "equidistant"
     assert apart(rig, read_in_mm(folder)) < 1e-8
 
@@ -120,4 +120,4 @@ def test_cameras_one_behind_the_other_are_no_pair() -> None:
     with pytest.raises(
         InputError, match=r"--to ros: camera \S+ stands above, below, before or behind camera \S+, .*side by side"
     ):
-        converted(type(rig)("test", (first, behind), "mm", "x"), "ros", "x")
+        convert_rig(type(rig)("test", (first, behind), "mm", "x"), "ros", "x")

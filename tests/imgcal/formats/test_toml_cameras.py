@@ -3,7 +3,7 @@ import tomllib
 import pytest
 
 from imgcal.formats.foreign_rig import FormatError
-from imgcal.formats.toml_cameras import AT, cameras_of, toml_key, toml_text
+from imgcal.formats.toml_cameras import AT, read_cameras, toml_key, toml_text
 
 LENS = {"matrix": [[900.0, 0, 640], [0, 901, 400], [0, 0, 1]], "distortions": [0.1, 0, 0, 0, 0], "size": [1280, 800]}
 LENS |= {AT: ("cameras.toml", ())}
@@ -16,29 +16,29 @@ def test_who_has_no_pose_is_named_and_left_out() -> None:
         "a": POSED, "b": {**LENS, "rotation": "null", "translation": "null"}, "c": LENS,
         "d": {**POSED, "matrix": "null"}, "e": {**POSED, "translation": []},
     }  # fmt: skip
-    assert [camera.name for camera in cameras_of(tables, notes)] == ["a"]
+    assert [camera.name for camera in read_cameras(tables, notes)] == ["a"]
     assert notes == [
         "camera d: left out, intrinsics are not calibrated",
         "cameras b, c, e: left out, where they stand is not calibrated",
     ]
     with pytest.raises(FormatError, match="no camera has both"):
-        cameras_of({"c": LENS}, [])
+        read_cameras({"c": LENS}, [])
 
 
 def test_zeros_are_no_extrinsics() -> None:
     zero = {**LENS, "rotation": [0.0, 0.0, 0.0], "translation": [0.0, 0.0, 0.0]}
-    assert len(cameras_of({"a": zero, "b": POSED}, [])) == 2  # one camera may be the origin
+    assert len(read_cameras({"a": zero, "b": POSED}, [])) == 2  # one camera may be the origin
     with pytest.raises(FormatError, match="cameras a, c: rotation and translation are zero"):
-        cameras_of({"a": zero, "b": POSED, "c": zero}, [])
+        read_cameras({"a": zero, "b": POSED, "c": zero}, [])
 
 
 def test_a_fisheye_has_four_coefficients() -> None:
     fish = {**POSED, "distortions": [0.1, 0.2, 0.3, 0.4], "fisheye": True}
-    assert cameras_of({"a": fish}, [])[0].lens.model == "fisheye"
+    assert read_cameras({"a": fish}, [])[0].lens.model == "fisheye"
     with pytest.raises(FormatError, match="found 5 distortion"):
-        cameras_of({"a": {**POSED, "fisheye": True}}, [])
+        read_cameras({"a": {**POSED, "fisheye": True}}, [])
     with pytest.raises(FormatError, match="expected true or false"):
-        cameras_of({"a": {**POSED, "fisheye": "yes"}}, [])
+        read_cameras({"a": {**POSED, "fisheye": "yes"}}, [])
 
 
 def test_toml_is_read_as_it_was_written() -> None:

@@ -18,7 +18,7 @@ def test_units() -> None:
 
 
 def test_what_the_file_says_is_not_asked_for() -> None:
-    metres = RIG.scaled(1e-3, "m")
+    metres = RIG.scale(1e-3, "m")
     assert np.allclose(in_millimetres(metres, "x").cameras[1].translation, RIG.cameras[1].translation)
     assert np.allclose(in_millimetres(metres, "x", "2m").cameras[1].translation, 2 * RIG.cameras[1].translation)
 

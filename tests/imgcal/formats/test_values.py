@@ -10,15 +10,15 @@ from imgcal.formats.foreign_rig import FormatError
 def test_rotations_agree_with_opencv(angle: float) -> None:
     for axis in ([1.0, 0, 0], [0, 1.0, 0], [0.6, 0, 0.8], [-0.48, 0.6, 0.64]):
         vector = np.array(axis) * angle
-        matrix = values.rotation_of_vector(vector)
+        matrix = values.rotation_from_vector(vector)
         assert np.abs(matrix - cv2.Rodrigues(vector)[0]).max() < 1e-12
-        assert np.abs(values.rotation_of_vector(values.vector_of_rotation(matrix)) - matrix).max() < 1e-12
-        q = values.quaternion_of_rotation(matrix)
-        assert np.abs(values.rotation_of_quaternion(q.tolist(), "q") - matrix).max() < 1e-12
+        assert np.abs(values.rotation_from_vector(values.vector_from_rotation(matrix)) - matrix).max() < 1e-12
+        q = values.quaternion_from_rotation(matrix)
+        assert np.abs(values.rotation_from_quaternion(q.tolist(), "q") - matrix).max() < 1e-12
 
 
 def test_a_quaternion_is_hamilton_s_w_first() -> None:
-    quarter = values.rotation_of_quaternion([np.sqrt(0.5), 0, 0, np.sqrt(0.5)], "q")  # about z
+    quarter = values.rotation_from_quaternion([np.sqrt(0.5), 0, 0, np.sqrt(0.5)], "q")  # about z
     assert np.allclose(quarter @ [1, 0, 0], [0, 1, 0])
 
 
@@ -32,7 +32,7 @@ def test_what_a_number_may_be() -> None:
 
 
 def test_what_a_rotation_may_be() -> None:
-    rounded = np.round(values.rotation_of_vector(np.array([0.1, -0.2, 0.3])), 5)
+    rounded = np.round(values.rotation_from_vector(np.array([0.1, -0.2, 0.3])), 5)
     found = values.rotation(rounded.tolist(), "R")
     assert np.abs(found @ found.T - np.eye(3)).max() < 1e-12
     assert np.abs(found - rounded).max() < 1e-4
@@ -41,7 +41,7 @@ def test_what_a_rotation_may_be() -> None:
     with pytest.raises(FormatError, match="expected a rotation"):
         values.rotation((2 * np.eye(3)).tolist(), "R")
     with pytest.raises(FormatError, match="quaternion of length 0"):
-        values.rotation_of_quaternion([0, 0, 0, 0], "q")
+        values.rotation_from_quaternion([0, 0, 0, 0], "q")
 
 
 def test_what_a_camera_matrix_may_be() -> None:
@@ -74,8 +74,8 @@ def test_coefficients_are_as_many_as_some_model_has() -> None:
 
 
 def test_cameras_in_a_sentence() -> None:
-    assert values.named(["a"]) == "camera a"
-    assert values.named([str(n) for n in range(9)]) == "cameras 0, 1, 2, 3, 4, 5, 6, 7, ... (9)"
+    assert values.name_cameras(["a"]) == "camera a"
+    assert values.name_cameras([str(n) for n in range(9)]) == "cameras 0, 1, 2, 3, 4, 5, 6, 7, ... (9)"
 
 
 def test_a_scale_of_a_camera_matrix_that_nothing_can_be_divided_by_is_refused_without_a_warning() -> None:

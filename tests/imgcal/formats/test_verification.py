@@ -29,7 +29,7 @@ def test_a_pixel_is_seen() -> None:
 
 
 def test_the_frame_is_free_and_a_camera_s_place_is_not() -> None:
-    assert worst_difference(RIG, RIG.seen_from_first())[0] < 1e-9
+    assert worst_difference(RIG, RIG.in_camera_frame())[0] < 1e-9
     one = RIG.cameras[1]
     moved = replace(one, translation=one.translation + np.array([1.0, 0.0, 0.0]))
     assert worst_difference(RIG, replace(RIG, cameras=(RIG.cameras[0], moved)))[0] > 0.5

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats import converted, in_millimetres, read_foreign_rig
-from imgcal.formats.values import quaternion_of_rotation, rotation_of_vector
+from imgcal.formats import convert_rig, in_millimetres, read_foreign_rig
+from imgcal.formats.values import quaternion_from_rotation, rotation_from_vector
 from tests.imgcal.formats.rigs import put
 
-R = rotation_of_vector(np.array([1.3, 0.4, -0.2]))
-W, X, Y, Z = quaternion_of_rotation(R).tolist()
+R = rotation_from_vector(np.array([1.3, 0.4, -0.2]))
+W, X, Y, Z = quaternion_from_rotation(R).tolist()
 RADIAL = "ViconRadial2 642 399 -3.0e-8 1.0e-14 0"
 
 
@@ -42,7 +42,7 @@ def test_poses_and_the_direction_of_the_distortion(tmp_path: Path) -> None:
 
 def test_another_model_takes_the_lens_s_place(tmp_path: Path) -> None:
     rig = in_millimetres(read(tmp_path, camera("21"), camera("23", radial="ViconRadial2 640 400 0 0 0")), "x")
-    made = converted(rig, "imgcal", "x")
+    made = convert_rig(rig, "imgcal", "x")
     assert 0 < made.between_models < 0.05
     assert sum("fitted over the image" in note for note in made.notes) == 1
 

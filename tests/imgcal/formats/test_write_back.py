@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.formats import ForeignRig, from_camera_rig, known_points, to_camera_rig, written_back
-from imgcal.formats.conversion import NATIVE, held_by
+from imgcal.formats import ForeignRig, from_camera_rig, known_points, to_camera_rig, write_into
+from imgcal.formats.conversion import NATIVE, fit_to_target
 from imgcal.formats.lens import Lens
 from tests.imgcal.formats import originals
 from tests.imgcal.formats.rigs import apart, brown, fisheye, read_in_mm, rig_of
@@ -36,7 +36,7 @@ def original(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 def ours(path: Path) -> ForeignRig:
     """What a user has after reading the file: a rig of our own."""
-    held = held_by(read_in_mm(path), NATIVE, "ours")
+    held = fit_to_target(read_in_mm(path), NATIVE, "ours")
     return from_camera_rig(to_camera_rig(held.rig, "x"))
 
 
@@ -46,7 +46,7 @@ def text_of(content: bytes) -> str:
 
 def test_only_numbers_of_cameras_that_moved_are_replaced(original: Path, tmp_path: Path) -> None:
     rig = originals.drifted(ours(original), names=("a1", "c3"))
-    made = written_back(rig, [original], NOW)
+    made = write_into(rig, [original], NOW)
     assert (made.changed, made.kept) == (("a1", "c3"), ("b2",))
     before, after = text_of(original.read_bytes()), text_of(made.files[original.name])
     assert NUMBER.sub("#", before) == NUMBER.sub("#", after)
@@ -117,7 +117,7 @@ def bent(v: np.ndarray, k1: float, k2: float, p1: float, p2: float, k3: float) -
 
 def test_independent_readers_see_the_rig(original: Path, tmp_path: Path) -> None:
     rig = originals.drifted(ours(original))
-    made = written_back(rig, [original], NOW)
+    made = write_into(rig, [original], NOW)
     loss = made.loss.worst if made.loss is not None else 0.0
     root = ElementTree.fromstring(made.files[original.name])
     elements = [*root.iter("Camera"), *root.iter("camera")]
@@ -132,7 +132,7 @@ def test_independent_readers_see_the_rig(original: Path, tmp_path: Path) -> None
 
 
 def test_what_did_not_change_stays_to_the_last_byte(original: Path) -> None:
-    made = written_back(ours(original), [original], NOW)
+    made = write_into(ours(original), [original], NOW)
     if original.stem != "vicon":  # whose lens is fitted, and fitted back
         assert made.files[original.name] == original.read_bytes()
         assert made.changed == ()
@@ -145,7 +145,7 @@ def test_times_of_calibration(tmp_path: Path) -> None:
     ):
         path = tmp_path / f"{name}.xml"
         path.write_bytes(WRITERS[name](RIG))
-        made = written_back(originals.drifted(ours(path)), [path], NOW)
+        made = write_into(originals.drifted(ours(path)), [path], NOW)
         assert any(said in note for note in made.notes)
         text = text_of(made.files[path.name])
         if name == "motive":
@@ -157,10 +157,10 @@ def test_times_of_calibration(tmp_path: Path) -> None:
 def test_cameras_that_are_missing(original: Path) -> None:
     rig = originals.drifted(ours(original))
     some = replace(rig, cameras=rig.cameras[:2], own=None)
-    assert written_back(some, [original], NOW).kept == ("c3",)
+    assert write_into(some, [original], NOW).kept == ("c3",)
     other = replace(rig, cameras=(*rig.cameras[:2], replace(rig.cameras[2], name="zz")), own=None)
     with pytest.raises(InputError, match="camera zz not in it, which has cameras a1, b2, c3"):
-        written_back(other, [original], NOW)
+        write_into(other, [original], NOW)
 
 
 def test_a_lens_that_the_file_cannot_say_is_refused(original: Path) -> None:
@@ -169,18 +169,18 @@ def test_a_lens_that_the_file_cannot_say_is_refused(original: Path) -> None:
         rig, cameras=(*rig.cameras[:2], replace(rig.cameras[2], lens=fisheye(0.2, 0.3, -0.2, 0.1))), own=None
     )
     with pytest.raises(RefusedError, match=r"camera c3: .* cannot say its lens .*more than the limit of 0.05 px"):
-        written_back(wide, [original], NOW)
+        write_into(wide, [original], NOW)
     near = replace(rig.cameras[2], lens=Lens((1010.0, 1010.0), (640.0, 480.0), (-0.05, 0.01, 1e-5, 0, 0, 1e-3)))
-    made = written_back(replace(rig, cameras=(*rig.cameras[:2], near), own=None), [original], NOW, limit=1.0)
+    made = write_into(replace(rig, cameras=(*rig.cameras[:2], near), own=None), [original], NOW, limit=1.0)
     assert made.loss is not None and 0 < made.loss.worst < 1.0
 
 
 def test_another_frame_is_refused_where_a_camera_would_stay_behind(original: Path) -> None:
-    rig = ours(original).seen_from_first()
-    made = written_back(rig, [original], NOW)
+    rig = ours(original).in_camera_frame()
+    made = write_into(rig, [original], NOW)
     assert any("the frame of the rig is not that of the file" in note for note in made.notes)
     with pytest.raises(InputError, match=r"another frame than the file .*camera c3, which the rig does not have"):
-        written_back(replace(rig, cameras=rig.cameras[:2], own=None), [original], NOW)
+        write_into(replace(rig, cameras=rig.cameras[:2], own=None), [original], NOW)
 
 
 def damaged(content: bytes, kind: int, generator: np.random.Generator) -> bytes:
@@ -205,7 +205,7 @@ def test_damaged_originals(original: Path, tmp_path: Path) -> None:
     for number in range(15):
         original.write_bytes(damaged(content, number % 3, generator))
         try:
-            result = written_back(rig, [original], NOW)
+            result = write_into(rig, [original], NOW)
         except (InputError, RefusedError) as error:
             assert "\n" not in str(error)
             outcomes["refused"] += 1

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.formats import FORMATS, ForeignRig, converted, from_camera_rig, selected, to_camera_rig, written_back
-from imgcal.formats.conversion import NATIVE, held_by
+from imgcal.formats import FORMATS, ForeignRig, convert_rig, from_camera_rig, select_cameras, to_camera_rig, write_into
+from imgcal.formats.conversion import NATIVE, fit_to_target
 from tests.imgcal.formats.originals import drifted
 from tests.imgcal.formats.rigs import apart, brown, put_files, read_in_mm, rig_of
 from tests.imgcal.formats.test_write_back import damaged
@@ -22,8 +22,8 @@ WRITABLE = [one for one in FORMATS if one.write is not None]
 
 
 def write(folder: Path, name: str, few: int) -> Path:
-    rig = selected(rig_of(*[LENS] * 4), tuple(f"side{n}" for n in range(few)))
-    return put_files(folder, converted(rig, name, "rig", unit="mm" if name == "pymvg" else None).files)
+    rig = select_cameras(rig_of(*[LENS] * 4), tuple(f"side{n}" for n in range(few)))
+    return put_files(folder, convert_rig(rig, name, "rig", unit="mm" if name == "pymvg" else None).files)
 
 
 def unit_of(name: str) -> str | None:
@@ -34,12 +34,12 @@ def unit_of(name: str) -> str | None:
 def ours(path: Path, name: str) -> ForeignRig:
     rig = read_in_mm(path, unit_of(name), name)
     rig = replace(rig, cameras=tuple(replace(camera, image_size=(1280, 960)) for camera in rig.cameras))
-    return from_camera_rig(to_camera_rig(held_by(rig, NATIVE, "ours").rig, "x"))
+    return from_camera_rig(to_camera_rig(fit_to_target(rig, NATIVE, "ours").rig, "x"))
 
 
 def fitted_into(path: Path, name: str, rig: ForeignRig, out: Path) -> None:
     """Write back, and read the result with everything around it."""
-    made = written_back(rig, [path], NOW, name=name, unit=unit_of(name))
+    made = write_into(rig, [path], NOW, name=name, unit=unit_of(name))
     back = read_in_mm(put_files(out, made.files if path.is_dir() else {"": next(iter(made.files.values()))}),
                       unit_of(name), name)  # fmt: skip
     back = replace(back, cameras=tuple(replace(camera, image_size=(1280, 960)) for camera in back.cameras))
@@ -59,7 +59,7 @@ def test_a_drift_goes_back(name: str, tmp_path: Path) -> None:
     one = next(one for one in WRITABLE if one.name == name)
     path = write(tmp_path / "original", name, min(4, one.cameras[1]))
     rig = ours(path, name)
-    same = written_back(rig, [path], NOW, name=name, unit=unit_of(name))
+    same = write_into(rig, [path], NOW, name=name, unit=unit_of(name))
     assert same.changed == ()
     for file, content in same.files.items():
         assert content == ((path / file) if path.is_dir() else path).read_bytes()

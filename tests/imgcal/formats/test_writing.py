@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.formats import FORMATS, converted, format_named, selected
+from imgcal.formats import FORMATS, convert_rig, find_format, select_cameras
 from imgcal.formats.writing import OURS
 from imgcal.io import RigCovariance
 from tests.imgcal.formats.rigs import brown, rig_of
@@ -14,9 +14,9 @@ WRITTEN = [OURS, *(one.name for one in FORMATS if one.write is not None)]
 
 @pytest.mark.parametrize("to", WRITTEN)
 def test_every_format_is_read_back(to: str) -> None:
-    count = 3 if to == OURS else min(3, format_named(to).cameras[1])
+    count = 3 if to == OURS else min(3, find_format(to).cameras[1])
     rig = rig_of(*[brown(-0.1, 0.02, 0.001, -0.002), brown(0.05), brown()][:count])
-    made = converted(rig, to, "x")
+    made = convert_rig(rig, to, "x")
     assert made.round_trip < 1e-8
     assert made.between_models < 1e-8
     assert made.points == count * 147
@@ -26,31 +26,31 @@ def test_uncertainty_goes_along_where_there_is_a_place() -> None:
     rig = replace(
         rig_of(brown(-0.1), brown()), covariance=RigCovariance(torch.full((2, 15), 0.25, dtype=torch.float64))
     )
-    assert "std:" in converted(rig, OURS, "x").files[""].decode()
-    assert any("standard deviations are left out" in note for note in converted(rig, "kalibr", "x").notes)
+    assert "std:" in convert_rig(rig, OURS, "x").files[""].decode()
+    assert any("standard deviations are left out" in note for note in convert_rig(rig, "kalibr", "x").notes)
 
 
 def test_a_unit_that_the_format_states_is_not_another() -> None:
     rig = rig_of(brown(), brown())
-    assert converted(rig, "anipose", "x", unit="inch").round_trip < 1e-8
+    assert convert_rig(rig, "anipose", "x", unit="inch").round_trip < 1e-8
     with pytest.raises(InputError, match="Kalibr camchain is always in m"):
-        converted(rig, "kalibr", "x", unit="mm")
+        convert_rig(rig, "kalibr", "x", unit="mm")
 
 
 def test_what_cannot_be_written() -> None:
     rig = rig_of(brown(), brown(), brown())
     with pytest.raises(InputError, match=r"Vicon calibration .* is only read, expected one of imgcal"):
-        converted(rig, "vicon", "x")
+        convert_rig(rig, "vicon", "x")
     with pytest.raises(InputError, match="holds 1 to 2 cameras, found 3: choose with --cameras"):
-        converted(rig, "ros", "x")
+        convert_rig(rig, "ros", "x")
 
 
 def test_cameras_are_chosen_by_name() -> None:
     rig = rig_of(brown(), brown(), brown())
-    assert selected(rig, ("side2", "side0")).names == ["side2", "side0"]
+    assert select_cameras(rig, ("side2", "side0")).names == ["side2", "side0"]
     for bad in (("side7",), ("side0", "side0")):
         with pytest.raises(InputError, match="--cameras: found"):
-            selected(rig, bad)
+            select_cameras(rig, bad)
 
 
 def test_uncertainty_of_the_cameras_that_are_kept() -> None:
@@ -59,12 +59,12 @@ def test_uncertainty_of_the_cameras_that_are_kept() -> None:
         rig_of(brown(), brown(), brown()),
         covariance=RigCovariance(spread, torch.diag(spread.flatten().square()), "side1"),
     )
-    kept = selected(rig, ("side2", "side1")).covariance
+    kept = select_cameras(rig, ("side2", "side1")).covariance
     assert kept is not None
     assert torch.allclose(kept.std, spread[[2, 1]])
     assert kept.matrix is not None
     assert torch.allclose(kept.matrix, torch.diag(spread[[2, 1]].flatten().square()))
-    assert "std:" in converted(selected(rig, ("side2", "side1")), OURS, "x").files[""].decode()
-    without = selected(rig, ("side2", "side0"))
+    assert "std:" in convert_rig(select_cameras(rig, ("side2", "side1")), OURS, "x").files[""].decode()
+    without = select_cameras(rig, ("side2", "side0"))
     assert without.covariance is None
     assert any("relative to camera side1" in note for note in without.notes)

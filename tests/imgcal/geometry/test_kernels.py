@@ -49,7 +49,7 @@ def test_ranks_are_those_of_sorted_values(kind: type) -> None:
         for rank in {0, count // 4, count // 2, count - 1}:
             values = random.integers(0, 9, count + 3).astype(kind)  # many are equal; the last three do not count
             expected, rest = np.sort(values[:count]), values[count:].copy()
-            found = kernels.ranked(values, count, rank)
+            found = kernels.select_rank(values, count, rank)
             assert found == expected[rank] == values[rank]
             assert (values[:rank] <= found).all() and (values[rank:count] >= found).all()
             assert np.array_equal(np.sort(values[:count]), expected) and np.array_equal(values[count:], rest)

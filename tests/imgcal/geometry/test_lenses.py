@@ -13,9 +13,9 @@ from imgcal.geometry.lenses import (
     distort_with_jacobian,
     is_before_fold,
     lens_codes,
+    lens_label,
     lens_names,
     lens_width,
-    named_lenses,
     undistort,
 )
 from imgcal.geometry.projection import project, project_kornia
@@ -167,8 +167,8 @@ def test_cameras_of_different_models_are_those_of_each() -> None:
 
 def test_names_and_numbers() -> None:
     assert lens_names("rational", 2) == ("rational", "rational")
-    assert named_lenses(["rational", "rational"]) == "rational"
-    assert named_lenses(["rational", "equidistant"]) == ("rational", "equidistant")
+    assert lens_label(["rational", "rational"]) == "rational"
+    assert lens_label(["rational", "equidistant"]) == ("rational", "equidistant")
     assert (lens_width("equidistant"), lens_width(("equidistant", "rational"))) == (5, 8)
     assert lens_codes("brown_conrady", 3, 5) is None
     codes = lens_codes(("equidistant", "brown_conrady"), 2, 5)

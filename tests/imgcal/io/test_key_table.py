@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from imgcal.io import Key, StrictModel, StrictRecord, keys_of
+from imgcal.io import Key, StrictModel, StrictRecord, list_keys
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Outer(Base):
 
 
 def test_keys_of_a_record() -> None:
-    assert list(keys_of(Outer)) == [
+    assert list(list_keys(Outer)) == [
         Key("name", "text", "", "for people"),
         Key("kind", "a or b", "a", "which one"),
         Key("count", "integer >= 1", "", "how many"),
@@ -49,4 +49,4 @@ def test_keys_of_a_record() -> None:
         Key("either.share", "number >= 0 and <= 1", "", "of the whole"),
         Key("either.speed", "number", "", ""),
     ]
-    assert next(keys_of(Other, "deep.")).path == "deep.speed"
+    assert next(list_keys(Other, "deep.")).path == "deep.speed"

@@ -19,7 +19,7 @@ from imgcal.io.names import (
     model_name,
     natural_key,
     nearest,
-    title_of,
+    title_from_name,
 )
 
 
@@ -63,9 +63,9 @@ def test_a_good_name_stays_in_its_folder(name: str) -> None:
 
 
 def test_titles_are_text() -> None:
-    assert title_of(Path("some/rig one.yaml")) == "rig one"
-    assert title_of(Path(os.fsdecode(b"a\xffb\n.csv"))) == "a?b?"
-    assert len(title_of(Path("x" * 250 + ".csv"))) == LONGEST_NAME
+    assert title_from_name(Path("some/rig one.yaml")) == "rig one"
+    assert title_from_name(Path(os.fsdecode(b"a\xffb\n.csv"))) == "a?b?"
+    assert len(title_from_name(Path("x" * 250 + ".csv"))) == LONGEST_NAME
 
 
 def test_folders_and_pipes_are_no_files(tmp_path: Path) -> None:

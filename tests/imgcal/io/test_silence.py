@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from imgcal.io.silence import silenced
+from imgcal.io.silence import silence_stderr
 
 
 def test_native_words_go_nowhere_and_come_back_after(capfd) -> None:
     os.write(2, b"before ")
-    with silenced():
+    with silence_stderr():
         os.write(2, b"within ")
-        with silenced():
+        with silence_stderr():
             os.write(2, b"deeper ")
         os.write(2, b"still within ")
     os.write(2, b"after")
@@ -21,7 +21,7 @@ def test_native_words_go_nowhere_and_come_back_after(capfd) -> None:
 
 
 def test_an_error_within_ends_the_silence(capfd) -> None:
-    with pytest.raises(ValueError), silenced():
+    with pytest.raises(ValueError), silence_stderr():
         raise ValueError
     os.write(2, b"heard")
     assert capfd.readouterr().err == "heard"
@@ -31,14 +31,14 @@ def test_threads_that_overlap_end_it_together(capfd) -> None:
     begun, may_end = threading.Event(), threading.Event()
 
     def decode() -> None:
-        with silenced():
+        with silence_stderr():
             begun.set()
             may_end.wait(10)
 
     other = threading.Thread(target=decode)
     other.start()
     begun.wait(10)
-    with silenced():
+    with silence_stderr():
         pass
     os.write(2, b"the other thread still decodes ")
     may_end.set()
@@ -50,6 +50,6 @@ def test_threads_that_overlap_end_it_together(capfd) -> None:
 def test_no_file_descriptor_is_lost() -> None:
     before = len(list(Path("/proc/self/fd").iterdir()))
     for _ in range(50):
-        with silenced():
+        with silence_stderr():
             pass
     assert len(list(Path("/proc/self/fd").iterdir())) == before

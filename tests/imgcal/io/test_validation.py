@@ -7,7 +7,7 @@ import pytest
 from pydantic import Field
 
 from imgcal.errors import InputError
-from imgcal.io.validation import StrictModel, StrictRecord, validated
+from imgcal.io.validation import StrictModel, StrictRecord, validate
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Setup(StrictModel):
 
 
 def test_the_same_record_from_python_and_from_a_mapping() -> None:
-    made = validated({"noise": {"sigma": 2, "kinds": ("a", "b")}}, Setup, "here").noise
+    made = validate({"noise": {"sigma": 2, "kinds": ("a", "b")}}, Setup, "here").noise
     assert made == Noise(2.0, ("a", "b")) and isinstance(made, Noise) and isinstance(made.sigma, float)
-    assert validated({}, Setup, "here").noise == Noise()
+    assert validate({}, Setup, "here").noise == Noise()
 
 
 WRONG = [({"sigma": -1.0}, r"sigma: found -1\.0"), ({"sigma": "1"}, "sigma: found '1'")]
@@ -40,21 +40,21 @@ def test_wrong_values_are_refused_either_way(values, message) -> None:
     with pytest.raises(InputError, match=message):
         Noise(**values)
     with pytest.raises(InputError, match=f"here: noise: {message}"):
-        validated({"noise": values}, Setup, "here")
+        validate({"noise": values}, Setup, "here")
 
 
 def test_what_fields_must_be_together_is_asked_either_way() -> None:
     with pytest.raises(InputError, match="needs a kind"):
         Noise(sigma=6.0)
     with pytest.raises((InputError, ValueError), match="needs a kind"):
-        validated({"noise": {"sigma": 6.0}}, Setup, "here")
+        validate({"noise": {"sigma": 6.0}}, Setup, "here")
 
 
 def test_misspelt_names_come_before_what_follows_from_them() -> None:
     with pytest.raises(InputError, match="here: noise: unknown key `sgima`, nearest: sigma"):
-        validated({"noise": {"sgima": 1.0}}, Setup, "here")
+        validate({"noise": {"sgima": 1.0}}, Setup, "here")
     with pytest.raises(InputError, match="here: unknown key `nose`, nearest: noise"):
-        validated({"nose": {}, "count": "many"}, Setup, "here")
+        validate({"nose": {}, "count": "many"}, Setup, "here")
 
 
 def test_records_cannot_be_changed() -> None:

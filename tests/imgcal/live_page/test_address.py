@@ -3,7 +3,7 @@ import socket
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.live_page.address import Address, checked_token, is_loopback, parse_address
+from imgcal.live_page.address import Address, check_token, is_loopback, parse_address
 
 
 @pytest.mark.parametrize(
@@ -42,11 +42,11 @@ def test_an_address_that_is_taken_says_so():
 
 
 def test_tokens_are_long_and_fit_into_an_address():
-    first, second = checked_token(None), checked_token(None)
-    assert first != second and len(first) >= 32 and checked_token(first) == first
+    first, second = check_token(None), check_token(None)
+    assert first != second and len(first) >= 32 and check_token(first) == first
     for bad in ("short", "x" * 15, "x" * 129, "with space and more", "ümläut-is-not-ascii"):
         with pytest.raises(InputError, match="expected 16 to 128"):
-            checked_token(bad)
+            check_token(bad)
 
 
 def test_the_url_has_the_token_only_where_it_is_given():

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from imgcal.live_page.contents import belief_message, rig_message
-from imgcal.live_page.guidance import compare, information_gain, look
+from imgcal.live_page.guidance import compare, compute_guidance, information_gain
 from imgcal.live_page.viewing_volume import viewing_volume
 from imgcal.monitoring import RigBelief, absorb
 from imgcal.types.observations import Observations
@@ -48,7 +48,7 @@ def test_nothing_is_learnt_where_nothing_is_seen_and_less_where_one_has_been(o10
 
 def test_the_page_is_told_how_well_the_volume_is_known(o10, asymmetric8):
     state = made_state(o10, asymmetric8)
-    advice, rig, std = look(belief_message(state), asymmetric8.points.numpy(), viewing_volume(o10))
+    advice, rig, std = compute_guidance(belief_message(state), asymmetric8.points.numpy(), viewing_volume(o10))
     assert np.shape(advice["mm"]) == np.shape(advice["count"]) == (9, 9, 9)
     assert 0 < advice["median"] < advice["p95"] and advice["best"] == int(np.argmax(advice["gain"]))
     assert rig.camera_names == o10.camera_names
@@ -60,7 +60,7 @@ def test_the_page_says_the_deviations_of_the_state_where_the_rig_has_moved_too(o
     step = torch.zeros(10, 15).double()
     step[6, 1], step[2, 3] = 0.1, 30.0
     state = replace(state, belief=replace(state.belief, rig=state.belief.rig.retract(step)))
-    _, rig, std = look(belief_message(state), asymmetric8.points.numpy(), viewing_volume(o10))
+    _, rig, std = compute_guidance(belief_message(state), asymmetric8.points.numpy(), viewing_volume(o10))
     assert torch.equal(rig.focal_length, state.rig.focal_length) and torch.equal(rig.positions, state.rig.positions)
     assert std.numpy() == pytest.approx(state.std.numpy(), rel=1e-12)
 

@@ -99,8 +99,8 @@ def test_an_allowance_is_used_up_and_comes_back(monkeypatch):
     now = [0.0]
     monkeypatch.setattr("imgcal.live_page.security.time.monotonic", lambda: now[0])
     allowance = Allowance(3, 2.0)
-    assert [allowance.take() for _ in range(4)] == [True, True, True, False]
+    assert [allowance.try_take() for _ in range(4)] == [True, True, True, False]
     now[0] = 0.6
-    assert [allowance.take() for _ in range(2)] == [True, False]
+    assert [allowance.try_take() for _ in range(2)] == [True, False]
     now[0] = 100.0
-    assert sum(allowance.take() for _ in range(9)) == 3
+    assert sum(allowance.try_take() for _ in range(9)) == 3

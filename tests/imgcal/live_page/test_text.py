@@ -3,21 +3,21 @@ import json
 import numpy as np
 import pytest
 
-from imgcal.live_page.text import as_json, rounded, stream_event
+from imgcal.live_page.text import round_values, stream_event, to_json
 
 
 def test_numbers_are_short_and_what_is_none_is_null():
     values = np.array([[0.0, -1.23456789e-7], [np.inf, 123456.789]])
-    assert rounded(values) == [[0.0, -1.2346e-07], [None, 123460.0]]
-    assert rounded(np.zeros((0, 3))) == []
+    assert round_values(values) == [[0.0, -1.2346e-07], [None, 123460.0]]
+    assert round_values(np.zeros((0, 3))) == []
 
 
 def test_json_stands_safely_inside_of_a_script():
     hostile = "</script><!--&"
-    text = as_json({"name": hostile})
+    text = to_json({"name": hostile})
     assert not set("<>&") & set(text) and json.loads(text)["name"] == hostile
     with pytest.raises(ValueError):
-        as_json(float("nan"))
+        to_json(float("nan"))
 
 
 def test_an_event_of_the_stream_is_two_lines():

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from imgcal.live_page.timelines import SPANS, Timelines, change_of, sigmas_of
+from imgcal.live_page.timelines import SPANS, Timelines, camera_changes, camera_sigmas
 
 
 def test_a_day_takes_no_more_than_its_points():
@@ -26,7 +26,7 @@ def test_a_clock_that_is_set_back_begins_anew():
 def test_values_have_their_units():
     change = np.zeros((1, 15))
     change[0, :8] = 0.0, np.deg2rad(0.3), np.deg2rad(0.4), 3.0, 0.0, 4.0, 16.0, 16.0
-    assert change_of(change, np.full((1, 2), 1600.0))[0] == pytest.approx([0.5, 5.0, 1.0])
+    assert camera_changes(change, np.full((1, 2), 1600.0))[0] == pytest.approx([0.5, 5.0, 1.0])
     std = np.zeros((1, 15))
     std[0, :8] = *[np.deg2rad(0.1)] * 3, 2.0, 2.0, 2.0, 8.0, 8.0
-    assert sigmas_of(std, np.full((1, 2), 1600.0))[0, :3] == pytest.approx([0.1, 2.0, 0.5])
+    assert camera_sigmas(std, np.full((1, 2), 1600.0))[0, :3] == pytest.approx([0.1, 2.0, 0.5])

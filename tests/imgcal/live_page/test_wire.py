@@ -3,13 +3,13 @@ import asyncio
 import numpy as np
 import pytest
 
-from imgcal.live_page.wire import framed, read_message
+from imgcal.live_page.wire import frame_message, read_message
 
 
 def test_messages_arrive_one_after_another():
     async def read_two():
         reader = asyncio.StreamReader()
-        reader.feed_data(framed("first", {"a": np.arange(3)}) + framed("second", {}) + b"\x05")
+        reader.feed_data(frame_message("first", {"a": np.arange(3)}) + frame_message("second", {}) + b"\x05")
         reader.feed_eof()
         found = [await read_message(reader), await read_message(reader)]
         with pytest.raises(asyncio.IncompleteReadError):

@@ -32,7 +32,7 @@ def slow(maps, gain, rig, obj, pose, reach):
 def test_scores_are_those_of_every_shift_tried_alone():
     rig, obj, truth, (frames,) = dim_frames()
     maps, _ = surprise_maps([frames[name] for name in rig.camera_names], 4, False, [None] * 4)
-    maps = maps.pooled(8)
+    maps = maps.pool(8)
     reach, gain = np.array([20.0, 33.0, 8.0, 40.0]), gains(maps)
     off = RigidTransform(truth.rig_from_object.rotation, truth.rig_from_object.translation + 300)
     poses = RigidTransform.cat([truth.rig_from_object, off])

@@ -35,12 +35,12 @@ def test_what_is_masked_says_nothing():
 
 def test_larger_cells_keep_what_is_most_surprising_and_stay_exponential():
     maps, _ = surprise_maps([as_frame(noise())], 4, False, [None])
-    pooled = maps.pooled(16)
+    pooled = maps.pool(16)
     assert pooled.factor == 16 and pooled.surprise.shape == (1, 16, 20) and pooled.size.tolist() == [[20, 16]]
     assert (pooled.surprise > 1).mean() == pytest.approx(np.exp(-1), rel=0.2)
     top = np.unravel_index(maps.surprise[0].argmax(), maps.surprise[0].shape)
     assert pooled.surprise[0].argmax() == (top[0] // 4) * 20 + top[1] // 4
-    assert maps.pooled(4) is maps
+    assert maps.pool(4) is maps
 
 
 def test_nothing_counts_more_than_the_most():
@@ -64,5 +64,5 @@ def test_a_window_shows_what_the_frame_shows_there():
     whole, _ = surprise_maps([as_frame(frame)], 4, False, [None])
     there = np.unravel_index(whole.surprise[0].argmax(), whole.surprise[0].shape)
     assert (np.array(there) - maps.corner[0, ::-1] == peak).all()
-    pooled = maps.pooled(16)
+    pooled = maps.pool(16)
     assert pooled.corner[0].tolist() == [4, 2] and pooled.size[0].tolist() == [10, 10] and response[1].max() == 0

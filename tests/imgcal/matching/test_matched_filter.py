@@ -12,7 +12,7 @@ from imgcal.io import load_object
 from imgcal.matching import MatchedFilter
 from imgcal.matching.correlation import Scores
 from imgcal.matching.matched_filter import distinct
-from imgcal.matching.poses import Ranked, Scene, turned
+from imgcal.matching.poses import Ranked, Scene, turn_object
 from renderers import SensorModel
 
 from .scenes import DIM, dim_frames
@@ -30,7 +30,7 @@ def errors(rows, truth, snapshot=0):
 def test_twelve_degrees_off_and_too_dim_for_blobs():
     rig, obj, truth, (frames,) = dim_frames()
     axis = torch.tensor([0.5, 1.0, -1.0], dtype=torch.float64)
-    start = turned(truth.rig_from_object[0], np.radians(12) * axis / axis.norm(), obj)
+    start = turn_object(truth.rig_from_object[0], np.radians(12) * axis / axis.norm(), obj)
     proposal = MatchedFilter().propose(snapshot_of(frames, rig, obj, [start]))
     assert proposal.reason == "" and proposal.margin > 20
     assert float(geodesic_angle(proposal.rig_from_object.rotation, truth.rig_from_object.rotation[0])) < 0.02
@@ -79,7 +79,7 @@ def test_of_a_cube_every_turn_is_the_same_pose():
     scene, pose = Scene(rig, obj, rig.prior.std(rig), 850.0), truth.rig_from_object
     turns = torch.tensor([[0.0, 0.0, np.pi / 2], [0.0, 0.0, 0.05], [0.0, 0.0, np.pi / 4]], dtype=torch.float64)
     scores = Scores(np.full((1, 4), 9.0), np.zeros((1, 4, 2)))
-    others = Ranked(turned(pose, turns, obj), Scores(np.full((3, 4), 9.0), np.zeros((3, 4, 2))))
+    others = Ranked(turn_object(pose, turns, obj), Scores(np.full((3, 4), 9.0), np.zeros((3, 4, 2))))
     assert distinct(others, Ranked(pose, scores), scene).tolist() == [False, False, True]
     result = calibrate(frames, rig, obj, detector="matched")
     assert result.identity == "ambiguous" and result.labelled.snapshots[0].alternatives == 24
@@ -87,7 +87,7 @@ def test_of_a_cube_every_turn_is_the_same_pose():
 
 def test_around_a_known_pose_nothing_else_is_looked_at():
     rig, obj, truth, (frames,) = dim_frames(size=(1280, 680))
-    start = turned(truth.rig_from_object[0], torch.tensor([0.01, -0.02, 0.01], dtype=torch.float64), obj)
+    start = turn_object(truth.rig_from_object[0], torch.tensor([0.01, -0.02, 0.01], dtype=torch.float64), obj)
     prior = 0.2 * rig.prior.std(rig)
     given = replace(snapshot_of(frames, rig, obj, [start]), prior_std=prior)
     first = MatchedFilter().propose(given)

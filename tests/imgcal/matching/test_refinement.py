@@ -8,7 +8,7 @@ from imgcal.io import load_rig
 from imgcal.matching.correlation import Scores
 from imgcal.matching.maps import surprise_maps
 from imgcal.matching.poses import Matcher, Ranked, Scene
-from imgcal.matching.refinement import fitted, predictions, spacing
+from imgcal.matching.refinement import fit_and_measure, predictions, spacing
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CalibrationObject
 from renderers import palette
@@ -28,7 +28,7 @@ def given():
 def result(given, pose):
     scene, maps, response, shots, _ = given
     found = Matcher.on(scene, maps, 4 * scene.drift).rank(pose)
-    return fitted(scene, found, maps, response, shots, False)
+    return fit_and_measure(scene, found, maps, response, shots, False)
 
 
 def test_fiducials_are_measured_where_they_are(given):
@@ -72,6 +72,8 @@ def test_a_camera_that_is_a_step_of_the_lattice_off_is_put_right(cameras):
     shift = (uv - expected).mean(1)
     shift[cameras] += (predictions(rig, scene, pose[0] @ step) - expected).mean(1)[cameras]
     maps, response = surprise_maps(shots, 4, False, [None] * 4)
-    found = fitted(scene, Ranked(pose, Scores(np.full((1, 4), 20.0), shift[None])), maps, response, shots, False)
+    found = fit_and_measure(
+        scene, Ranked(pose, Scores(np.full((1, 4), 20.0), shift[None])), maps, response, shots, False
+    )
     assert found is not None and found.seen.mean() > 0.95
     assert np.linalg.norm(found.uv - uv, axis=-1)[found.seen].max() < 2

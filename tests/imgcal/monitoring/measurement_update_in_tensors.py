@@ -10,11 +10,11 @@ from torch import Tensor
 from imgcal.errors import RefusedError
 from imgcal.estimation.linearization import NormalEquations, Problem, State, pose_at, retract
 from imgcal.estimation.map_estimate import EstimationOptions, equations_at, initial_state, make_loss, make_problem
-from imgcal.estimation.rig_error import displaced, error_between, step_by_error
+from imgcal.estimation.rig_error import displace, error_between, step_by_error
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring import measurement_update_cpu
 from imgcal.monitoring.measurement_update_cpu import DAMPED, MOST_DAMPING, SLACK, STALLED, WHY_NOT
-from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, cholesky_factor, whitened
+from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, cholesky_factor, whiten
 from imgcal.monitoring.snapshot_information import SnapshotInformation
 from imgcal.types import Observations
 
@@ -118,7 +118,7 @@ class _Linearization:
         pose = -_solved(equations.pose[:, 0], right)
         own_step = None if equations.object is None else own.expand(len(pose), -1)
         state = retract(problem, state, torch.zeros_like(state.offset), pose.unsqueeze(1), own_step)
-        rig = displaced(problem.factory[0], error * self.belief.unit)
+        rig = displace(problem.factory[0], error * self.belief.unit)
         problem = replace(problem, factory=rig.expand(len(pose)))
         return self._at(self.belief, problem, state, self.options)
 
@@ -142,7 +142,7 @@ class _Linearization:
 
     def _basis(self) -> Tensor:
         """Whitened offsets of the problem by errors in units: (C, K, K)."""
-        return whitened(step_by_error(self.problem.factory[0]), self.belief.unit)
+        return whiten(step_by_error(self.problem.factory[0]), self.belief.unit)
 
     def _brought(self) -> SnapshotInformation:
         """What the snapshots say about cameras and object, poses eliminated."""

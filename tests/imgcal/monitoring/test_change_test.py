@@ -15,10 +15,10 @@ from imgcal.monitoring import (
     MeasurementUpdate,
     RigBelief,
     absorb,
-    change_of_errors,
+    camera_change_errors,
+    change_std,
     pixel_changes,
-    spread_of,
-    widened,
+    widen,
 )
 from imgcal.synthesis import PhysicalDrift, Truth, simulate_truth
 from imgcal.types import CalibrationObject, CameraRig, Observations
@@ -49,7 +49,7 @@ def against(later: MeasurementUpdate, before: RigBelief | None = None) -> Change
     before, brought = before or later.before, later.brought
     at, information = brought.distance_from(before.rig, before.object_offset), brought.information()
     pull = brought.pull.sum(0) - information @ at
-    change = change_of_errors(before.rig, before.unit)
+    change = camera_change_errors(before.rig, before.unit)
     return ChangeTest.of(before.information, information, pull, change, pixel_changes(before.rig))
 
 
@@ -85,13 +85,13 @@ def test_the_kind_of_a_change_is_the_most_probable_one(followed, kind: str) -> N
     part = CHANGES[kind]
     size = {"rotation": 3e-3, "position": 3.0, "focal_length": 8.0, "principal_point": 5.0}[kind]
     known = followed[-1]
-    free = widened(known, spread_of({1: None}, pixel_changes(known.rig)).square())
+    free = widen(known, change_std({1: None}, pixel_changes(known.rig)).square())
     step = [size, -0.5 * size, 0.3 * size][: part.stop - part.start]
     test = against(bumped((*followed[:-1], free), 1, part, step, 7, 20, 40), known)
     odds = {name: test.odds({1: name}) for name in CHANGES}
     assert max(odds, key=lambda name: odds[name]) == kind
     assert test.odds({1: kind}) > test.odds({0: kind})
-    assert max(float(scores[[0, 2, 3]].max()) for scores in test.given({1: None}).scores().values()) < 40
+    assert max(float(scores[[0, 2, 3]].max()) for scores in test.condition_on({1: None}).scores().values()) < 40
     change, covariance = test.jump(1, kind)
     error = change - torch.tensor([size, -0.5 * size, 0.3 * size], dtype=torch.float64)[: len(change)]
     assert float(error @ torch.linalg.solve(covariance, error)) < 25

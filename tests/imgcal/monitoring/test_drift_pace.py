@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import imgcal
-from imgcal.monitoring import CHANGES, ChangeTest, RigBelief, RigFilter, RigMonitor, change_of_errors, pixel_changes
+from imgcal.monitoring import CHANGES, ChangeTest, RigBelief, RigFilter, RigMonitor, camera_change_errors, pixel_changes
 from imgcal.monitoring.drift_pace import ADDED_TOGETHER, STRETCH_SECONDS, DriftLearning, DriftPaces, Stretch
 from imgcal.types import CameraRig, DriftRate
 from scripts.benchmarks.rig_streams import Conditions, Stream
@@ -27,7 +27,7 @@ def drifted(belief: RigBelief, step: torch.Tensor, generator: torch.Generator) -
     stretch = Stretch.after(belief)
     stretch.seconds = STRETCH_SECONDS
     brought = 4 * belief.information
-    error = torch.einsum("cij,cj->ci", change_of_errors(belief.rig, belief.unit), step).flatten()
+    error = torch.einsum("cij,cj->ci", camera_change_errors(belief.rig, belief.unit), step).flatten()
     noise = torch.linalg.cholesky(brought) @ torch.randn(len(brought), generator=generator, dtype=torch.float64)
     stretch.add(belief, brought, brought @ error + noise)
     return stretch
@@ -55,7 +55,7 @@ def test_what_is_added_up_is_what_the_snapshots_say() -> None:
     step = 1e-3 * belief.unit * torch.randn(4, 15, generator=generator, dtype=torch.float64)
     whole, other = drifted(belief, step, generator), Stretch.after(belief)
     there = RigBelief.of_prior(belief.rig.retract(0.5 * step), belief.obj, belief.unit)
-    error = torch.einsum("cij,cj->ci", change_of_errors(belief.rig, belief.unit), 0.5 * step).flatten()
+    error = torch.einsum("cij,cj->ci", camera_change_errors(belief.rig, belief.unit), 0.5 * step).flatten()
     other.add(there, whole.brought, whole.pull - whole.brought @ error)  # the same from another place
     other.seconds = STRETCH_SECONDS
     torch.testing.assert_close(other.pull, whole.pull, rtol=1e-4, atol=1e-6 * float(whole.pull.abs().max()))

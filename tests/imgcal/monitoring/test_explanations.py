@@ -11,7 +11,7 @@ from imgcal.errors import RefusedError
 from imgcal.monitoring import ClockSlip, absorb
 from imgcal.monitoring.case import Case, Explained, Explanation, Finding, Variant
 from imgcal.monitoring.change_test import JUMPS
-from imgcal.monitoring.clock_slip import ClockSlipped
+from imgcal.monitoring.clock_slip import ClockSlipExplanation
 from imgcal.monitoring.explanations import EXPLANATIONS, LEAD, PATIENCE, Diagnosis, Moved, doubtful_cameras, weigh
 from imgcal.monitoring.measurement_update import stack_snapshots
 from imgcal.monitoring.pending_change import free_cameras
@@ -99,7 +99,7 @@ def test_the_table_names_each_explanation_once() -> None:
 
 @pytest.mark.parametrize("late", [0.002, -0.01, 0.0167])
 def test_a_slip_is_more_probable_than_a_move(late: float) -> None:
-    verdict = weigh(case_of(followed(BEFORE + COUNT, slips=[Slip(BEFORE, 2, late)])), (Moved(), ClockSlipped()))
+    verdict = weigh(case_of(followed(BEFORE + COUNT, slips=[Slip(BEFORE, 2, late)])), (Moved(), ClockSlipExplanation()))
     assert verdict.best.name == "clock slip"
     (slip,) = verdict.best.finding.slips
     assert slip.camera == 2
@@ -136,7 +136,7 @@ def test_a_move_is_not_believed_of_too_little() -> None:
 
 def test_a_slip_that_is_hardly_known_of_a_camera_that_is_hardly_known_waits() -> None:
     case = case_of(followed(BEFORE + COUNT), uncertain=True)
-    slipped = ClockSlipped()
+    slipped = ClockSlipExplanation()
     for sigma, why in ((1e-4, None), (2e-3, "the slip is hardly known")):
         found = Finding((ClockSlip(2, 0, 0.01, sigma, math.nan),))
         explained = Explained(slipped, 0.0, case.before, list(case.latest), found)

@@ -7,7 +7,7 @@ import torch
 
 import imgcal
 from imgcal.errors import RefusedError
-from imgcal.estimation import EstimationOptions, displaced, error_between
+from imgcal.estimation import EstimationOptions, displace, error_between
 from imgcal.geometry import rotation_from_vector
 from imgcal.monitoring import MeasurementUpdate, RigBelief, absorb
 from imgcal.synthesis import PhysicalDrift, simulate_truth
@@ -87,7 +87,7 @@ def test_a_shift_that_all_points_of_a_camera_share_is_weighed_by_its_covariance(
 
     def residual(values: torch.Tensor) -> torch.Tensor:
         """Change the rig, the object and its pose."""
-        there = displaced(rig, values[:wide].view(belief.unit.shape) * belief.unit)
+        there = displace(rig, values[:wide].view(belief.unit.shape) * belief.unit)
         size = len(belief.object_offset)
         bent = replace(result.belief, object_offset=result.belief.object_offset + values[wide : wide + size])
         turn = rotation_from_vector(values[-6:-3])

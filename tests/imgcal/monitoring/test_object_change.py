@@ -10,7 +10,7 @@ import imgcal
 from imgcal.monitoring import SHAPE, RigBelief, RigFilter, RigMonitor, absorb, object_change
 from imgcal.monitoring.case import Case
 from imgcal.monitoring.explanations import weigh
-from imgcal.monitoring.object_change import LEAST_USUAL, MISFIT_LEAD, Misfit, ObjectChanged, never_fitted
+from imgcal.monitoring.object_change import LEAST_USUAL, MISFIT_LEAD, Misfit, ObjectChanged, has_never_fitted
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import Observations
 from renderers import palette
@@ -154,8 +154,8 @@ def test_an_object_that_never_was_as_its_file_says_explains_the_first_snapshots(
     seen = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), torch.ones(uv.shape[:-1]) > 0)
     before = RigFilter(factory, obj).belief
     result = absorb(before, seen, truth.rig_from_object)
-    assert never_fitted(result, 16) == bent
-    assert not never_fitted(result, 15)  # not asked then
+    assert has_never_fitted(result, 16) == bent
+    assert not has_never_fitted(result, 15)  # not asked then
     parts = [(seen.of_snapshots([s]), truth.rig_from_object[s : s + 1]) for s in range(16)]
     verdict = weigh(Case(before, parts, [0.1] * 16, 16))
     changed = verdict.best.finding.object_change

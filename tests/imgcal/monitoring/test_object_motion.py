@@ -16,7 +16,7 @@ def test_poses_between_and_after_snapshots_are_those_of_the_motion() -> None:
     seconds = torch.arange(20, dtype=torch.float64) / 60
     motion = ObjectMotion.of(waved(seconds), seconds)
     asked = torch.tensor([0.1, 0.1042, 19 / 60 + 0.0167], dtype=torch.float64)
-    found, true = motion.at(asked), waved(asked)
+    found, true = motion.interpolate(asked), waved(asked)
     assert (found.translation - true.translation).norm(dim=-1).max() < 0.05  # of 4 mm a snapshot
     assert geodesic_angle(found.rotation, true.rotation).max() < 3e-4
     assert bool(motion.known.all())

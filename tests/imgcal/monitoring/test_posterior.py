@@ -7,7 +7,7 @@ import torch
 
 import imgcal
 from imgcal.estimation import camera_covariance, error_between
-from imgcal.monitoring import belief_of, calibration_of, posterior_of
+from imgcal.monitoring import belief_from_posterior, calibration_posterior, make_posterior
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from tests.imgcal.monitoring.made_snapshots import batch, made_snapshots
 
@@ -23,7 +23,7 @@ def test_the_belief_has_the_covariance_of_the_estimate(made, loose: bool) -> Non
     if loose:
         obj = replace(obj, tolerance=torch.full((8,), 0.3, dtype=torch.float64), scale_tolerance=1e-3)
     fit = batch(made, 6, obj)
-    belief = belief_of(posterior_of(fit, obj), obj)
+    belief = belief_from_posterior(make_posterior(fit, obj), obj)
     expected = camera_covariance(fit, curved=False)
     scale = expected.diagonal().sqrt()
     assert torch.allclose(belief.covariance() / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-6)
@@ -34,9 +34,9 @@ def test_the_belief_has_the_covariance_of_the_estimate(made, loose: bool) -> Non
 def test_of_another_object_it_says_what_it_knows_of_the_cameras(made) -> None:
     _, obj, _, _ = made
     loose = replace(obj, tolerance=torch.full((8,), 0.3, dtype=torch.float64))
-    posterior = posterior_of(batch(made, 6, loose), loose)
+    posterior = make_posterior(batch(made, 6, loose), loose)
     other = replace(obj, points=obj.points + torch.tensor([5.0, 0.0, 0.0]))
-    known, belief = belief_of(posterior, loose), belief_of(posterior, other)
+    known, belief = belief_from_posterior(posterior, loose), belief_from_posterior(posterior, other)
     assert len(belief.object_offset) == 0
     assert torch.allclose(belief.std(), known.std(), rtol=1e-6)
 
@@ -44,9 +44,9 @@ def test_of_another_object_it_says_what_it_knows_of_the_cameras(made) -> None:
 def test_a_scattered_estimate_starts_a_wider_belief(made) -> None:
     _, obj, _, _ = made
     fit = batch(made, 6)
-    std = belief_of(posterior_of(fit, obj), obj).std()
-    wider = belief_of(
-        posterior_of(replace(fit, inflation=torch.full((fit.rig.num_cameras,), 2.0, dtype=torch.float64)), obj), obj
+    std = belief_from_posterior(make_posterior(fit, obj), obj).std()
+    wider = belief_from_posterior(
+        make_posterior(replace(fit, inflation=torch.full((fit.rig.num_cameras,), 2.0, dtype=torch.float64)), obj), obj
     ).std()
     assert 1.3 < float((wider / std)[:, 6].median()) < 2.001
 
@@ -55,8 +55,8 @@ def test_a_rig_that_was_changed_has_no_posterior() -> None:
     factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
     truth = simulate_truth(factory, obj, 4, torch.Generator().manual_seed(1), PhysicalDrift())
     result = imgcal.calibrate(true_detections(truth), factory, obj)
-    posterior = calibration_of(result.rig)
+    posterior = calibration_posterior(result.rig)
     assert posterior is not None
     assert posterior.snapshots == 4
-    assert calibration_of(replace(result.rig, focal_length=result.rig.focal_length + 0.1)) is None
-    assert calibration_of(factory) is None
+    assert calibration_posterior(replace(result.rig, focal_length=result.rig.focal_length + 0.1)) is None
+    assert calibration_posterior(factory) is None

@@ -2,7 +2,7 @@
 
 from imgcal.estimation import EstimationOptions
 from imgcal.monitoring.quarantine import CASE_AFTER, CASE_EVERY, CASE_SNAPSHOTS, SETTLE_SECONDS, Quarantine
-from imgcal.monitoring.unsynchronized import drop_cameras
+from imgcal.monitoring.unsynchronized_cameras import drop_cameras
 from tests.imgcal.monitoring.followed import followed
 
 

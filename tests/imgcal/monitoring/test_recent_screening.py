@@ -6,7 +6,7 @@ import torch
 
 import imgcal
 from imgcal.estimation import error_between
-from imgcal.monitoring import change_of_errors
+from imgcal.monitoring import camera_change_errors
 from imgcal.monitoring.recent_screening import add_error, add_row, put, screen
 from imgcal.monitoring.rig_arrays import RigArrays
 
@@ -58,7 +58,7 @@ def ring(request) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...], np.nd
 def test_quick_scores_are_squares_in_units_of_the_information(ring) -> None:
     rows, totals, full = ring
     rig = imgcal.load_rig("T4").select([0, 1, 2])
-    change = change_of_errors(rig, torch.ones(3, 15, dtype=torch.float64)).numpy()
+    change = camera_change_errors(rig, torch.ones(3, 15, dtype=torch.float64)).numpy()
     parts, ages, at = np.array([(0, 3), (8, 10)]), np.array((2, 3, 9)), np.random.default_rng(4).normal(size=47)
     scores = np.empty((3, CAMERAS))
     screen(rows, totals, SNAPSHOTS, 3, at, change, parts, ages, scores)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import imgcal
-from imgcal.estimation import displaced
+from imgcal.estimation import displace
 from imgcal.monitoring import RigBelief, absorb, age_belief
 from imgcal.types import DriftRate
 from tests.imgcal.monitoring.made_snapshots import SQUARED, made_snapshots, snapshots
@@ -40,4 +40,4 @@ def test_a_belief_may_be_moved_as_a_whole(made) -> None:
     factory, obj, _, _ = made
     belief = RigBelief.of_prior(factory, obj)
     assert torch.allclose(belief.std(), (factory.prior or imgcal.types.RigPrior()).std(factory), rtol=1e-6)
-    assert displaced(belief.rig, torch.zeros(4, 15, dtype=torch.float64)).camera_names == factory.camera_names
+    assert displace(belief.rig, torch.zeros(4, 15, dtype=torch.float64)).camera_names == factory.camera_names

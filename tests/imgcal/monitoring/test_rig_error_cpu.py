@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import imgcal
-from imgcal.estimation import displaced, error_between, step_by_error
+from imgcal.estimation import displace, error_between, step_by_error
 from imgcal.monitoring.rig_arrays import RigArrays
 from imgcal.monitoring.rig_error_cpu import times_basis, write_basis, write_error
 from imgcal.types import CameraRig
@@ -15,7 +15,7 @@ UNITS = torch.tensor((0.02,) * 3 + (10.0,) * 3 + (20.0,) * 4 + (0.02,) * 5, dtyp
 
 def drifted(size: float) -> CameraRig:
     error = UNITS * torch.randn(4, 15, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    return displaced(imgcal.load_rig("T4"), size * error)
+    return displace(imgcal.load_rig("T4"), size * error)
 
 
 @pytest.mark.parametrize("size", [0.0, 1.0, 80.0])  # the last: turns by more than a right angle

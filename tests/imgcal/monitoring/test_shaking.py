@@ -66,15 +66,15 @@ def test_how_much_each_camera_shakes_is_followed() -> None:
         for _ in range(times):
             noise = observations.sigma[..., None] * torch.randn(1, 4, 8, 2, generator=generator, dtype=torch.float64)
             shift = size[:, None, None] * torch.randn(4, 1, 2, generator=generator, dtype=torch.float64)
-            level.take(observations, math.sqrt(1 - 1.5 / 4) * (noise + shift))
+            level.observe(observations, math.sqrt(1 - 1.5 / 4) * (noise + shift))
 
     take(EVERY - 1, size)
-    assert not level.shake.any() and level.of(observations) is observations
+    assert not level.shake.any() and level.apply_to(observations) is observations
     take(1, size)
     assert level.shake.tolist() == pytest.approx(size.tolist(), rel=0.35)
-    assert torch.equal(level.of(observations).shake, level.shake[None])
+    assert torch.equal(level.apply_to(observations).shake, level.shake[None])
     take(EVERY, torch.zeros(4))
     assert not level.shake.any()
     level.believe(size)
-    level.take(replace(observations, seen=torch.zeros_like(observations.seen)), torch.zeros(1, 4, 8, 2))
+    level.observe(replace(observations, seen=torch.zeros_like(observations.seen)), torch.zeros(1, 4, 8, 2))
     assert torch.equal(level.shake, size)

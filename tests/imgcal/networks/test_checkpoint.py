@@ -12,7 +12,7 @@ from imgcal.io import load_object, load_rig
 from imgcal.io.safetensors_file import read_tensors, write_tensors
 from imgcal.networks import Checkpoint, build_network, load_checkpoint, load_network, save_checkpoint, warm_start
 from imgcal.networks.checkpoint import FORMAT
-from imgcal.training import experiment_of
+from imgcal.training import checkpoint_experiment
 from imgcal.types.prediction import Views
 from tests.imgcal.training.toy import Toy, experiments
 
@@ -61,7 +61,7 @@ def test_a_network_comes_back(made, path):
     assert torch.equal(again.rig_from_object.rotation, expected.rig_from_object.rotation)
     assert not found.network.training
     assert found.metrics == {"re_px": 1.5}
-    assert experiment_of(found.experiment) == experiment
+    assert checkpoint_experiment(found.experiment) == experiment
     assert found.experiment.drift == experiment.drift and found.experiment.poses == experiment.poses
     assert found.obj.name == "asymmetric8"
     torch.testing.assert_close(found.drift_std, experiment.drift.std(load_rig("T4")), rtol=1e-9, atol=1e-12)
@@ -134,7 +134,7 @@ def test_published_weights_are_not_asked_for_where_trained_ones_replace_them(exp
     monkeypatch.setattr("imgcal.networks.factory.build", build)
     network = built(setup)
     save_network(tmp_path / "a.safetensors", network, setup, {})
-    assert experiment_of(load_checkpoint(tmp_path / "a.safetensors").experiment) == setup
+    assert checkpoint_experiment(load_checkpoint(tmp_path / "a.safetensors").experiment) == setup
     assert asked == [True, False]
 
 

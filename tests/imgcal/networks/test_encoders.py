@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from imgcal.networks.encoders import STRIDE, Cells, CnnEncoder, Pyramid, VitEncoder, resized
+from imgcal.networks.encoders import STRIDE, Cells, CnnEncoder, Pyramid, VitEncoder, resize_images
 from imgcal.training.optimization import layer_scales
 
 
@@ -70,7 +70,7 @@ def test_a_pyramid_adds_coarse_maps_to_fine_ones():
 
 def test_images_of_the_right_size_are_left_alone():
     images = torch.rand(1, 3, 8, 8)
-    assert resized(images, (8, 8)) is images and resized(images, (4, 6)).shape == (1, 3, 4, 6)
+    assert resize_images(images, (8, 8)) is images and resize_images(images, (4, 6)).shape == (1, 3, 4, 6)
 
 
 @pytest.mark.parametrize("name", ["cnn", "vit"])

@@ -9,7 +9,15 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.io import model_file
-from imgcal.networks import Measurer, MeasurerConfig, drawing_from, load_program, normalized, save_exported, save_onnx
+from imgcal.networks import (
+    Measurer,
+    MeasurerConfig,
+    drawing_from,
+    load_program,
+    normalize_crops,
+    save_exported,
+    save_onnx,
+)
 from imgcal.networks.export import _measurer, _points, _query, difference
 from imgcal.networks.infrared import InfraredConfig, InfraredNetwork
 from imgcal.synthesis import render_crops, sample_scenes
@@ -38,7 +46,7 @@ def query_inputs(truth, fiducials=None):
     place = torch.nn.functional.pad(truth.expected.flatten(0, 1), (0, 0, *more))
     radius, depth = (torch.nn.functional.pad(part.flatten(0, 1), more) for part in (truth.radius, truth.depth))
     asked = torch.nn.functional.pad(torch.ones(4, truth.place.shape[2], dtype=torch.bool), more)
-    return normalized(truth.crops.flatten(0, 1)), place, radius, depth, asked
+    return normalize_crops(truth.crops.flatten(0, 1)), place, radius, depth, asked
 
 
 def run(runtime, path, program, inputs):
@@ -64,7 +72,7 @@ def test_the_shipped_query_network_says_the_same_of_rendered_crops(runtime, tmp_
 
 def test_the_shipped_measurer_says_the_same_of_rendered_patches(runtime, tmp_path):
     crops = rendered(6).crops.flatten(0, 1)
-    patches = normalized(crops.unfold(1, PATCH_SIZE, 24).unfold(2, PATCH_SIZE, 24).flatten(0, 2))
+    patches = normalize_crops(crops.unfold(1, PATCH_SIZE, 24).unfold(2, PATCH_SIZE, 24).flatten(0, 2))
     program = load_program(model_file("measurer-cnn"), count=len(patches))
     save_onnx(program, tmp_path / "measurer.onnx")
     inputs = patches, torch.linspace(1.0, 4.0, len(patches))
@@ -113,7 +121,7 @@ def test_the_example_measures_with_numpy_alone(runtime, tmp_path):
     example = runpy.run_path(str(EXAMPLES / "run_onnx.py"))
     crops = rendered(5).crops.flatten(0, 1).double()
     crops[0, 60:] = torch.nan  # beside the image
-    assert np.allclose(example["normalized"](crops.numpy()), normalized(crops), atol=1e-6)
+    assert np.allclose(example["normalized"](crops.numpy()), normalize_crops(crops), atol=1e-6)
     program = load_program(model_file("measurer-cnn"))
     save_onnx(program, tmp_path / "measurer.onnx")
     v, u = np.mgrid[0:128, 0:160]

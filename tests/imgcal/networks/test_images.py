@@ -5,7 +5,7 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.io import load_object, load_rig
-from imgcal.networks import NetworkConfig, Sightings, build
+from imgcal.networks import NetworkConfig, Positions, build
 from imgcal.nn import MapEstimate, project_fiducials
 from imgcal.synthesis.colour_coding import ImageOptions, render_views
 from imgcal.types import Observations, Views
@@ -123,14 +123,14 @@ def test_a_position_counts_whole_or_next_to_nothing():
     """As positions do where the trunk learns: a weight of 0.99 would move a point by a hundredth of the image."""
     uv, sigma = torch.zeros(1, 1, 4, 2), torch.tensor([[[0.3, 2.9, 3.1, 0.1]]])
     confidence = torch.tensor([[[0.8, 0.6, 0.9, 0.4]]])
-    weight = Sightings(uv, sigma, confidence).weight[0, 0]
+    weight = Positions(uv, sigma, confidence).weight[0, 0]
     assert weight[:2].tolist() == [1.0, 1.0] and ((weight[2:] > 0) & (weight[2:] < 1e-3)).all()
 
 
 def test_the_gradient_passes_through_how_much_a_position_counts():
     uv, sigma = torch.zeros(1, 1, 2, 2), torch.tensor([[[0.3, 3.1]]], requires_grad=True)
     confidence = torch.tensor([[[0.8, 0.6]]], requires_grad=True)
-    Sightings(uv, sigma, confidence).weight.sum().backward()
+    Positions(uv, sigma, confidence).weight.sum().backward()
     assert (confidence.grad > 0).all() and (sigma.grad < 0).all()
 
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from imgcal.networks import InfraredConfig, InfraredNetwork, Queries, normalized
+from imgcal.networks import InfraredConfig, InfraredNetwork, Queries, normalize_crops
 from imgcal.networks.infrared import SetBlock, aligned_windows
 
 SMALL = {"crop": 48, "channels": 4, "window": 6, "blocks": 2}
@@ -80,11 +80,11 @@ def test_a_common_shift_of_crop_and_queries_changes_nothing() -> None:
 def test_normalized_crops_do_not_know_gain_and_level() -> None:
     crops = torch.randn(2, 48, 48, generator=torch.Generator().manual_seed(0)) + 5
     crops[0, :, :10] = torch.nan
-    plain = normalized(crops)
-    torch.testing.assert_close(normalized(crops * 40 + 7), plain, atol=1e-5, rtol=1e-5)
+    plain = normalize_crops(crops)
+    torch.testing.assert_close(normalize_crops(crops * 40 + 7), plain, atol=1e-5, rtol=1e-5)
     assert bool(plain.isfinite().all())
     assert not plain[0, :, :10].any()
-    assert not normalized(torch.full((1, 8, 8), torch.nan)).any()
+    assert not normalize_crops(torch.full((1, 8, 8), torch.nan)).any()
 
 
 def test_groups_hold_all_parameters() -> None:

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from imgcal.networks.layers import ConvBlock, TransformerBlock, conv1d, mlp, transformer, zeroed
+from imgcal.networks.layers import ConvBlock, TransformerBlock, conv1d, mlp, transformer, zero_last_layer
 
 WIDTH = 16
 
@@ -66,10 +66,10 @@ def test_heads_have_the_widths_they_are_given_and_end_without_a_nonlinearity() -
 
 
 def test_a_zeroed_head_says_nothing_and_learns() -> None:
-    head = zeroed(mlp((4, 6, 3)))
+    head = zero_last_layer(mlp((4, 6, 3)))
     given = torch.randn(5, 4)
     assert not head(given).any()
     (head(given) - 1).square().sum().backward()
     assert head[-1].weight.grad.abs().max() > 0 and head[-1].bias.grad.abs().min() > 0
     with pytest.raises(TypeError, match="found GELU at the end of a head"):
-        zeroed(nn.Sequential(nn.Linear(2, 2), nn.GELU()))
+        zero_last_layer(nn.Sequential(nn.Linear(2, 2), nn.GELU()))

@@ -8,7 +8,7 @@ from imgcal.geometry.transforms import RigidTransform
 from imgcal.io import load_object, load_rig
 from imgcal.networks.parameterization import POSE_SHIFT, Parameterization
 from imgcal.synthesis.rigs import RelativeDrift, synthesize
-from imgcal.types.packing import pack18, pack21
+from imgcal.types.parameter_vectors import pack18, pack21
 from imgcal.types.prediction import Prediction
 from tests.imgcal.lensed import KINDS, lensed
 
@@ -93,7 +93,7 @@ def test_an_untrained_pose_is_a_level_object_at_the_working_distance(parameteriz
 
 def test_positions_become_numbers_of_about_one(parameterization, truth):
     uv = truth.rig.project(truth.rig_from_object.apply(load_object("asymmetric8").points)).uv
-    numbers = parameterization.normalized(uv)
+    numbers = parameterization.normalize(uv)
     assert numbers.shape == uv.shape
     assert 0.3 < numbers.std() < 3
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from imgcal.networks.points import CameraIdentity, points_of
+from imgcal.networks.points import CameraIdentity, stack_points
 from imgcal.types import Views
 from tests.imgcal.networks.making import make, snapshots, views
 
@@ -61,7 +61,7 @@ def test_identities_of_cameras_stay_distinct_where_there_are_more_than_dimension
 def test_points_that_all_are_seen_need_no_mask():
     network = make("points")
     made = snapshots(network)
-    uv, seen = points_of(Views(uv=made.projection.uv))
+    uv, seen = stack_points(Views(uv=made.projection.uv))
     assert seen.all() and seen.shape == uv.shape[:-1]
     with pytest.raises(ValueError, match=r"needs views\.uv, found images only"):
-        points_of(Views(images=torch.zeros(1, 4, 3, 8, 8)))
+        stack_points(Views(images=torch.zeros(1, 4, 3, 8, 8)))

@@ -27,9 +27,9 @@ def test_shipped_objects_are_looked_at_in_one_crop_a_camera_as_they_are(name: st
     assert torch.equal(tiles.placement.corner, whole.corner)
     assert torch.equal(tiles.placement.scale, whole.scale)
     # The very tensors, since others of the same values are summed in another order.
-    assert tiles.of(expected) is expected
-    assert tiles.joined(expected.uv[0], factory.num_cameras, obj.num_fiducials).data_ptr() == expected.uv.data_ptr()
-    assert torch.equal(tiles.summed(expected.uv[0], factory.num_cameras), expected.uv[0].sum(1))
+    assert tiles.arrange_expected(expected) is expected
+    assert tiles.join(expected.uv[0], factory.num_cameras, obj.num_fiducials).data_ptr() == expected.uv.data_ptr()
+    assert torch.equal(tiles.sum_by_camera(expected.uv[0], factory.num_cameras), expected.uv[0].sum(1))
 
 
 @pytest.mark.parametrize("radius", [None, 0.5])
@@ -40,20 +40,20 @@ def test_many_small_markers_are_divided_among_tiles_that_show_them_as_in_trainin
     assert float((expected.radius[0] / whole.scale[:, None]).max()) < LEAST_RADIUS
     tiles = Tiles.of_object(rig, obj, POSES, 96)
     assert tiles.divided
-    seen = tiles.of(Expectation.of(rig, obj, POSES[:1], tiles.usual))
+    seen = tiles.arrange_expected(Expectation.of(rig, obj, POSES[:1], tiles.usual))
     shown = seen.queries(tiles.placement).radius[tiles.there]
     assert 1.2 < float(shown.min()) <= float(shown.max()) < 2.4
     assert 5 < float(tiles.there.sum(1).double().mean()) < 30
     # Each counts once in each camera, well inside of its tile.
-    assert torch.equal(tiles.joined(torch.ones_like(tiles.fiducial), 2, 90), torch.ones(2, 90, dtype=torch.long))
+    assert torch.equal(tiles.join(torch.ones_like(tiles.fiducial), 2, 90), torch.ones(2, 90, dtype=torch.long))
     assert int(tiles.counts.sum()) == 180
     assert not bool((tiles.counts & ~tiles.there).any())
     place = tiles.placement.to_crop(seen.uv[0])[tiles.counts]
     assert float(place.min()) > 12
     assert float(place.max()) < 84
     # There and back: what is arranged by tile is what was expected of each camera.
-    assert torch.equal(tiles.joined(seen.uv[0], 2, 90), expected.uv[0])
-    assert torch.equal(tiles.summed(torch.ones_like(tiles.there).double(), 2), torch.full((2,), 90.0).double())
+    assert torch.equal(tiles.join(seen.uv[0], 2, 90), expected.uv[0])
+    assert torch.equal(tiles.sum_by_camera(torch.ones_like(tiles.there).double(), 2), torch.full((2,), 90.0).double())
 
 
 def test_what_is_not_in_view_is_in_no_tile() -> None:
@@ -61,12 +61,12 @@ def test_what_is_not_in_view_is_in_no_tile() -> None:
     aside = RigidTransform(torch.eye(3).double()[None], torch.tensor([[60.0, 0.0, 0.0]]).double())
     expected = Expectation.of(rig, obj, aside, 0.6)
     assert 0 < int(expected.visible.sum()) < 180
-    tiles = Tiles.around(expected, 96)
-    assert torch.equal(tiles.joined(tiles.there, 2, 90), expected.visible[0])
+    tiles = Tiles.from_neighbours(expected, 96)
+    assert torch.equal(tiles.join(tiles.there, 2, 90), expected.visible[0])
     beyond = replace(expected, visible=expected.visible & (torch.arange(2) == 1)[:, None])
     assert tiles.camera.unique().tolist() == [0, 1]
-    assert Tiles.around(beyond, 96).camera.unique().tolist() == [1]
-    assert not bool(tiles.only(torch.tensor([True, False])).there[tiles.camera == 1].any())
+    assert Tiles.from_neighbours(beyond, 96).camera.unique().tolist() == [1]
+    assert not bool(tiles.select_cameras(torch.tensor([True, False])).there[tiles.camera == 1].any())
 
 
 def test_a_few_small_markers_far_apart_are_no_neighbours() -> None:

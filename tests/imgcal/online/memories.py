@@ -7,8 +7,8 @@ from imgcal.association import PipelineOptions
 from imgcal.detection import DetectionOptions
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.labelling import Labelling
-from imgcal.online.learning import learnt_from
-from imgcal.online.snapshot_labels import Labelled, labelled_snapshot
+from imgcal.online.snapshot_labels import Labelled, label_snapshot
+from imgcal.online.snapshot_update import learn_snapshot
 from imgcal.types import Detections
 from scripts.benchmarks.rig_streams import Conditions, Stream
 
@@ -21,7 +21,7 @@ class Remembered:
     def __init__(self, seed: int = 1, **given) -> None:
         obj = imgcal.load_object("asymmetric8")
         self.stream = Stream(imgcal.load_rig("T4"), obj, seed, given.pop("conditions", Conditions()), **given)
-        self.memory = KeeperMemory.of(self.stream.factory, obj, None, OPTIONS)
+        self.memory = KeeperMemory.from_factory(self.stream.factory, obj, None, OPTIONS)
         self.labelling = Labelling(self.memory.factory, obj, OPTIONS, DetectionOptions(), "classical")
 
     def blobs(self) -> Detections:
@@ -32,11 +32,11 @@ class Remembered:
         return replace(blobs, snapshot_names=("next",))
 
     def labelled(self, blobs: Detections) -> Labelled:
-        return labelled_snapshot(self.memory, self.labelling, blobs, "next", None)
+        return label_snapshot(self.memory, self.labelling, blobs, "next", None)
 
     def learn(self, count: int) -> KeeperMemory:
         """Learn so many snapshots."""
         for _ in range(count):
-            learnt_from(self.memory, self.labelled(self.blobs()).checked)
+            learn_snapshot(self.memory, self.labelled(self.blobs()).checked)
             self.labelling.follow(self.memory.poses[-1][1][0])
         return self.memory

@@ -1,33 +1,33 @@
 """How each camera is, the worst first, and the sentence that says so."""
 
 from imgcal.online import Event
-from imgcal.online.camera_health import VAIN, health_of, sentence_of, take_health
+from imgcal.online.camera_health import VAIN, camera_health, describe_health, take_health
 from tests.imgcal.online.memories import Remembered
 
 
 def test_the_worst_is_said_of_a_camera() -> None:
     memory = Remembered().learn(2)
     memory.sightings.seen |= {0, 1, 2}
-    assert health_of(memory) == {"cam01": "ok", "cam02": "ok", "cam03": "ok", "cam04": "unseen"}
+    assert camera_health(memory) == {"cam01": "ok", "cam02": "ok", "cam03": "ok", "cam04": "unseen"}
     take_health(memory, Event(0.0, 1, "dirty", "cam02"))
     take_health(memory, Event(0.0, 1, "object_bent"))
-    assert health_of(memory)["cam02"] == "dirty"
+    assert camera_health(memory)["cam02"] == "dirty"
     memory.off[1] = 0.0
-    assert health_of(memory)["cam02"] == "doubtful"
+    assert camera_health(memory)["cam02"] == "doubtful"
     memory.off.clear()
     memory.monitor.undecided = {1: 3}
-    assert health_of(memory)["cam02"] == "doubtful"
+    assert camera_health(memory)["cam02"] == "doubtful"
     memory.relearning.events[1] = Event(0.0, 1, "moved", "cam02")
-    assert health_of(memory)["cam02"] == "relearning"
+    assert camera_health(memory)["cam02"] == "relearning"
     memory.monitor.undecided = {}
     memory.relearning.events.clear()
     take_health(memory, Event(0.0, 2, "clean", "cam02"))
-    assert health_of(memory)["cam02"] == "ok"
+    assert camera_health(memory)["cam02"] == "ok"
     memory.in_vain = VAIN
-    assert health_of(memory) == {**dict.fromkeys(("cam01", "cam02", "cam03"), "doubtful"), "cam04": "unseen"}
+    assert camera_health(memory) == {**dict.fromkeys(("cam01", "cam02", "cam03"), "doubtful"), "cam04": "unseen"}
 
 
 def test_the_rig_is_said_in_a_sentence() -> None:
-    assert sentence_of({"a": "ok"}, 0) == "the object has not been seen yet"
-    assert sentence_of({"a": "ok", "b": "ok"}, 5) == "all 2 cameras are calibrated"
-    assert sentence_of({"a": "dirty", "b": "relearning"}, 5) == "b moved and is being recalibrated; a is dirty"
+    assert describe_health({"a": "ok"}, 0) == "the object has not been seen yet"
+    assert describe_health({"a": "ok", "b": "ok"}, 5) == "all 2 cameras are calibrated"
+    assert describe_health({"a": "dirty", "b": "relearning"}, 5) == "b moved and is being recalibrated; a is dirty"

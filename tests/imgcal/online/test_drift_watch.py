@@ -7,7 +7,7 @@ import torch
 
 import imgcal
 from imgcal.monitoring import RigBelief
-from imgcal.online.drift_watch import EVERY_SECONDS, DriftWatch, with_cameras
+from imgcal.online.drift_watch import EVERY_SECONDS, DriftWatch, replace_cameras
 
 
 def test_a_slow_turn_is_told_of_its_camera() -> None:
@@ -18,12 +18,12 @@ def test_a_slow_turn_is_told_of_its_camera() -> None:
     step[3, 1] = math.radians(0.03)
     for number in range(5):
         time = number * EVERY_SECONDS
-        told += watch.take(replace(belief, rig=belief.rig.retract(number * step)), frozenset(), time, number)
+        told += watch.observe(replace(belief, rig=belief.rig.retract(number * step)), frozenset(), time, number)
     assert [(event.kind, event.camera, event.change) for event in told] == [("drift", "cam04", "rotation")] * 2
     assert told[0].size is not None
     assert abs(told[0].size - 0.06) < 0.002
     assert told[0].since == 0.0
-    assert watch.take(belief, frozenset(), 4 * EVERY_SECONDS + 1, 12) == []  # it was looked a moment ago
+    assert watch.observe(belief, frozenset(), 4 * EVERY_SECONDS + 1, 12) == []  # it was looked a moment ago
 
 
 def test_a_camera_that_moved_does_not_drift() -> None:
@@ -34,10 +34,10 @@ def test_a_camera_that_moved_does_not_drift() -> None:
     )
     step = torch.zeros(7, 15, dtype=torch.float64)
     step[3, 1] = math.radians(1.0)
-    watch.take(belief, frozenset(), 0.0, 0)
+    watch.observe(belief, frozenset(), 0.0, 0)
     there = replace(belief, rig=rig.retract(step))
-    assert watch.take(there, frozenset({3}), 20.0, 1) == []
-    assert watch.take(there, frozenset(), 40.0, 2) == []  # from where it is now
+    assert watch.observe(there, frozenset({3}), 20.0, 1) == []
+    assert watch.observe(there, frozenset(), 40.0, 2) == []  # from where it is now
 
 
 def test_a_move_between_two_looks_is_no_drift() -> None:
@@ -45,10 +45,10 @@ def test_a_move_between_two_looks_is_no_drift() -> None:
     belief = RigBelief.of_prior(rig, obj, torch.full((7, 15), 1e-4, dtype=torch.float64))
     watch, step = DriftWatch(rig.camera_names), torch.zeros(7, 15, dtype=torch.float64)
     step[3, 1] = math.radians(1.0)
-    watch.take(belief, frozenset(), 0.0, 0)
+    watch.observe(belief, frozenset(), 0.0, 0)
     there = replace(belief, rig=rig.retract(step))
-    assert watch.take(there, frozenset({3}), 2.0, 1) == []  # bumped, and learnt again before the next look
-    assert watch.take(there, frozenset(), EVERY_SECONDS + 1, 2) == []
+    assert watch.observe(there, frozenset({3}), 2.0, 1) == []  # bumped, and learnt again before the next look
+    assert watch.observe(there, frozenset(), EVERY_SECONDS + 1, 2) == []
 
 
 def test_what_is_not_known_any_more_has_not_drifted() -> None:
@@ -57,14 +57,14 @@ def test_what_is_not_known_any_more_has_not_drifted() -> None:
     sure = RigBelief.of_prior(rig, obj, torch.full((7, 15), 1e-5, dtype=torch.float64))
     watch, step = DriftWatch(rig.camera_names), torch.zeros(7, 15, dtype=torch.float64)
     step[3, 1] = math.radians(0.2)
-    watch.take(sure, frozenset(), 0.0, 0)
+    watch.observe(sure, frozenset(), 0.0, 0)
     unsure = RigBelief.of_prior(rig.retract(step), obj, torch.full((7, 15), 0.01, dtype=torch.float64))
-    assert watch.take(unsure, frozenset(), EVERY_SECONDS + 1, 1) == []
+    assert watch.observe(unsure, frozenset(), EVERY_SECONDS + 1, 1) == []
 
 
 def test_cameras_are_replaced() -> None:
     rig = imgcal.load_rig("T4").to(torch.float64)
     other = rig.retract(torch.full((4, 15), 0.01, dtype=torch.float64))
-    mixed = with_cameras(rig, other, [2])
+    mixed = replace_cameras(rig, other, [2])
     assert torch.equal(mixed.focal_length[2], other.focal_length[2])
     assert torch.equal(mixed.cam_from_rig.rotation[[0, 1, 3]], rig.cam_from_rig.rotation[[0, 1, 3]])

@@ -14,7 +14,7 @@ from tests.imgcal.online.memories import OPTIONS, Remembered
 
 def test_nothing_is_known_at_the_beginning_but_what_the_factory_says() -> None:
     rig, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
-    memory = KeeperMemory.of(rig, obj, None, OPTIONS)
+    memory = KeeperMemory.from_factory(rig, obj, None, OPTIONS)
     assert memory.surroundings is None and memory.most_usual == np.inf
     assert memory.obj_now is obj
     assert np.isnan(memory.predicted(None)).all() and memory.predicted(None).shape == (4, 8, 2)
@@ -27,7 +27,7 @@ def test_what_has_been_learnt_is_forgotten_but_for_the_factory() -> None:
     known = memory.surroundings
     assert known is not None and bool((known.std[:, 6] < known.widest[:, 6]).all())
     factory = memory.factory
-    memory.begin_anew()
+    memory.reset()
     assert memory.factory is factory and memory.surroundings is None and memory.most_usual == np.inf
     assert not memory.looks.any() and not memory.times
     assert [event.kind for event in memory.pending] == ["restart"]
@@ -35,16 +35,16 @@ def test_what_has_been_learnt_is_forgotten_but_for_the_factory() -> None:
 
 def test_moments_are_those_of_the_snapshots_or_since_when_it_was_in_doubt() -> None:
     memory = Remembered().learn(3)
-    assert memory.since(1) == memory.since(1, 2) == pytest.approx(1 / 60)
-    assert memory.since(99) == memory.time
+    assert memory.change_time(1) == memory.change_time(1, 2) == pytest.approx(1 / 60)
+    assert memory.change_time(99) == memory.time
     memory.off[2] = 0.001
-    assert memory.since(1, 2) == 0.001
+    assert memory.change_time(1, 2) == 0.001
 
 
 def test_a_state_is_resumed_and_parts_of_another_rig_are_refused() -> None:
     memory, writer = Remembered().learn(2), StateWriter()
     plain = writer.write(KeeperMemory, memory)
-    other = writer.write(KeeperMemory, KeeperMemory.of(imgcal.load_rig("U7"), memory.obj, None, OPTIONS))
+    other = writer.write(KeeperMemory, KeeperMemory.from_factory(imgcal.load_rig("U7"), memory.obj, None, OPTIONS))
     plain, other, tables = json.loads(json.dumps([plain, other, writer.tables()]))
     again = KeeperMemory.restored(StateReader(tables), plain, OPTIONS)
     assert torch.equal(again.belief.factor, memory.belief.factor) and again.count == 2

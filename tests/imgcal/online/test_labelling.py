@@ -21,7 +21,7 @@ def test_blobs_of_one_snapshot_are_labelled_and_those_of_two_refused() -> None:
         named = labelling.blobs(blobs, "7")
         assert named.snapshot_names == ("7",)
         unlabelled = replace(named, fiducial=np.full(len(named), -1))
-        found, snapshot = labelling.decided(unlabelled, "7", None, None, None)
+        found, snapshot = labelling.decide(unlabelled, "7", None, None, None)
         assert snapshot.name == "7"
         np.testing.assert_array_equal(found.fiducial, blobs.fiducial)
         assert not labelling.follows
@@ -29,7 +29,7 @@ def test_blobs_of_one_snapshot_are_labelled_and_those_of_two_refused() -> None:
         labelling.follow(snapshot.rig_from_object)
         assert labelling.follows
         with pytest.raises(RefusedError, match="identity"):
-            labelling.decided(unlabelled.select(np.arange(2)), "8", None, None, None)
+            labelling.decide(unlabelled.select(np.arange(2)), "8", None, None, None)
         assert not labelling.follows
         with pytest.raises(InputError, match="found 2 snapshots"):
             labelling.blobs(replace(blobs, snapshot_names=("0", "1")), "9")

@@ -27,7 +27,7 @@ def seen() -> tuple[imgcal.CameraRig, Detections]:
 
 
 def memory_of(rig: imgcal.CameraRig) -> KeeperMemory:
-    return KeeperMemory.of(rig, UnknownLights.of(8), None, imgcal.PipelineOptions())
+    return KeeperMemory.from_factory(rig, UnknownLights.of(8), None, imgcal.PipelineOptions())
 
 
 def shifted(blobs: Detections, by: tuple[float, float]) -> Detections:

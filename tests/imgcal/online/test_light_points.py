@@ -41,7 +41,7 @@ def test_errors_are_as_large_as_is_said(shake):
         rig = factory.retract(PRIOR.std(factory) * normal)
         found, truth = seen_lights(rig, seed, shake)
         known = light_points(belief, found, nothing, nothing + shake, np.ones(10, dtype=bool))
-        laid = even.laid(rig, factory)
+        laid = even.align(rig, factory)
         there = ((laid.cam_from_rig.inverse() @ rig.cam_from_rig)[0]).apply(truth).numpy()
         kept = np.linalg.norm(known.point[:, None] - there, axis=-1).argmin(1)
         squared += (np.square(known.point - there[kept]).sum(1) / known.error**2).tolist()

@@ -59,7 +59,7 @@ def test_errors_are_as_large_as_the_covariance_says(tolerance, shake):
         found = absorb(RigBelief.of_prior(factory, obj), observations, poses, SQUARED)
         known = last_pose(found.belief, found.rig_from_object, observations, shake)
         # The true rig laid upon the estimate, and the pose with it.
-        laid = even.laid(rig, found.belief.rig)
+        laid = even.align(rig, found.belief.rig)
         there = (laid.cam_from_rig.inverse() @ rig.cam_from_rig)[0] @ poses[-1]
         turn = vector_from_rotation(there.rotation @ known.rig_from_object.rotation.mT)
         error = torch.cat((turn, there.translation - known.rig_from_object.translation))

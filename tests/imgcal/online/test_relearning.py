@@ -6,35 +6,35 @@ import pytest
 import torch
 
 import imgcal
-from imgcal.monitoring import Change, RigBelief, widened
-from imgcal.online.relearning import Relearning, relative_std, sigma_of
+from imgcal.monitoring import Change, RigBelief, widen
+from imgcal.online.relearning import Relearning, change_sigma, relative_std
 
 
 def test_a_camera_is_known_again_when_it_is_known_as_well_as_before() -> None:
     rig, obj = imgcal.load_rig("T4").to(torch.float64), imgcal.load_object("asymmetric8")
     known = RigBelief.of_prior(rig, obj)
     relearning = Relearning(rig.camera_names)
-    first = relearning.told(Change(1, 0, "unknown", math.nan, math.nan), 1.0, 1.1, 4, known)
+    first = relearning.report_change(Change(1, 0, "unknown", math.nan, math.nan), 1.0, 1.1, 4, known)
     assert (first.camera, first.change, first.size, first.message) == ("cam02", "unknown", None, "cam02 moved")
     assert first.evidence is None  # JSON knows no nan
     change = Change(1, 0, "rotation", math.radians(0.3), math.radians(0.01), evidence=812.0)
-    told = relearning.told(change, 1.0, 1.2, 8, known)
+    told = relearning.report_change(change, 1.0, 1.2, 8, known)
     assert (told.change, told.unit, told.evidence) == ("rotation", "deg", 812.0)
     assert told.size == pytest.approx(0.3)
     assert told.message == "cam02 turned 0.3 +- 0.01 deg"
     variance = torch.zeros(4, 15, dtype=torch.float64)
     variance[1, :3] = 0.05**2
-    wide = widened(known, variance)
-    assert relearning.learnt(wide, frozenset(), frozenset(), 1.3, 12) == []
-    assert relearning.learnt(known, frozenset({1}), frozenset(), 1.3, 12) == []
-    (learnt,) = relearning.learnt(known, frozenset(), frozenset(), 1.4, 16)
+    wide = widen(known, variance)
+    assert relearning.report_relearnt(wide, frozenset(), frozenset(), 1.3, 12) == []
+    assert relearning.report_relearnt(known, frozenset({1}), frozenset(), 1.3, 12) == []
+    (learnt,) = relearning.report_relearnt(known, frozenset(), frozenset(), 1.4, 16)
     assert (learnt.kind, learnt.camera, learnt.since, learnt.snapshot) == ("relearnt", "cam02", 1.0, 16)
-    assert learnt.sigma == pytest.approx(sigma_of(relative_std(known)[1], "rotation"))
+    assert learnt.sigma == pytest.approx(change_sigma(relative_std(known)[1], "rotation"))
     assert relearning.events == {}
 
 
 def test_of_two_cameras_it_is_said_that_it_may_be_the_other() -> None:
     rig, obj = imgcal.load_rig("T4").to(torch.float64).select([0, 2]), imgcal.load_object("asymmetric8")
     change = Change(1, 0, "unknown", math.nan, math.nan)
-    told = Relearning(rig.camera_names).told(change, 1.0, 1.1, 4, RigBelief.of_prior(rig, obj))
+    told = Relearning(rig.camera_names).report_change(change, 1.0, 1.1, 4, RigBelief.of_prior(rig, obj))
     assert told.message == "cam03 moved, or cam01: of two cameras nobody can tell which"

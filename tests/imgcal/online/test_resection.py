@@ -3,7 +3,7 @@ import pytest
 import torch
 from numpy.testing import assert_equal
 
-from imgcal.online.resection import labels_at, resected
+from imgcal.online.resection import labels_at, resect_camera
 from tests.imgcal.streams import Stream
 
 
@@ -30,7 +30,7 @@ def test_a_camera_turned_far_is_found(rig, obj, turn_deg):
         blobs, places, labels = sightings(stream, camera, [0, 12, 24, 36], turn_deg)
         if sum(len(uv) >= 5 for uv in blobs) < 2:
             continue  # it looks away now
-        place = resected(blobs, places, stream.rig.select([camera]), np.random.default_rng(0))
+        place = resect_camera(blobs, places, stream.rig.select([camera]), np.random.default_rng(0))
         if place is not None:
             found += 1
             named = place.labels
@@ -46,5 +46,5 @@ def test_blobs_that_no_place_explains_stay_without_labels():
     for seed in range(5):
         random = np.random.default_rng(seed)
         blobs = [random.random((5, 2)) * 1000 for _ in range(3)]
-        assert resected(blobs, places, stream.rig.select([0]), random) is None
-        assert resected([uv[:2] for uv in blobs], places, stream.rig.select([0]), random) is None
+        assert resect_camera(blobs, places, stream.rig.select([0]), random) is None
+        assert resect_camera([uv[:2] for uv in blobs], places, stream.rig.select([0]), random) is None

@@ -13,8 +13,8 @@ from tests.imgcal.online.memories import Remembered
 
 def test_a_snapshot_is_followed_by_the_last_pose_and_else_decided_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     made, decided = Remembered(), []
-    own = made.labelling.decided
-    monkeypatch.setattr(made.labelling, "decided", lambda *given: (decided.append(made.memory.count), own(*given))[1])
+    own = made.labelling.decide
+    monkeypatch.setattr(made.labelling, "decide", lambda *given: (decided.append(made.memory.count), own(*given))[1])
     made.learn(5)
     assert decided == [1]
     made.labelling.follows = False

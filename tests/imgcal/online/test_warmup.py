@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from imgcal.online.warmup import warm_up, with_another_lens
+from imgcal.online.warmup import replace_lenses, warm_up
 from imgcal.types import CameraRig
 
 COUNT = """
@@ -74,7 +74,7 @@ def test_other_lenses_are_warmed_up_where_that_is_asked_for(monkeypatch: pytest.
     warm_up(all_lenses=True)
     assert [rig.lens_model for rig in warmed] == ["brown_conrady", "brown_conrady", "rational"]
     points = torch.tensor([[10.0, 20.0, 860.0]], dtype=torch.float64)
-    images = [rig.project(points).uv for rig in (o10, with_another_lens(o10))]
+    images = [rig.project(points).uv for rig in (o10, replace_lenses(o10))]
     torch.testing.assert_close(*images)  # the same lens in other words
 
 

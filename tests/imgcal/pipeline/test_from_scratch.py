@@ -8,10 +8,10 @@ from imgcal.errors import RefusedError
 from imgcal.io import load_object
 from imgcal.pipeline import calibrate, unit_doubt
 from imgcal.pipeline.from_scratch import calibrate_from_scratch
-from imgcal.synthesis import HandHeld, PhysicalDrift, arranged_rig, simulate_volume, true_detections
+from imgcal.synthesis import HandHeld, PhysicalDrift, arrange_rig, simulate_volume, true_detections
 from imgcal.types import RigPrior, Volume
 
-FACTORY = arranged_rig(
+FACTORY = arrange_rig(
     "ring", 4, 3000.0, height=1800.0, target=(0.0, 0.0, 900.0), prior=RigPrior(0.01, 5.0, 0.01, 0.01, 3)
 )
 ROUGH = RigPrior(0.15, 25.0, 0.1, 1.0, 1e6)

@@ -9,7 +9,7 @@ import torch
 import imgcal
 from imgcal import InputError, RefusedError
 from imgcal.association import associate
-from imgcal.pipeline.steadiness import _with_earlier
+from imgcal.pipeline.motion_check import _prepend_earlier
 from scripts.benchmarks.lights import LIGHTS, Scene, simulate, triangulation_error
 
 
@@ -54,7 +54,7 @@ def test_after_a_move_rows_keep_their_moments(scene: Scene, result: imgcal.Calib
     labelled = result.labelled
     first = labelled.detections.snapshot_names.index("00010")
     later = labelled.detections.of_snapshots(first, len(labelled.snapshots))
-    whole = _with_earlier(associate(later, scene.factory, LIGHTS), labelled, "00010")
+    whole = _prepend_earlier(associate(later, scene.factory, LIGHTS), labelled, "00010")
     assert (whole.moments == labelled.moments).all()
     assert set(whole.moments[whole.used]) == set(range(10, 24))
 

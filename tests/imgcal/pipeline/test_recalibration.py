@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association import Proposal, Sight, rows_of
+from imgcal.association import Proposal, Sight, proposal_rows
 from imgcal.errors import RefusedError
 from imgcal.estimation import relative_covariance
 from imgcal.pipeline import calibrate
@@ -86,7 +86,7 @@ class Oracle:
     def propose(self, snapshot):
         number = int(snapshot.frames["number"][0, 0])
         some = np.full(self.truth.uv.shape[1:3], 0.1)
-        rows = rows_of(self.truth.uv[number].numpy(), some, some > 0, 30 * some, snapshot.blobs)
+        rows = proposal_rows(self.truth.uv[number].numpy(), some, some > 0, 30 * some, snapshot.blobs)
         return Proposal(rows, self.truth.rig_from_object[number], 100.0)
 
 

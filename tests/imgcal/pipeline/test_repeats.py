@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import imgcal
-from imgcal.pipeline.repeats import Repeats, without_repeats
+from imgcal.pipeline.repeats import Repeats, drop_repeats
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
@@ -35,7 +35,7 @@ def stalled(blobs: Detections, times: int) -> Detections:
 
 def test_a_capture_without_copies_stays_as_it_is(capture) -> None:
     blobs, *_ = capture
-    left, found = without_repeats(blobs)
+    left, found = drop_repeats(blobs)
     assert left is blobs
     assert found == Repeats()
     assert str(found) == ""
@@ -56,7 +56,7 @@ def test_rows_that_stand_twice_count_once(capture) -> None:
     blobs, *_ = capture
     unlabelled = replace(blobs, fiducial=np.full(len(blobs), -1))
     twice = unlabelled.select(np.repeat(np.arange(len(blobs)), 2))
-    left, found = without_repeats(twice)
+    left, found = drop_repeats(twice)
     assert found == Repeats(rows=len(blobs))
     assert np.array_equal(left.uv, blobs.uv)
     assert str(found) == f"{len(blobs)} blobs are listed twice: these copies are left out"
@@ -67,7 +67,7 @@ def test_one_camera_that_stands_still(capture) -> None:
     uv = blobs.uv.copy()
     first = (blobs.snapshot == 2) & (blobs.camera == 1)
     uv[(blobs.snapshot == 3) & (blobs.camera == 1)] = uv[first]
-    left, found = without_repeats(replace(blobs, uv=uv))
+    left, found = drop_repeats(replace(blobs, uv=uv))
     assert found == Repeats(images=1)
     assert not ((left.snapshot == 3) & (left.camera == 1)).any()
     assert len(left) == len(blobs) - first.sum()
@@ -77,17 +77,17 @@ def test_order_of_rows_does_not_matter(capture) -> None:
     blobs, *_ = capture
     many = stalled(blobs, 2)
     mixed = many.select(np.random.default_rng(3).permutation(len(many)))
-    assert without_repeats(mixed)[1] == without_repeats(many)[1]
+    assert drop_repeats(mixed)[1] == drop_repeats(many)[1]
 
 
 def test_a_reflection_at_rest_is_no_copy(capture) -> None:
     blobs, *_ = capture
     one = blobs.select(np.flatnonzero(blobs.camera == 0)[[0, -1]])
     still = replace(one, uv=np.tile(one.uv[:1], (2, 1)))
-    assert without_repeats(still)[1] == Repeats()
+    assert drop_repeats(still)[1] == Repeats()
 
 
 def test_nothing_at_all(capture) -> None:
     blobs, *_ = capture
     nothing = blobs.select(np.zeros(len(blobs), dtype=np.bool_))
-    assert without_repeats(nothing) == (nothing, Repeats())
+    assert drop_repeats(nothing) == (nothing, Repeats())

@@ -129,7 +129,7 @@ class Watcher:
 
     def propose(self, snapshot):
         self.shown.append(snapshot)
-        return Proposal.declined(snapshot, "seen enough")
+        return Proposal.decline(snapshot, "seen enough")
 
 
 def test_a_proposer_is_shown_the_frames_of_each_snapshot(o10, asymmetric8):

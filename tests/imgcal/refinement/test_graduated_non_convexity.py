@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from imgcal.evaluation.metrics import errors
-from imgcal.refinement import as_prediction, refine_robustly
+from imgcal.refinement import make_prediction, refine_robustly
 from imgcal.refinement.graduated_non_convexity import Target, robust_pose, undo_label_swaps
 from tests.imgcal.evaluation.conftest import disturbed
 
@@ -21,7 +21,7 @@ def re(prediction, some):
 
 def test_without_outliers_it_is_the_map_estimate(sample):
     some = sample(6, noise=0.1)
-    reference = as_prediction(some.reference())
+    reference = make_prediction(some.reference())
     found = refined(some)
     assert torch.allclose(found.rig.focal_length, reference.rig.focal_length, atol=0.02)
     assert torch.allclose(re(found, some), re(reference, some), atol=1e-3)
@@ -33,13 +33,13 @@ def test_exact_points_give_an_exact_rig(sample):
 
 def test_outliers_cost_nothing_because_swapped_labels_are_mended(sample):
     some = sample(60, rig="O10", noise=0.1, missing=0.2, swapped=0.1)
-    reference = re(as_prediction(some.reference()), some)
+    reference = re(make_prediction(some.reference()), some)
     assert float(re(refined(some), some).median()) < 1.0 * float(reference.median())
 
 
 def test_false_blobs_are_left_out(sample):
     some = sample(60, rig="O10", noise=0.1, false=0.1)
-    reference = re(as_prediction(some.reference()), some)
+    reference = re(make_prediction(some.reference()), some)
     assert float(re(refined(some), some).median()) < 1.1 * float(reference.median())
 
 
@@ -93,7 +93,7 @@ def test_a_blind_camera_keeps_what_the_prior_says(sample, seen):
     found = refined(some)
     assert torch.isfinite(found.rig.focal_length).all()
     others = [camera for camera in range(10) if camera != 2]
-    reference = as_prediction(some.reference())
+    reference = make_prediction(some.reference())
     assert torch.allclose(found.rig.focal_length[:, others], reference.rig.focal_length[:, others], atol=0.1)
 
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from imgcal.refinement import refine_images
-from imgcal.refinement.label_swaps import colours_at, swapped_labels
+from imgcal.refinement.label_swaps import colours_at, find_swapped_labels
 from imgcal.types.prediction import Prediction
 from renderers import palette, splat
 
@@ -22,10 +22,10 @@ def test_each_colour_is_named_once_and_never_that_of_a_place_that_fits():
     found = colours[[0, 2, 1, 0, 4]] + 0.05
     found[4] = 0.02
     fits = torch.tensor([True, False, False, False, False])
-    assert swapped_labels(found, colours, fits).tolist() == [0, 2, 1, -1, -1]
+    assert find_swapped_labels(found, colours, fits).tolist() == [0, 2, 1, -1, -1]
     twice = colours[[1, 1, 2, 3, 4]]
     twice[0] += 0.1
-    assert swapped_labels(twice, colours, torch.zeros(5, dtype=torch.bool)).tolist() == [-1, 1, 2, 3, 4]
+    assert find_swapped_labels(twice, colours, torch.zeros(5, dtype=torch.bool)).tolist() == [-1, 1, 2, 3, 4]
 
 
 def test_exchanged_dots_count_as_what_they_are(o10_scene):

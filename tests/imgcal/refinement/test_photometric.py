@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from imgcal.refinement.photometric import DAMPING, DotWindows, ShiftPrior, blurred_step, profile_and_slope
+from imgcal.refinement.photometric import DAMPING, DotWindows, ShiftPrior, profile_and_slope, take_blurred_step
 from renderers import splat
 
 COLOURS = torch.tensor([[1.0, 1, 1], [1, 0, 0], [0.9, 0.7, 0.4], [0, 0.7, 0]], dtype=torch.float64)  # N = 4
@@ -65,7 +65,7 @@ def test_a_blurred_step_goes_to_the_truth(offset):
     truth = places(close=False)
     uv = truth + offset * torch.tensor([0.8, -0.6], dtype=torch.float64)
     prior = ShiftPrior(together=8.0, alone=2.0)
-    step, amplitude = blurred_step(render(truth), uv, COLOURS, DOT, 3.0, prior, trust=1e-3)
+    step, amplitude = take_blurred_step(render(truth), uv, COLOURS, DOT, 3.0, prior, trust=1e-3)
     assert float((uv + step - truth).norm(dim=-1).max()) < 0.25 * offset
     assert float((amplitude - 1).abs().max()) < 0.15
 
@@ -73,7 +73,7 @@ def test_a_blurred_step_goes_to_the_truth(offset):
 def test_a_blurred_step_stays_at_the_truth_and_sees_what_is_missing():
     truth = places(close=False)
     images = splat(truth, COLOURS, DOT, SIZE, visible=torch.arange(4) != 3)
-    step, amplitude = blurred_step(images, truth, COLOURS, DOT, 1.0, ShiftPrior(8.0, 2.0), trust=0.1)
+    step, amplitude = take_blurred_step(images, truth, COLOURS, DOT, 1.0, ShiftPrior(8.0, 2.0), trust=0.1)
     assert float(step.abs().max()) < 0.02
     assert float(amplitude[:, 3].max()) < 0.2 and float(amplitude[:, :3].min()) > 0.95
 

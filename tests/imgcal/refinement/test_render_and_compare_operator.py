@@ -7,7 +7,7 @@ import torch
 
 from imgcal.geometry import RigidTransform
 from imgcal.io import load_rig
-from imgcal.refinement import ImageRefinementOptions, encoded_image_options, refine_images_anywhere
+from imgcal.refinement import ImageRefinementOptions, encode_image_options, refine_images_anywhere
 from imgcal.refinement import render_and_compare_operator as module
 from imgcal.synthesis import ImageOptions
 from imgcal.types import Prediction, RigPrior
@@ -17,7 +17,7 @@ OPTIONS = ImageRefinementOptions(image=ImageOptions(96, 1.5), attempts=("near",)
 
 
 def test_options_are_written_and_read():
-    assert module._decoded(encoded_image_options(OPTIONS)) == OPTIONS
+    assert module._decode(encode_image_options(OPTIONS)) == OPTIONS
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor")  # opcheck itself asks its copies for it
@@ -36,7 +36,7 @@ def test_is_sound(asymmetric8, monkeypatch):
     monkeypatch.setattr(module, "OPERATOR", spy)
     guess = Prediction(rig, replace(pose, translation=pose.translation + 1))
     prior_std = RigPrior().std(rig)
-    given = (guess, images, rig, asymmetric8, prior_std, encoded_image_options(OPTIONS))
+    given = (guess, images, rig, asymmetric8, prior_std, encode_image_options(OPTIONS))
     _, _, converged = refine_images_anywhere(*given)
     assert converged.all()
     named = zip(operator.inputs, calls[0][:-1], strict=True)

@@ -88,7 +88,7 @@ def calibrated(
     fixed = torch.zeros(cameras, PARAMETERS, dtype=torch.float64)
     before = estimate(observations, factory, obj, prior_std=fixed, options=EstimationOptions(loss="squared"))
     detections, labels, cell = _detections(observations, factory, clutter, generator)
-    gauge = Gauge.of_camera(0, 1) if cameras == 1 else Gauge.of_most(after.rig, factory)
+    gauge = Gauge.from_camera(0, 1) if cameras == 1 else Gauge.from_majority(after.rig, factory)
     real = labels >= 0
 
     def predicted(residual: torch.Tensor) -> np.ndarray:

@@ -47,7 +47,7 @@ def test_moved_and_undetermined_leave_out_the_reference(content: ReportContent) 
     std = np.ones((10, PARAMETERS))
     prior = np.full((10, PARAMETERS), 1.1)
     prior[4] = 10.0
-    gauge = Gauge.of_camera(0, 10)
+    gauge = Gauge.from_camera(0, 10)
     changed = replace(content, recalibrated=content.factory.retract(step), std=std, prior_std=prior, gauge=gauge)
     assert changed.moved.nonzero() == ([3], [6])
     expected = np.ones((10, PARAMETERS), dtype=bool)

@@ -10,14 +10,14 @@ import torch
 
 from imgcal.estimation import Gauge
 from imgcal.report import ReportContent
-from imgcal.report.scene import LARGEST_CLOUD, drawn_fiducials, drawn_scene
+from imgcal.report.scene import LARGEST_CLOUD, choose_fiducials, describe_scene
 
 
 def test_drawn_fiducials_project_onto_their_images(content: ReportContent) -> None:
     """Points and recalibrated cameras share a frame: what is drawn is what was seen."""
     assert content.recalibrated is not None
-    points = torch.as_tensor(drawn_scene(content).values["groups"]).double()
-    drawn = content.laid
+    points = torch.as_tensor(describe_scene(content).values["groups"]).double()
+    drawn = content.aligned_rig
     assert points.shape == (6, 8, 3) and drawn is not None
     uv = drawn.expand(6).project(points).uv.numpy()
     rows = np.flatnonzero(content.used)
@@ -29,7 +29,7 @@ def test_drawn_fiducials_project_onto_their_images(content: ReportContent) -> No
 
 
 def test_exaggeration_scales_the_shift_and_keeps_the_reference(content: ReportContent) -> None:
-    drawn = drawn_scene(replace(content, gauge=Gauge.of_camera(0, 10)))
+    drawn = describe_scene(replace(content, gauge=Gauge.from_camera(0, 10)))
     assert drawn.factors[:3] == (1, 2, 5)
     factory, recalibrated = drawn.values["rigs"]
     centres = np.array(recalibrated["steps"])[:, :, 0]  # (factors, C, 3)
@@ -40,7 +40,7 @@ def test_exaggeration_scales_the_shift_and_keeps_the_reference(content: ReportCo
 
 
 def test_refused_rig_shows_the_factory_alone(refused_content: ReportContent) -> None:
-    drawn = drawn_scene(refused_content)
+    drawn = describe_scene(refused_content)
     assert [rig["name"] for rig in drawn.values["rigs"]] == ["factory"]
     assert drawn.values["groups"] == []
     assert drawn.factors == ()
@@ -51,8 +51,8 @@ def test_rejected_snapshots_are_not_drawn(content: ReportContent) -> None:
     translation = content.rig_from_object.translation.clone()
     translation[2] = torch.nan
     partly = replace(content, rig_from_object=replace(content.rig_from_object, translation=translation))
-    assert drawn_fiducials(partly)[0].tolist() == [0, 1, 3, 4, 5]
-    scene = drawn_scene(partly).values
+    assert choose_fiducials(partly)[0].tolist() == [0, 1, 3, 4, 5]
+    scene = describe_scene(partly).values
     assert np.isfinite(np.array(scene["groups"])).all()
     assert scene["groupNames"] == [f"snapshot {i:04d}" for i in (0, 1, 3, 4, 5)]
 
@@ -62,6 +62,6 @@ def test_number_of_points_is_bounded(content: ReportContent, snapshots: int) -> 
     assert content.rig_from_object is not None
     poses = content.rig_from_object[torch.zeros(snapshots, dtype=torch.int64)]
     many = replace(content, rig_from_object=poses, object_points=np.zeros((437, 3)))
-    chosen, fiducials = drawn_fiducials(many)
+    chosen, fiducials = choose_fiducials(many)
     assert len(chosen) == min(snapshots, 60)
     assert len(chosen) * len(fiducials) <= LARGEST_CLOUD

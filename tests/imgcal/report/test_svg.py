@@ -69,5 +69,5 @@ def test_coordinates_are_short(value: float, expected: str) -> None:
 
 
 def test_words_for_people() -> None:
-    assert svg.grouped(1234567) == "1\u202f234\u202f567" and svg.tick_label(-0.5) == "\u22120.5"
-    assert svg.shortened("a" * 16) == "a" * 16 and svg.shortened("a" * 17) == "a" * 15 + "…"
+    assert svg.group_digits(1234567) == "1\u202f234\u202f567" and svg.tick_label(-0.5) == "\u22120.5"
+    assert svg.shorten_name("a" * 16) == "a" * 16 and svg.shorten_name("a" * 17) == "a" * 15 + "…"

@@ -10,7 +10,7 @@ import torch
 
 from imgcal.estimation import Gauge
 from imgcal.report import ReportContent
-from imgcal.report.tables import GROUPS, camera_rows, knowledge, signed
+from imgcal.report.tables import GROUPS, camera_rows, format_signed, knowledge_rows
 from imgcal.types.rig import PARAMETERS
 
 
@@ -27,7 +27,7 @@ from imgcal.types.rig import PARAMETERS
     ],
 )
 def test_signed(value: float, std: float, expected: tuple[str, str]) -> None:
-    assert signed(value, std) == expected
+    assert format_signed(value, std) == expected
 
 
 def test_rows_show_changes_in_their_units(content: ReportContent) -> None:
@@ -36,7 +36,7 @@ def test_rows_show_changes_in_their_units(content: ReportContent) -> None:
     std = np.full((10, PARAMETERS), 0.05)
     std[:, :3], std[:, 10:] = np.radians(0.1), 1e-3
     rig = content.factory.retract(step)
-    changed = replace(content, recalibrated=rig, std=std, gauge=Gauge.of_most(rig, content.factory))
+    changed = replace(content, recalibrated=rig, std=std, gauge=Gauge.from_majority(rig, content.factory))
     row = camera_rows(changed)[3]
     cells = {(g[0], c.name): c for g, group in zip(GROUPS, row.groups, strict=True) for c in group}
     assert (cells["rotation (deg)", "x"].change, cells["rotation (deg)", "x"].std) == ("+1.50", "0.10")
@@ -49,20 +49,20 @@ def test_rows_show_changes_in_their_units(content: ReportContent) -> None:
 
 def test_reference_has_no_extrinsics_of_its_own(content: ReportContent) -> None:
     assert not any(row.reference for row in camera_rows(content))
-    content = replace(content, gauge=Gauge.of_camera(0, 10))
+    content = replace(content, gauge=Gauge.from_camera(0, 10))
     first, *others = camera_rows(content)
     kinds = [{cell.kind for cell in group} for group in first.groups]
     assert first.reference
     assert kinds[3:] == [{"fixed"}, {"fixed"}]
     assert "fixed" not in kinds[0]
     assert not any(row.reference for row in others)
-    assert [cell.label for cell in knowledge(content)[0][:6]] == ["·"] * 6
+    assert [cell.label for cell in knowledge_rows(content)[0][:6]] == ["·"] * 6
 
 
 def test_knowledge_compares_with_the_prior(content: ReportContent) -> None:
     std = np.full((10, PARAMETERS), 0.5)
     std[1, 8], std[1, 9] = 0.999, 0.001
-    cells = knowledge(replace(content, std=std, prior_std=np.ones((10, PARAMETERS))))[1]
+    cells = knowledge_rows(replace(content, std=std, prior_std=np.ones((10, PARAMETERS))))[1]
     assert (cells[8].label, cells[8].unknown) == ("100", True)
     assert (cells[9].label, cells[9].unknown) == ("<1", False)
     assert (cells[6].label, cells[6].unknown) == ("50", False)
@@ -72,4 +72,4 @@ def test_refused_rows_count_blobs(refused_content: ReportContent) -> None:
     rows = camera_rows(refused_content)
     assert sum(row.blobs for row in rows) == len(refused_content.detections)
     assert all(row.groups == () and row.after == "" for row in rows)
-    assert knowledge(refused_content) == []
+    assert knowledge_rows(refused_content) == []

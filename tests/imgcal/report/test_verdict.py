@@ -25,9 +25,9 @@ def test_the_bumped_camera_is_named_even_if_it_is_the_first(content: ReportConte
     step = torch.zeros(10, 15, dtype=torch.float64)
     step[0, 1] = 0.01
     rig = content.factory.retract(step)
-    bumped = replace(content, recalibrated=rig, gauge=Gauge.of_most(rig, content.factory))
+    bumped = replace(content, recalibrated=rig, gauge=Gauge.from_majority(rig, content.factory))
     assert "1 of 10 cameras moved relative to the others, most of all cam01 (0.57°" in " ".join(judge(bumped).found)
-    relative = replace(bumped, gauge=Gauge.of_camera(2, 10))
+    relative = replace(bumped, gauge=Gauge.from_camera(2, 10))
     assert "1 of 9 cameras moved relative to cam03, most of all cam01 (0.57°" in " ".join(judge(relative).found)
 
 

@@ -2,14 +2,14 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.synthesis.arrangements import Lens, arranged_positions, arranged_rig, look_at
+from imgcal.synthesis.arrangements import Lens, arrange_positions, arrange_rig, look_at
 
 
 @pytest.mark.parametrize("shape", ["ring", "dome", "row"])
 @pytest.mark.parametrize("cameras", [1, 2, 7])
 def test_every_camera_has_the_target_in_the_middle_of_its_image(shape, cameras):
     target = (100.0, -50.0, 700.0)
-    rig = arranged_rig(shape, cameras, 3000.0, height=2000.0, target=target, lens=Lens((641, 481), 60.0))
+    rig = arrange_rig(shape, cameras, 3000.0, height=2000.0, target=target, lens=Lens((641, 481), 60.0))
     projection = rig.project(torch.tensor([target, (100.0, -50.0, 800.0)], dtype=torch.float64))
     torch.testing.assert_close(projection.uv[:, 0], torch.tensor([[320.0, 240.0]] * cameras, dtype=torch.float64))
     assert projection.visible[:, 0].all()
@@ -25,7 +25,7 @@ def test_a_camera_straight_above_has_some_way_up():
 
 
 def test_a_dome_is_even_and_above_the_ground():
-    positions = arranged_positions("dome", 40, 1000.0, 0.0)
+    positions = arrange_positions("dome", 40, 1000.0, 0.0)
     assert (positions[:, 2] > 0).all()
     torch.testing.assert_close(positions.norm(dim=-1), torch.full((40,), 1000.0, dtype=torch.float64))
     apart = torch.cdist(positions, positions).fill_diagonal_(torch.inf).amin(1)
@@ -34,10 +34,10 @@ def test_a_dome_is_even_and_above_the_ground():
 
 def test_impossible_arrangements():
     with pytest.raises(InputError, match="cameras: found 0"):
-        arranged_rig("ring", 0, 1000.0)
+        arrange_rig("ring", 0, 1000.0)
     with pytest.raises(InputError, match="radius"):
-        arranged_rig("ring", 3, -1.0)
+        arrange_rig("ring", 3, -1.0)
     with pytest.raises(InputError, match="very point"):
-        arranged_rig("row", 3, 1000.0, target=(0.0, 0.0, 0.0))
+        arrange_rig("row", 3, 1000.0, target=(0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="field_of_view_deg"):
         Lens(field_of_view_deg=180.0)

@@ -10,7 +10,7 @@ from imgcal.pipeline import score
 from imgcal.synthesis.arrangements import look_at
 from imgcal.synthesis.captures import true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
-from imgcal.synthesis.volumes import HandHeld, sample_path, sample_volume, seen_volume, simulate_volume
+from imgcal.synthesis.volumes import HandHeld, find_seen_volume, sample_path, sample_volume, simulate_volume
 from imgcal.types import Volume
 
 CORNER = Volume(((0, 0, 0), (900, 0, 0), (0, 900, 0), (0, 0, 900)))
@@ -63,12 +63,12 @@ def test_the_same_seed_is_the_same_way():
 
 def test_a_volume_is_found_where_cameras_look_together():
     rig = load_rig("room10")
-    box = seen_volume(replace(rig, volume=None))
+    box = find_seen_volume(replace(rig, volume=None))
     middle = torch.tensor([box.low, box.high]).mean(0).double()
     assert rig.project(middle[None]).visible.sum() >= 8
     with pytest.raises(InputError, match="volume"):
-        seen_volume(rig.select([0]))
+        find_seen_volume(rig.select([0]))
     outward = look_at(rig.positions[[0, 5]], 2 * rig.positions[[0, 5]])
     away = replace(rig.select([0, 5]), cam_from_rig=outward)
     with pytest.raises(InputError, match="no two cameras"):
-        seen_volume(away)
+        find_seen_volume(away)

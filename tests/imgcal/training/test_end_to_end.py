@@ -8,7 +8,7 @@ from imgcal.io import load_object, load_rig
 from imgcal.synthesis.corruption import Corruption
 from imgcal.synthesis.rigs import PoseRange, RelativeDrift
 from imgcal.training.data import Source, object_to
-from imgcal.training.end_to_end import refined_loss
+from imgcal.training.end_to_end import end_to_end_loss
 from imgcal.training.losses import RefinedLoss
 from imgcal.types.prediction import Prediction
 
@@ -33,7 +33,7 @@ def test_weights_learn_to_leave_outliers_out(source):
 
     def loss():
         prediction = Prediction(batch.truth.rig, batch.truth.rig_from_object, log_sigma)
-        return refined_loss(prediction, batch, source, prior_std, CONFIG)
+        return end_to_end_loss(prediction, batch, source, prior_std, CONFIG)
 
     before = loss()
     before.backward()
@@ -44,11 +44,11 @@ def test_weights_learn_to_leave_outliers_out(source):
 
 
 def test_without_weight_nothing_is_computed(source):
-    assert refined_loss(None, None, source, None, RefinedLoss()) == 0
+    assert end_to_end_loss(None, None, source, None, RefinedLoss()) == 0
 
 
 def test_a_network_without_weights_is_refused(source):
     generator = torch.Generator().manual_seed(2)
     batch = source.show(source.sample(2, generator), generator)
     with pytest.raises(InputError, match="trust: true"):
-        refined_loss(batch.truth, batch, source, source.drift.std(source.factory), CONFIG)
+        end_to_end_loss(batch.truth, batch, source, source.drift.std(source.factory), CONFIG)

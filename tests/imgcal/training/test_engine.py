@@ -16,7 +16,7 @@ from imgcal.io.safetensors_file import read_tensors
 from imgcal.networks import load_checkpoint
 from imgcal.training import engine, rigs
 from imgcal.training.callbacks import Callbacks, DivergedError
-from imgcal.training.engine import finished, progress, stream_seeds
+from imgcal.training.engine import is_finished, progress, stream_seeds
 from imgcal.training.experiment_file import load_experiment
 from tests.imgcal.training.toy import Toy, ToyOfImages, train
 
@@ -46,7 +46,7 @@ def stopping_at(step):
 
 def test_a_training_learns_and_tells(experiment, tmp_path):
     run = train(experiment("training.steps=300", "training.log_every=50", "training.validate_every=150"), tmp_path)
-    assert finished(run, run.seconds)
+    assert is_finished(run, run.seconds)
     rows = read_metrics(tmp_path / "metrics.jsonl")
     logged = [row for row in rows if "loss" in row]
     assert [row["step"] for row in logged] == [50, 100, 150, 200, 250, 300]
@@ -72,7 +72,7 @@ def test_the_refined_loss_is_minimized_with_the_others_and_logged(experiment, tm
     def heavy(prediction, batch, source, *_):
         return sign * 1e6 * (prediction.rig.focal_length / source.factory.focal_length).mean()
 
-    monkeypatch.setattr(rigs, "refined_loss", heavy)
+    monkeypatch.setattr(rigs, "end_to_end_loss", heavy)
     run = train(setup, tmp_path / "more")
     plain, more = (read_metrics(tmp_path / name / "metrics.jsonl")[0]["loss"] for name in ("plain", "more"))
     assert more - plain == pytest.approx(sign * 1e6, rel=1e-6)  # the untrained toy has the factory's focal lengths
@@ -93,7 +93,7 @@ def test_a_resumed_run_ends_bit_for_bit_the_same(experiment, tmp_path, schedule)
     setup = experiment(f"schedule={schedule}", "training.steps=40")
     train(setup, tmp_path / "whole")
     first = train(setup, tmp_path / "parts", should_stop=stopping_at(17))
-    assert first.step == 17 and not finished(first, first.seconds)
+    assert first.step == 17 and not is_finished(first, first.seconds)
     torch.manual_seed(99)  # what another process has in its default generator
     second = train(setup, tmp_path / "parts", resume=True)
     assert second.step == 40
@@ -171,7 +171,7 @@ def test_time_moves_the_schedule_and_ends_the_run(experiment, tmp_path, monkeypa
     assert rows[-2]["seconds"] < 60 <= rows[-1]["seconds"]
     rates = [row["lr"] for row in rows]
     assert rates[1] == max(rates) and rates[-1] < 0.01 * rates[1]
-    assert finished(run, 61.0) and progress(run, 30.0) == 0.5
+    assert is_finished(run, 61.0) and progress(run, 30.0) == 0.5
 
 
 def test_without_a_terminal_there_is_a_line_a_minute_and_one_at_the_end(line, tmp_path, monkeypatch, capsys):

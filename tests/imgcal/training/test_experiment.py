@@ -90,7 +90,7 @@ def test_a_run_that_gets_no_better_ends_with_the_best_weights(line, monkeypatch)
     run = engine.train(setup, told)
     errors = {row["step"]: row["validation_slope"] for row in told.rows if "validation_slope" in row}
     best = min(errors, key=errors.get)
-    assert run.step == best + 20 < 1000 and engine.finished(run, run.seconds)
+    assert run.step == best + 20 < 1000 and engine.is_finished(run, run.seconds)
     assert errors[run.step] > errors[best] == told.metrics["validation_slope"] and told.metrics["step"] == best
     assert abs(float(told.result["weight"]) - 3.0) == pytest.approx(errors[best], abs=1e-5)
     engine.train(setup, parts, should_stop=stopping_at(best + 7))

@@ -5,8 +5,8 @@ import pytest
 from imgcal.errors import InputError
 from imgcal.io import load_rig, save_rig
 from imgcal.synthesis import ImageOptions
-from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, RelativeDrift, drift_of
-from imgcal.training.experiment_file import changed, load_experiment, save_experiment
+from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, RelativeDrift, make_drift
+from imgcal.training.experiment_file import change_experiment, load_experiment, save_experiment
 from tests.imgcal.training.toy import EXPERIMENT
 
 
@@ -76,15 +76,15 @@ def test_blocks_may_say_nothing(experiment):
 
 def test_drift_as_older_files_have_it():
     values = {"kappa_intrinsics": 0.05, "kappa_extrinsics": 0.01, "rotation_deg": None, "position": None}
-    assert drift_of(values) == RelativeDrift(0.05, 0.01)
+    assert make_drift(values) == RelativeDrift(0.05, 0.01)
 
 
 def test_changes_are_applied_in_order(experiment):
-    made = changed(experiment(), "training.steps=7", "training.steps=8")
+    made = change_experiment(experiment(), "training.steps=7", "training.steps=8")
     assert made.training.steps == 8
     assert made.training.batch_size == 12
-    assert changed(made, "paper={table: '1', row: 3}").paper.row == 3
-    assert changed(made, "images.size=32").images.size == 32
+    assert change_experiment(made, "paper={table: '1', row: 3}").paper.row == 3
+    assert change_experiment(made, "images.size=32").images.size == 32
 
 
 @pytest.mark.parametrize(

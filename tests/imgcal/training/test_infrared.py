@@ -1,9 +1,9 @@
 import pytest
 import torch
 
-from imgcal.networks import Evidence, InfraredConfig, InfraredNetwork, normalized
+from imgcal.networks import Evidence, InfraredConfig, InfraredNetwork, normalize_crops
 from imgcal.synthesis import render_crops, sample_scenes
-from imgcal.training.infrared import evidence_at_best, queries_of, query_losses
+from imgcal.training.infrared import evidence_at_best, make_queries, query_losses
 
 
 def made_for(place: torch.Tensor, *, logit: float, present: float, spread: float) -> Evidence:
@@ -57,8 +57,8 @@ def test_every_weight_learns(encoder: str) -> None:
     draw = torch.Generator().manual_seed(0)
     network = InfraredNetwork(InfraredConfig(encoder=encoder, channels=4, window=12, blocks=1))
     truth = render_crops(sample_scenes(3, 1, 5, draw), draw)
-    queries = queries_of(truth)
-    evidence = network(normalized(truth.crops.flatten(0, 1)), queries)
+    queries = make_queries(truth)
+    evidence = network(normalize_crops(truth.crops.flatten(0, 1)), queries)
     query_losses(evidence, queries.asked, truth.place.flatten(0, 1), truth.seen.flatten(0, 1)).total.backward()
     silent = [name for name, p in network.named_parameters() if p.grad is None or not bool(p.grad.any())]
     assert not silent

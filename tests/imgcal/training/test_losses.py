@@ -27,7 +27,7 @@ from imgcal.training.losses import (
     principal_point_shift,
     reprojection_rmse,
 )
-from imgcal.types.packing import pack21
+from imgcal.types.parameter_vectors import pack21
 from imgcal.types.prediction import Prediction
 from imgcal.types.rig import PARAMETERS
 from tests.imgcal.lensed import KINDS, lensed

@@ -7,7 +7,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from imgcal.errors import InputError
 from imgcal.networks import Checkpoint, NetworkSpec, load_checkpoint
 from imgcal.training import data
-from imgcal.training.rigs import RigTask, experiment_of
+from imgcal.training.rigs import RigTask, checkpoint_experiment
 from imgcal.types import CameraRig
 from tests.imgcal.training.toy import ToyOfImages
 
@@ -68,10 +68,10 @@ def test_a_result_is_a_file_of_a_network(experiment, tmp_path):
     result.save(tmp_path / "model.safetensors")
     found = load_checkpoint(tmp_path / "model.safetensors")
     assert found.metrics == {"re_px": 1.5}
-    assert experiment_of(found.experiment) == made == experiment_of(made)
+    assert checkpoint_experiment(found.experiment) == made == checkpoint_experiment(made)
     # A model from before there were tasks says nothing of them.
     older = {name: value for name, value in found.experiment.model_dump(mode="json").items() if name != "task"}
-    assert experiment_of(NetworkSpec.model_validate(older)).task == "rig"
+    assert checkpoint_experiment(NetworkSpec.model_validate(older)).task == "rig"
 
 
 class NoWaiting(TorchDispatchMode):

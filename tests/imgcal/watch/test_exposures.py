@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.watch.exposures import MOST_BLOBS, CameraBlobs, Exposure, checked
+from imgcal.watch.exposures import MOST_BLOBS, CameraBlobs, Exposure, check_exposure
 
 
 @pytest.mark.parametrize(
@@ -36,7 +36,7 @@ def test_exposures_are_compared_with_the_rig(o10):
         Exposure("cam01", 1.7e9, np.zeros((height, width), np.uint16)),
         Exposure("cam01", 0.0, CameraBlobs.of([[0.0, 0.0], [width - 1, height - 1]])),
     ]
-    assert [checked(exposure, o10) for exposure in good] == good
+    assert [check_exposure(exposure, o10) for exposure in good] == good
     bad = [
         (Exposure("cam99", 0.0, good[0].content), "found camera 'cam99'"),
         (Exposure("cam01", float("inf"), good[0].content), "found the time inf"),
@@ -49,4 +49,4 @@ def test_exposures_are_compared_with_the_rig(o10):
     ]
     for exposure, message in bad:
         with pytest.raises(InputError, match=message):
-            checked(exposure, o10)
+            check_exposure(exposure, o10)

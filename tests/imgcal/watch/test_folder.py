@@ -13,7 +13,7 @@ from imgcal.io.frames import write_frame
 from imgcal.watch import folder as module
 from imgcal.watch.exposures import Exposure, Unreadable
 from imgcal.watch.folder import Folder
-from imgcal.watch.intake import Intake
+from imgcal.watch.source_reader import SourceReader
 
 RIG = load_rig("T4")
 HEIGHT, WIDTH = 1088, 2048
@@ -66,7 +66,7 @@ def test_what_was_there_before_is_a_recording_of_which_nothing_is_dropped(tmp_pa
         for camera in rig.camera_names:
             put(tmp_path, camera, name)
     found = []
-    with Intake(Folder(tmp_path, rig, until_idle=1.0), rig) as intake:
+    with SourceReader(Folder(tmp_path, rig, until_idle=1.0), rig) as intake:
         time.sleep(0.5)  # nobody takes anything
         while not intake.ended:
             snapshot = intake.next(0.2)
@@ -145,9 +145,9 @@ def test_snapshots_before_a_restart_are_not_read_again_and_what_is_saved_is_remo
     folder = Folder(tmp_path, rig, remove=True, after="9", until_idle=0.3)
     assert [e.snapshot for e in folder.items() if e is not None] == ["10", "11"]
     assert len(list(tmp_path.glob("frames/cam01/*"))) == 4  # 11 may still wait to be worked on
-    folder.saved("10")
+    folder.delete_read("10")
     assert sorted(path.name for path in tmp_path.glob("frames/cam01/*")) == ["11.png", "8.png", "9.png"]
-    folder.saved("11")
+    folder.delete_read("11")
     assert sorted(path.name for path in tmp_path.glob("frames/cam01/*")) == ["8.png", "9.png"]
 
 
@@ -160,11 +160,11 @@ def test_a_frame_that_cannot_be_deleted_keeps_no_other_and_is_tried_again(tmp_pa
     (cam01 / "1.png").rename(cam01 / "kept.png")
     (cam01 / "1.png" / "full").mkdir(parents=True)  # cannot be unlinked
     with pytest.raises(OSError, match=r"1\.png"):
-        folder.saved("2")
+        folder.delete_read("2")
     assert sorted(path.name for path in cam01.iterdir()) == ["1.png", "3.png", "kept.png"]
     shutil.rmtree(cam01 / "1.png")
     (cam01 / "kept.png").rename(cam01 / "1.png")
-    folder.saved("2")
+    folder.delete_read("2")
     assert [path.name for path in cam01.iterdir()] == ["3.png"]
 
 

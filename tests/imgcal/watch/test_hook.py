@@ -34,7 +34,7 @@ def test_the_event_is_standard_input_and_no_shell_sees_it(tmp_path, monkeypatch)
         "open(sys.argv[1], 'a').write(sys.stdin.read() + os.environ['IMGCAL_EVENT'] + os.environ['IMGCAL_CAMERA'])"
     )
     hook = Hook(script(tmp_path, code))
-    hook.tell(event(7, camera="cam02", message=EVIL))
+    hook.notify(event(7, camera="cam02", message=EVIL))
     hook.close()
     line, rest = (tmp_path / "out").read_text().split("\n")
     assert json.loads(line)["message"] == EVIL and rest == "movedcam02"
@@ -49,7 +49,7 @@ def test_one_that_hangs_is_killed_with_what_it_started_and_never_waited_for(tmp_
     )
     hook = Hook(script(tmp_path, code), timeout=4.0)
     started = time.monotonic()
-    hook.tell(event())
+    hook.notify(event())
     assert time.monotonic() - started < 3.0
     until(lambda: hook.failed == 1)
     (child,) = (tmp_path / "out").read_text().split()
@@ -70,7 +70,7 @@ def test_more_events_than_it_can_take_are_dropped_and_counted(tmp_path, monkeypa
     monkeypatch.setattr(module, "MOST_WAITING", 3)
     hook = Hook(script(tmp_path, "import sys, time; time.sleep(0.3); open(sys.argv[1], 'a').write(sys.stdin.read())"))
     for number in range(10):
-        hook.tell(event(number))
+        hook.notify(event(number))
     hook.close()
     names = [json.loads(line)["snapshot"] for line in (tmp_path / "out").read_text().splitlines()]
     assert names[-3:] == ["00007", "00008", "00009"] and len(names) + hook.dropped == 10
@@ -79,7 +79,7 @@ def test_more_events_than_it_can_take_are_dropped_and_counted(tmp_path, monkeypa
 
 def test_one_that_fails_is_counted(tmp_path):
     hook = Hook(script(tmp_path, "raise SystemExit(3)"))
-    hook.tell(event())
+    hook.notify(event())
     hook.close()
     assert hook.failed == 1 and hook.problem.endswith(" ended with exit code 3")
 
@@ -88,7 +88,7 @@ def test_what_is_left_at_the_end_is_killed_or_dropped_in_time(tmp_path):
     code = "import os, sys, time\nopen(sys.argv[1], 'a').write(f'{os.getpid()}\\n')\ntime.sleep(60)"
     hook = Hook(script(tmp_path, code), timeout=2.0)
     for number in range(5):
-        hook.tell(event(number))
+        hook.notify(event(number))
     until(lambda: (tmp_path / "out").is_file() and (tmp_path / "out").read_text().endswith("\n"))
     hook.close()
     runs = (tmp_path / "out").read_text().split()
@@ -104,8 +104,8 @@ def test_commands_that_are_none(command):
 
 def test_an_event_that_cannot_be_written_is_counted_and_the_next_one_is_told(tmp_path):
     hook = Hook(script(tmp_path, "import sys; open(sys.argv[1], 'a').write(sys.stdin.read())"))
-    hook.tell(replace(event(1), time="never"))
-    hook.tell(replace(event(2), size=float("inf")))
+    hook.notify(replace(event(1), time="never"))
+    hook.notify(replace(event(2), size=float("inf")))
     hook.close()
     assert hook.failed == 1 and json.loads((tmp_path / "out").read_text())["snapshot"] == "00002"
 
@@ -113,7 +113,7 @@ def test_an_event_that_cannot_be_written_is_counted_and_the_next_one_is_told(tmp
 def test_one_that_hangs_is_killed_where_there_are_no_process_groups(tmp_path, monkeypatch):
     monkeypatch.delattr(os, "killpg")
     hook = Hook(script(tmp_path, "import time; time.sleep(600)"), timeout=0.2)
-    hook.tell(event(7))
+    hook.notify(event(7))
     until(lambda: hook.failed == 1)
     assert "was killed after" in hook.problem
     hook.close()

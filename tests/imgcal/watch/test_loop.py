@@ -11,9 +11,9 @@ from imgcal.online import RigKeeper
 from imgcal.watch import loop as module
 from imgcal.watch.exposures import CameraBlobs, Exposure
 from imgcal.watch.hook import Hook
-from imgcal.watch.intake import Intake
 from imgcal.watch.loop import Progress, Watch
 from imgcal.watch.poses import Poses
+from imgcal.watch.source_reader import SourceReader
 from imgcal.watch.synchronization import TimedSnapshot
 from tests.imgcal.watch.states import OBJECT, RIG, KeeperOfStates, event
 
@@ -61,9 +61,9 @@ def test_events_go_to_all_who_want_to_know_and_rigs_are_kept(tmp_path):
     keeper, page, told = KeeperOfStates(), PageOfLists(), []
     keeper.events = {1: [event(1), event(1, "camera_lost")]}
     with Watch(keeper, tmp_path, page=page, told=told.append) as loop:
-        loop.tell(event(0, "restart"))
+        loop.publish_event(event(0, "restart"))
         for number in range(3):
-            loop.take(snapshot(1.7e9 + number))
+            loop.process(snapshot(1.7e9 + number))
     assert events_of(tmp_path) == ["restart", "moved", "camera_lost"] == [e.kind for e in told]
     assert [e.kind for e in page.told] == ["restart"]
     assert page.published == [(n, set(RIG.camera_names)) for n in range(3)]
@@ -83,7 +83,7 @@ def test_the_state_is_saved_once_a_second_with_how_far_the_source_is(tmp_path, m
                 time.sleep(0.01)
                 yield item
 
-    with Watch(keeper, tmp_path) as loop, Intake(Slow(*(k / 10 for k in range(10))), RIG) as intake:
+    with Watch(keeper, tmp_path) as loop, SourceReader(Slow(*(k / 10 for k in range(10))), RIG) as intake:
         loop.run(intake, threading.Event())
     assert 3 <= len(keeper.saves) <= 10 and keeper.saves[-1] == 10
     assert Progress.load(tmp_path) == Progress(0.9, logged=(tmp_path / "events.jsonl").stat().st_size)
@@ -93,12 +93,12 @@ def test_a_start_goes_on_after_the_last_snapshot_that_the_state_knows(tmp_path):
     keeper, saved = KeeperOfStates(), []
     with Watch(keeper, tmp_path, saved=saved.append) as loop:
         for number in range(2):
-            loop.take(snapshot(float(number), str(number)))
+            loop.process(snapshot(float(number), str(number)))
         loop.save()
     assert Progress.load(tmp_path) == Progress(1.0, "1", 0) == saved[-1]
     keeper.disk_full = True  # as where the process is killed before the state is written
     with Watch(keeper, tmp_path, saved=saved.append) as loop:
-        loop.take(snapshot(2.0, "2"))
+        loop.process(snapshot(2.0, "2"))
     assert Progress.load(tmp_path) == Progress(1.0, "1", 0) == saved[-1]
     assert json.loads((tmp_path / "state.json").read_text())["number"] == 2
 
@@ -112,7 +112,7 @@ def test_nothing_is_written_where_nothing_is_known(tmp_path):
 def test_input_that_cannot_be_used_does_not_end_it(tmp_path):
     told = []
     with Watch(KeeperOfStates(fails=[0, 2]), tmp_path, problem=told.append) as loop:
-        assert [loop.take(snapshot(float(k))) is None for k in range(4)] == [True, False, True, False]
+        assert [loop.process(snapshot(float(k))) is None for k in range(4)] == [True, False, True, False]
     assert loop.tally.unusable == 2 and loop.tally.learnt == 2 and told == ["frames of two rigs"]
 
 
@@ -121,7 +121,7 @@ def test_what_cannot_be_written_is_counted_said_once_and_written_later(tmp_path)
     (tmp_path / "state.json").mkdir()
     with Watch(KeeperOfStates(), tmp_path, problem=told.append) as loop:
         for number in range(3):
-            loop.take(snapshot(float(number)))
+            loop.process(snapshot(float(number)))
             loop.save()
             time.sleep(0.2)
         loop.save()
@@ -135,7 +135,7 @@ def test_people_pause_go_on_and_accept_the_rig(tmp_path):
     with Watch(keeper, tmp_path, page=page) as loop:
         for asked in ([], ["pause"], [], ["resume", "factory", "acknowledge"]):
             page.asked = list(asked)
-            with Intake(Snapshots(float(len(keeper.sources))), RIG) as intake:
+            with SourceReader(Snapshots(float(len(keeper.sources))), RIG) as intake:
                 loop.run(intake, threading.Event())
     assert len(keeper.sources) == 2 and loop.tally.paused == 2
     assert events_of(tmp_path) == ["factory"] == [e.kind for e in page.told]
@@ -145,14 +145,17 @@ def test_no_rig_is_accepted_before_there_is_a_snapshot(tmp_path):
     page, told = PageOfLists(), []
     page.asked = ["factory"]
     with RigKeeper(RIG, OBJECT) as keeper, Watch(keeper, tmp_path, page=page, problem=told.append) as loop:
-        loop._obey()
+        loop._apply_commands()
     assert events_of(tmp_path) == [] and len(told) == 1 and "no snapshot has come yet" in told[0]
 
 
 def test_a_hook_that_fails_is_told_once(tmp_path):
     keeper, told, hook = KeeperOfStates(), [], Hook("false")
     keeper.events = {0: [event(0)], 1: [event(1)], 2: [event(2)]}
-    with Watch(keeper, tmp_path, hook, problem=told.append) as loop, Intake(Snapshots(0.0, 1.0, 2.0), RIG) as intake:
+    with (
+        Watch(keeper, tmp_path, hook, problem=told.append) as loop,
+        SourceReader(Snapshots(0.0, 1.0, 2.0), RIG) as intake,
+    ):
         loop.run(intake, threading.Event())
     assert hook.failed == 3 and told == ["--hook: false ended with exit code 1"]
 
@@ -168,7 +171,7 @@ def test_it_stops_when_told(tmp_path):
                 yield from snapshot(float(k)).exposures.values()
 
     keeper = KeeperOfStates()
-    with Watch(keeper, tmp_path) as loop, Intake(Endless(), RIG) as intake:
+    with Watch(keeper, tmp_path) as loop, SourceReader(Endless(), RIG) as intake:
         loop.run(intake, stopped, lambda: stopped.set() if len(keeper.sources) == 5 else None)
     assert len(keeper.sources) == 5 == keeper.saves[-1]
 
@@ -176,7 +179,7 @@ def test_it_stops_when_told(tmp_path):
 def test_time_stamps_of_cameras_are_compared_with_their_snapshots(tmp_path):
     with Watch(KeeperOfStates(), tmp_path) as loop:
         for number in range(300):
-            loop.take(snapshot(float(number), lag=0.004))
+            loop.process(snapshot(float(number), lag=0.004))
     assert loop.tally.stamps == pytest.approx({"cam01": 0, "cam02": 0.004, "cam03": 0, "cam04": 0})
 
 
@@ -210,7 +213,7 @@ def test_poses_go_out_and_an_output_that_fails_is_told_once(tmp_path):
         outputs = broken, fine
         with Watch(KeeperOfStates(), tmp_path, problem=told.append, poses=outputs) as loop:
             for number in range(3):
-                loop.take(snapshot(number / 10))
+                loop.process(snapshot(number / 10))
             while broken.problem is None:
                 time.sleep(0.01)
     assert good.records == [(number, "ok") for number in range(3)]

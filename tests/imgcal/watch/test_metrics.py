@@ -6,9 +6,9 @@ import pytest
 from imgcal.errors import InputError
 from imgcal.watch.exposures import CameraBlobs, Exposure, Unreadable
 from imgcal.watch.hook import Hook
-from imgcal.watch.intake import Intake
 from imgcal.watch.loop import Watch
 from imgcal.watch.metrics import BUCKETS, Metrics, Tally
+from imgcal.watch.source_reader import SourceReader
 from tests.imgcal.watch.states import RIG, KeeperOfStates, event
 
 parser = pytest.importorskip("prometheus_client.parser")
@@ -37,12 +37,12 @@ def scraped(metrics):
 def test_what_is_counted_is_served(tmp_path):
     keeper, hook = KeeperOfStates(), Hook("true")
     keeper.events = {1: [event(1), event(1, "camera_lost")]}
-    intake = Intake(Given(), RIG)
+    intake = SourceReader(Given(), RIG)
     with Watch(keeper, tmp_path, hook) as loop, Metrics(loop.tally, intake, hook, ("127.0.0.1", 0)) as metrics:
         assert scraped(metrics)["imgcal_snapshots_total",] == 0
         with intake:
             while (snapshot := intake.next(1.0)) is not None:
-                loop.take(snapshot)
+                loop.process(snapshot)
         found = scraped(metrics)
     assert found["imgcal_snapshots_total",] == 3
     assert found["imgcal_exposures_missing_total", "cam04"] == 1
@@ -56,7 +56,7 @@ def test_what_is_counted_is_served(tmp_path):
 
 
 def test_only_this_machine_may_read_it_and_the_address_may_be_taken(tmp_path):
-    intake = Intake(Given(), RIG)
+    intake = SourceReader(Given(), RIG)
     with Metrics(Tally(), intake, None, ("127.0.0.1", 0)) as metrics:
         port = metrics.port
         with pytest.raises(InputError, match=rf"--metrics: 127\.0\.0\.1:{port} cannot"):
@@ -67,7 +67,7 @@ def test_only_this_machine_may_read_it_and_the_address_may_be_taken(tmp_path):
 
 def test_who_asks_for_another_name_is_not_served():
     """A page of another site may let its name point to this machine."""
-    with Metrics(Tally(), Intake(Given(), RIG), None, ("127.0.0.1", 0)) as metrics:
+    with Metrics(Tally(), SourceReader(Given(), RIG), None, ("127.0.0.1", 0)) as metrics:
         address = f"http://127.0.0.1:{metrics.port}/metrics"
         for host in ("evil.example", "evil.example:9100", "127.0.0.1.evil.example", ""):
             with pytest.raises(urllib.error.HTTPError, match="421") as caught:

@@ -11,9 +11,9 @@ from imgcal.formats import parse_xml
 from imgcal.io import load_rig
 from imgcal.online import RigKeeper
 from imgcal.watch.exposures import Exposure, Unreadable
-from imgcal.watch.intake import Intake
-from imgcal.watch.qualisys import COMMANDS, Qualisys, cameras_of
+from imgcal.watch.qualisys import COMMANDS, Qualisys, find_cameras
 from imgcal.watch.recordings import BlobTable
+from imgcal.watch.source_reader import SourceReader
 from tests.imgcal.streams import Stream
 from tests.imgcal.watch.qtm import Qtm, frame, general, packet
 
@@ -132,7 +132,7 @@ def test_the_same_events_as_from_a_file():
 
 def events(given, stream):
     lines = []
-    with RigKeeper(stream.rig, stream.obj) as keeper, Intake(given, stream.rig, keep_all=True) as intake:
+    with RigKeeper(stream.rig, stream.obj) as keeper, SourceReader(given, stream.rig, keep_all=True) as intake:
         for _ in range(60):
             snapshot = intake.next(60.0)
             state = keeper.update(snapshot.source(stream.rig.camera_names), snapshot.time)
@@ -143,14 +143,14 @@ def events(given, stream):
 def test_cameras_are_those_of_the_rig():
     rig = replace(RIG, camera_names=tuple(f"{number}" for number in range(10)))
     mixed = parse_xml(general([*range(9, -1, -1), "extra"], [*SIZES[::-1], (100, 100)]), "")
-    assert [one and one.name for one in cameras_of(mixed, rig)] == [*map(str, range(9, -1, -1)), None]
+    assert [one and one.name for one in find_cameras(mixed, rig)] == [*map(str, range(9, -1, -1)), None]
     with Qtm(general([*range(10), "extra"], [*SIZES, (100, 100)]), frame(0, [*MARKERS, [[5, 5]]])) as server:
         found = read(source(server, rig), lambda items: len(items) == 20)
     assert {item.camera for item in exposures(found)} == set(rig.camera_names)
     width, height = SIZES[0]
     larger = [(width + 200, height + 100)] * 10
     part = parse_xml(general(range(10), larger, fov=(50, 20, 49 + width, 19 + height)), "")
-    assert {(one.unit, one.corner) for one in cameras_of(part, RIG)} == {(64.0, (50.0, 20.0))}
+    assert {(one.unit, one.corner) for one in find_cameras(part, RIG)} == {(64.0, (50.0, 20.0))}
     for text, said in (
         (general(range(4), SIZES[:4]), "found 4 cameras .* expected 10"),
         (general(range(10), larger), f"found {width + 200}x.*expected {width}x{height}"),
@@ -158,7 +158,7 @@ def test_cameras_are_those_of_the_rig():
         (PARAMETERS.replace("Marker_Res", "Video_Res"), "no Marker_Res/Width"),
     ):
         with pytest.raises(InputError, match=said):
-            cameras_of(parse_xml(text, "parameters"), RIG)
+            find_cameras(parse_xml(text, "parameters"), RIG)
 
 
 @pytest.mark.parametrize(

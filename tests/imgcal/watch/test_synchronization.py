@@ -68,8 +68,8 @@ def test_a_camera_that_always_comes_a_little_later_is_not_out_for_ever():
 def test_the_clock_of_this_machine_ends_the_waiting_when_nothing_more_comes():
     sync = Synchronizer(ABC, Timing(patience=0.1))
     sync.add(at("a", 5.0), now=100.0)
-    assert sync.waited(100.05) == ()
-    assert cameras(sync.waited(100.11)) == ["a"]
+    assert sync.release_due(100.05) == ()
+    assert cameras(sync.release_due(100.11)) == ["a"]
 
 
 def test_late_duplicate_and_out_of_order_exposures_are_counted():
@@ -147,7 +147,7 @@ def test_named_snapshots_go_by_their_names():
     assert sync.add(at("a", 5.0, "1"), now=1.0) == sync.add(at("a", 5.0, "2"), now=1.0) == ()
     done = sync.add(at("b", 9.0, "1"), now=1.01)
     assert [(s.name, s.time) for s in done] == [("1", 9.0)]
-    assert [s.name for s in sync.waited(1.2)] == ["2"]
+    assert [s.name for s in sync.release_due(1.2)] == ["2"]
     assert sync.add(at("b", 5.0, "2"), now=1.2) == () and sync.counts["late"]["b"] == 1
 
 

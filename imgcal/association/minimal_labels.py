@@ -1,0 +1,146 @@
+"""One camera, hardly more blobs than a pose needs: no label is told by the others, but all labellings are compared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import permutations
+from math import perm
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+from scipy.stats import chi2
+
+from imgcal.association.hypotheses import Poses
+from imgcal.association.result import Identity, IdentityOptions, Status
+from imgcal.association.verification import Fits, Scene, evidence, fit, make_problem, rig_and_pose, start
+from imgcal.estimation import State, initial_pose, levenberg_marquardt_cpu
+from imgcal.types import Observations
+
+MOST_LABELLINGS = 400
+FITS = 0.999  # quantile of chi-squared that the right labelling stays below
+LEAST_MARGIN = 7.0
+"""Log odds against all other labellings together: all of them are known, and no hypotheses were chosen."""
+LEAST_CHANCE = 3.0
+"""Log odds against blobs that fit by chance, beyond those of trying all labellings. A pose and a rig as wide as its
+prior fit four blobs of something else about once in 200 images."""
+MOST_RIVALS, FAR = 64, 60.0
+"""Labellings whose evidence is asked: so many at most, with costs larger than the best one's by so much at most."""
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """All labellings of one camera's blobs, each fitted as well as it goes."""
+
+    fits: Fits
+    cost: NDArray[np.float64]  # (K,) half of chi-squared
+    off: NDArray[np.float64]  # (K,) px, RMS distance of blobs from their fiducials
+
+
+def has_minimal_blobs(scene: Scene) -> bool:
+    """Tell whether one camera alone has blobs, so few that all labellings can be compared."""
+    seen, fiducials = scene.blobs.count, scene.obj.num_fiducials
+    blobs = int(seen.max(initial=0))
+    alone = blobs >= 4 and (seen >= 4).sum() == 1
+    return bool(alone) and perm(max(blobs, fiducials), min(blobs, fiducials)) <= MOST_LABELLINGS
+
+
+def compare_labellings(scene: Scene, options: IdentityOptions) -> Identity:
+    """Accept the labelling that fits if all others are improbable, and it is not by chance; see `has_minimal_blobs`.
+
+    Labellings are weighed by their evidence: one that fits only for a pose or rig that must be exactly right, edge-on
+    or with a camera at the end of its prior, is less probable than its residuals look.
+    """
+    found = _compare(scene)
+    near = np.argsort(found.cost)[:MOST_RIVALS]
+    near = near[found.cost[near] <= found.cost[near[0]] + FAR]
+    fits = fit(scene, found.fits.select(near))
+    weight = np.nan_to_num(evidence(scene, fits), nan=-np.inf)
+    best, order = int(weight.argmax()), len(scene.obj.symmetries)
+    labels, cost, off = fits.labels, found.cost[near], found.off[near]
+    same = np.zeros(len(labels), bool)
+    for motion in scene.obj.symmetries:
+        same |= (labels[:, :, motion.permutation] == labels[best]).all((1, 2))
+    rivals = np.where(same, -np.inf, weight)
+    rival = int(rivals.argmax())
+    margin = float(weight[best] - logsumexp(rivals)) if np.isfinite(weight[best]) else 0.0
+    rig, pose = rig_and_pose(scene, fits, best)
+    labelled = int((labels[best] >= 0).sum())
+    refusal = ""
+    if 2 * cost[best] > chi2.ppf(FITS, 2 * labelled - 6):
+        refusal = f"no labelling of the {labelled} blobs fits: the best is {off[best]:.2g} px off"
+    elif margin < min(LEAST_MARGIN, options.least_margin):
+        refusal = (
+            f"two labellings fit within the rig's prior, chi-squared {2 * cost[best]:.1f} and {2 * cost[rival]:.1f}: "
+            f"{labelled} blobs are too few"
+        )
+    elif weight[best] < LEAST_CHANCE + np.log(len(found.cost)):
+        refusal = f"{labelled} blobs are so few that any would fit some labelling"
+    if refusal:
+        none = np.full(scene.blobs.rows, -1)
+        advice = "show more fiducials, to more cameras, or state a narrower prior in the rig if it is that well known"
+        return Identity(none, pose, rig, "refused", 0, margin, f"{refusal}; {advice}")
+    status: Status = "ambiguous" if order > 1 else "unique"
+    reason = f"fits to {off[best]:.2g} px, log odds against the next best labelling {margin:.0f}"
+    rows = scene.blobs.to_rows(labels[best])
+    return Identity(rows, pose, rig, status, order, margin, reason, 1.0, evidence=float(weight[best]))
+
+
+def _compare(scene: Scene) -> _Compared:
+    """Fit every labelling from the best pose for it and, of a planar object, from its mirror image."""
+    camera, fiducials = int(scene.blobs.count.argmax()), scene.obj.num_fiducials
+    blobs = int(scene.blobs.count[camera])
+    chosen = np.array(list(permutations(range(max(blobs, fiducials)), min(blobs, fiducials))))  # (K, n)
+    labels = np.full((len(chosen), scene.rig.num_cameras, fiducials), -1, dtype=np.int64)
+    if blobs >= fiducials:
+        labels[:, camera] = chosen
+    else:
+        labels[np.arange(len(chosen))[:, None], camera, chosen] = np.arange(blobs)
+    seen = torch.from_numpy(labels >= 0)[:, None]
+    uv = torch.from_numpy(scene.blobs.uv[np.arange(scene.rig.num_cameras)[:, None], np.maximum(labels, 0)])[:, None]
+    sigma = torch.ones(seen.shape, dtype=uv.dtype)
+    found = initial_pose(Observations(uv, sigma, seen), scene.rig, scene.obj)[:, 0]
+    poses = Poses(found.rotation.numpy(), found.translation.numpy())
+    fitted = _minimize(scene, start(scene, poses, labels))
+    if scene.obj.planar:
+        fitted = _better(fitted, _minimize(scene, start(scene, _mirror(scene, poses, camera), labels)))
+    return fitted
+
+
+def _better(first: _Compared, second: _Compared) -> _Compared:
+    """The better one of two fits of each labelling."""
+    other = second.cost < first.cost
+    a, b, take = first.fits.state, second.fits.state, torch.from_numpy(other)
+    state = State(
+        torch.where(take[:, None, None], b.offset, a.offset),
+        torch.where(take[:, None, None, None], b.rotation, a.rotation),
+        torch.where(take[:, None, None], b.centre, a.centre),
+    )
+    cost, off = np.where(other, second.cost, first.cost), np.where(other, second.off, first.off)
+    return _Compared(replace(first.fits, state=state, cost=cost), cost, off)
+
+
+def _minimize(scene: Scene, fits: Fits) -> _Compared:
+    """Fit each labelling with squared errors: what is off must count in full."""
+    problem = make_problem(scene, fits)
+    solution = levenberg_marquardt_cpu.minimize(problem, fits.state, "squared", 1.0, 30, 1e-4)
+    cost = solution.equations.cost.numpy()
+    seen = (fits.labels >= 0)[:, None]
+    squares = np.where(seen[:, :, :, None], solution.equations.residual.numpy() ** 2, 0.0).sum((1, 2, 3, 4))
+    off = np.sqrt(squares / seen.sum((1, 2, 3)))
+    cost = np.where(np.isfinite(cost), cost, np.inf)
+    return _Compared(replace(fits, state=solution.state, cost=cost), cost, off)
+
+
+def _mirror(scene: Scene, poses: Poses, camera: int) -> Poses:
+    """Poses (K,) of a planar object that look almost alike from a camera: turned about the view, depths reversed."""
+    points = scene.obj.points.double().numpy()
+    centroid = points.mean(0)
+    normal = np.linalg.svd(points - centroid)[2][2]
+    centre = poses.rotation @ centroid + poses.translation
+    view = centre - scene.rig.positions[camera].numpy()
+    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    flip = np.eye(3) - 2 * view[:, :, None] * view[:, None, :]
+    rotation = flip @ poses.rotation @ (np.eye(3) - 2 * np.outer(normal, normal))
+    return Poses(rotation, centre - rotation @ centroid)

@@ -1,0 +1,301 @@
+"""From a rough labelling to a certain one: fit rig and pose, predict with uncertainty, label again, finer each time.
+
+Only after such a fit can a label be judged: the factory rig alone is off by tens of pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.association.ambiguities import lattice_shifts
+from imgcal.association.assignment import assign
+from imgcal.association.blobs import PaddedBlobs
+from imgcal.association.hypotheses import Poses
+from imgcal.association.innovation import THRESHOLD, Innovations, find_contested, innovations, one_or_some
+from imgcal.estimation import Problem, Solution, State, levenberg_marquardt_cpu, pose_at
+from imgcal.geometry import RigidTransform
+from imgcal.types import CalibrationObject, CameraRig
+
+STAGES = (3.0, 0.7)
+"""Standard deviations (px) that the first fits allow, beyond the blobs' own; the last ones ask the residuals."""
+GATE = 25.0
+"""Squared normalized innovation of a label; two degrees of freedom exceed it once in 270,000."""
+LEAST_SIZE_SPREAD = 0.05
+"""Relative standard deviation of a blob's radius within its camera, at least: depth, tilt and exposure vary."""
+MOST_SIZE_MISFIT = 36.0
+"""Of one blob: a single odd radius decides no more than this."""
+KNOWN_PLACE = 5.0
+"""Standard deviation (px) of a prediction from which on a single marker of a stick needs no other beside it."""
+UNDECIDED = 2 * np.log(1e3)
+"""Two pairings whose squared normalized innovations differ by less cannot be told apart."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is given: the blobs, the object, the factory rig and how far it may have drifted."""
+
+    blobs: PaddedBlobs
+    obj: CalibrationObject
+    rig: CameraRig
+    std: Tensor  # (C, K)
+
+    @cached_property
+    def problem(self) -> Problem:
+        """Of one labelling, without any label."""
+        points, radius = self.obj.points.double(), self.obj.radius
+        centroid, cameras = points.mean(0), self.rig.num_cameras
+        return Problem(
+            uv=points.new_zeros(1, 1, cameras, 2, len(points)),
+            root_weight=points.new_zeros(1, 1, cameras, len(points)),
+            points=points - centroid,
+            centroid=centroid,
+            radius_squared=None if radius is None else radius.double().square(),
+            factory=self.rig.expand(1),
+            prior_std=self.std.expand(1, -1, -1),
+        )
+
+    def select_camera(self, camera: int) -> Scene:
+        """Keep one camera."""
+        return Scene(self.blobs.select_camera(camera), self.obj, self.rig.select([camera]), self.std[[camera]])
+
+
+@dataclass(frozen=True)
+class Fits:
+    """K labellings, each with the rig and pose that fit it best."""
+
+    labels: NDArray[np.int64]  # (K, C, N) blob of each fiducial, -1 = none
+    state: State
+    sigma: NDArray[np.float64]  # (K,) px, error of a blob centre beyond its own
+    cost: NDArray[np.float64]  # (K,) half of chi2, data and prior
+    innovations: Innovations | None = None  # of these labels at this state
+
+    def select(self, rows: NDArray[np.int64]) -> Fits:
+        """Keep the given labellings; a single one is not copied."""
+        chosen = one_or_some(rows)
+        state = State(self.state.offset[chosen], self.state.rotation[chosen], self.state.centre[chosen])
+        found = None if self.innovations is None else self.innovations.select(rows)
+        return Fits(self.labels[chosen], state, self.sigma[chosen], self.cost[chosen], found)
+
+
+def join(parts: Sequence[Fits]) -> Fits:
+    """Put fitted labellings of one snapshot together."""
+    if len(parts) == 1:
+        return parts[0]
+    states, found = [part.state for part in parts], [_fits(part) for part in parts]
+    columns = ("offset", "rotation", "centre")
+    state = State(*(torch.cat([getattr(state, name) for state in states]) for name in columns))
+    innovations = Innovations(
+        *(np.concatenate([getattr(one, field.name) for one in found]) for field in fields(Innovations))
+    )
+    labels, sigma, cost = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("labels", "sigma", "cost")
+    )
+    return Fits(labels, state, sigma, cost, innovations)
+
+
+def start(scene: Scene, poses: Poses, labels: NDArray[np.int64]) -> Fits:
+    """Put the factory rig at poses (K,) with rough labels (K, C, N)."""
+    u, _, vh = np.linalg.svd(poses.rotation)
+    rotation = torch.from_numpy(u @ vh)
+    centre = torch.from_numpy(np.ascontiguousarray(poses.translation)) + rotation @ scene.obj.points.mean(0).to(
+        rotation
+    )
+    offset = rotation.new_zeros(len(poses), *scene.std.shape)
+    return Fits(labels, State(offset, rotation[:, None], centre[:, None]), np.zeros(len(poses)), np.zeros(len(poses)))
+
+
+def refine(scene: Scene, fits: Fits, stages: tuple[float, ...] = STAGES) -> Fits:
+    """Fit and label again through all stages; the last labels are fitted too."""
+    for sigma in stages:
+        fits = fit(scene, replace(fits, sigma=np.full(len(fits.labels), sigma)))
+        fits = replace(fits, sigma=_residual_sigma(scene, fits), labels=_assign(fits))
+    return settle_labels(scene, fit(scene, fits), rounds=1)
+
+
+def settle_labels(scene: Scene, fits: Fits, rounds: int = 4) -> Fits:
+    """Label fitted labellings again, and fit, until the labels stay or for so many rounds."""
+    for _ in range(rounds):
+        labels = _assign(fits)
+        if np.array_equal(labels, fits.labels):
+            break
+        fits = fit(scene, replace(fits, sigma=_residual_sigma(scene, fits), labels=labels))
+    return fits
+
+
+def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
+    """Drop labels that are not certain: neither a false blob nor another fiducial may explain the blob nearly as well.
+
+    Args:
+        scene: what is given.
+        fits: refined labellings.
+        odds: odds of a label against a false blob, to be exceeded.
+        least_odds: the same where false blobs are so dense that hardly any label reaches `odds`.
+    """
+    # How dense false blobs are is asked once: a dropped label must not count as a false blob against the others.
+    surroundings = _detection_odds(scene, fits) - np.log(_clutter(scene, fits))
+    log_odds = _log_density(_fits(fits)) + surroundings
+    usual = np.median(log_odds[np.isfinite(log_odds)]) if np.isfinite(log_odds).any() else 0.0
+    demanded = np.clip(usual - np.log(100), np.log(least_odds), np.log(odds))
+    # Two or three labels of one camera can support each other in the wrong place: most of what it sees must fit.
+    # In a lattice, half of them can, a step away.
+    most = 0.7 if lattice_shifts(scene.obj) else 0.5
+    whole, stick = np.minimum(scene.blobs.count, scene.obj.num_fiducials), scene.obj.pose_rank == 5
+    enough = np.maximum(2 if stick else 3, most * whole)
+    for _ in range(4):
+        found = _fits(fits)
+        log_odds = _log_density(found) + surroundings
+        good = (found.own < GATE) & (log_odds > demanded) & ~find_contested(fits.labels, found, UNDECIDED)
+        # What a stick shows of itself is little; where the rig knows the place without it, one label is enough.
+        known = stick & (found.log_det < 2 * np.log(KNOWN_PLACE**2))
+        good &= (good.sum(-1) >= enough)[..., None] | known
+        if np.array_equal(good, fits.labels >= 0):
+            break
+        fits = fit(scene, replace(fits, labels=np.where(good, fits.labels, -1)))
+    return fits
+
+
+def evidence(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Log of the odds of each labelling against "all blobs are clutter" (Laplace's approximation): (K,)."""
+    labelled = fits.labels >= 0
+    noise = _blob_noise(scene, fits) + fits.sigma[:, None, None] ** 2
+    found = _fits(fits)
+    gain = -np.log(2 * np.pi * noise) - np.log(_clutter(scene, fits)) + _detection_odds(scene, fits)
+    sizes = _size_misfit(scene, fits)
+    return np.where(labelled, gain, 0).sum((1, 2)) - fits.cost - 0.5 * (found.complexity + sizes)
+
+
+def predictions(fits: Fits) -> NDArray[np.float64]:
+    """Pixels of all fiducials under the first labelling: (C, N, 2)."""
+    return _fits(fits).uv[0]
+
+
+def rig_and_pose(scene: Scene, fits: Fits, row: int) -> tuple[CameraRig, RigidTransform]:
+    """Give the rig and rig_from_object of one labelling, without batch axes."""
+    return levenberg_marquardt_cpu.rig_at(scene.problem, fits.state.offset[row : row + 1])[0], select_pose(
+        scene, fits, row
+    )
+
+
+def select_pose(scene: Scene, fits: Fits, row: int) -> RigidTransform:
+    """Give rig_from_object of one labelling, without batch axes."""
+    return pose_at(scene.problem, fits.state)[row, 0]
+
+
+def _fits(fits: Fits) -> Innovations:
+    if fits.innovations is None:
+        raise RuntimeError("labellings were not fitted")
+    return fits.innovations
+
+
+def _assign(fits: Fits) -> NDArray[np.int64]:
+    return assign(_fits(fits).squared, GATE)
+
+
+def _blob_noise(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Variance of each label's blob by its own account: (K, C, N) px^2."""
+    return scene.blobs.sigma[np.arange(fits.labels.shape[1])[:, None], np.maximum(fits.labels, 0)] ** 2
+
+
+def make_problem(scene: Scene, fits: Fits) -> Problem:
+    """Put labellings into the form that estimation knows."""
+    count, cameras, _ = fits.labels.shape
+    seen = fits.labels >= 0
+    uv = np.where(seen[..., None], scene.blobs.uv[np.arange(cameras)[:, None], np.maximum(fits.labels, 0)], 0.0)
+    sigma = np.sqrt(_blob_noise(scene, fits) + fits.sigma[:, None, None] ** 2)
+    problem = replace(
+        scene.problem,
+        uv=torch.from_numpy(np.ascontiguousarray(uv.swapaxes(-1, -2)))[:, None],
+        root_weight=torch.from_numpy(seen / sigma)[:, None],
+    )
+    if count == 1:
+        return problem
+    return replace(problem, factory=scene.rig.expand(count), prior_std=scene.std.expand(count, -1, -1))
+
+
+def fit(scene: Scene, fits: Fits) -> Fits:
+    """Fit labellings as they are."""
+    # One after the other: starting threads for a few small fits takes longer than the fits on a busy machine.
+    problem = make_problem(scene, fits)
+    if len(fits.labels) == 1:
+        solution = _minimize(problem, fits.state)
+    else:
+        bare = replace(fits, innovations=None)
+        each = (bare.select(np.array([k])) for k in range(len(fits.labels)))
+        solution = _stack_solutions([_minimize(make_problem(scene, one), one.state) for one in each])
+    found = innovations(scene.blobs, fits.labels, fits.sigma, problem, solution)
+    return replace(fits, state=solution.state, cost=solution.equations.cost.numpy(), innovations=found)
+
+
+def _minimize(problem: Problem, state: State) -> Solution:
+    return levenberg_marquardt_cpu.minimize(problem, state, "cauchy", THRESHOLD, 8, 1e-3)
+
+
+def _stack_solutions(solutions: Sequence[Solution]) -> Solution:
+    """Solutions of several labellings as one, with a batch axis."""
+
+    def cat(parts: Sequence[Any]) -> Any:
+        """Put records of tensors together, field by field."""
+        names = [field.name for field in fields(parts[0])]
+        columns = {name: [getattr(part, name) for part in parts] for name in names}
+        return type(parts[0])(**{k: None if v[0] is None else torch.cat(v) for k, v in columns.items()})
+
+    converged = torch.cat([solution.converged for solution in solutions])
+    state, equations = (cat([getattr(solution, name) for solution in solutions]) for name in ("state", "equations"))
+    return Solution(state, equations, converged, max(solution.iterations for solution in solutions))
+
+
+def _residual_sigma(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Error of blob centres beyond their own, as far as the residuals show it: (K,) px."""
+    found = _fits(fits)
+    inlier = (fits.labels >= 0) & (found.own < GATE)
+    freedom = np.where(inlier, found.freedom, 0).sum((1, 2))
+    variance = np.where(inlier, found.residual, 0).sum((1, 2)) / np.maximum(freedom, 1e-3)
+    own = np.where(inlier, _blob_noise(scene, fits), 0).sum((1, 2)) / np.maximum(inlier.sum((1, 2)), 1)
+    return np.minimum(np.sqrt(np.maximum(variance - own, 0)), fits.sigma)
+
+
+def _size_misfit(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Chi2 of the blobs' radii where fiducials differ in theirs: (K,). One unknown factor a camera takes the rest."""
+    radius = scene.obj.radius
+    if radius is None or not bool((radius > 1.05 * radius.min()).any()):
+        return np.zeros(len(fits.labels))
+    seen = scene.blobs.radius[np.arange(fits.labels.shape[1])[:, None], np.maximum(fits.labels, 0)]
+    with np.errstate(all="ignore"):
+        ratio = np.log(np.where(fits.labels >= 0, seen, np.nan) / radius.numpy())
+        ratio = np.where(np.isfinite(ratio).any(-1, keepdims=True), ratio, 0.0)
+        misfit = np.abs(ratio - np.nanmedian(ratio, axis=-1, keepdims=True))
+        usual = np.maximum(1.5 * np.nanmedian(misfit, axis=-1, keepdims=True), LEAST_SIZE_SPREAD)
+    return np.nansum(np.minimum((misfit / usual) ** 2, MOST_SIZE_MISFIT), axis=(1, 2))
+
+
+def _clutter(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """False blobs per square pixel, near the object's image or overall, whichever is more: (K, 1, 1)."""
+    uv = _fits(fits).uv
+    low, high = uv.min(2), uv.max(2)
+    middle, half = (low + high) / 2, 0.75 * (high - low) + 10
+    inside = (np.abs(scene.blobs.uv[None] - middle[:, :, None]) < half[:, :, None]).all(-1).sum((1, 2))
+    labelled = (fits.labels >= 0).sum((1, 2))
+    local = (np.maximum(inside - labelled, 0) + 1) / (4 * half.prod(-1)).sum(1)
+    overall = (scene.blobs.count.sum() - labelled + 1) / scene.rig.image_size.prod(1).sum().item()
+    return np.maximum(local, overall)[:, None, None]
+
+
+def _detection_odds(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Log odds that a fiducial in view gives a blob: (K, 1, 1)."""
+    uv = _fits(fits).uv
+    in_view = ((uv > 0) & (uv < scene.rig.image_size.numpy()[:, None])).all(-1).sum((1, 2))
+    share = np.clip(((fits.labels >= 0).sum((1, 2)) + 1) / (in_view + 2), 0.05, 0.95)
+    return np.log(share / (1 - share))[:, None, None]
+
+
+def _log_density(found: Innovations) -> NDArray[np.float64]:
+    """Log density (per px^2) of each label's blob where it is (K, C, N); -inf = no label."""
+    return -np.log(2 * np.pi) - 0.5 * found.log_det - 0.5 * found.own

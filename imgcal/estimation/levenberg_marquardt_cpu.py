@@ -1,0 +1,400 @@
+"""The solver's fast path on CPUs: `levenberg_marquardt.minimize` compiled to one loop a rig, without temporaries.
+
+`linearization.py`, `schur.py` and `levenberg_marquardt.py` say the same in tensors, run on any device, and this is
+tested against them. Names, units and layouts are theirs. Rigs of a batch run in parallel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+import torch
+from numba import prange
+from torch import Tensor
+
+from imgcal.estimation.levenberg_marquardt import (
+    FIRST_GROWTH,
+    GREATEST_RELAX,
+    LEAST_DAMPING,
+    MOST_DAMPING,
+    RELAX,
+    Solution,
+    pixel_rounding,
+)
+from imgcal.estimation.linearization import NormalEquations, ObjectEquations, Problem, State
+from imgcal.estimation.linearization_cpu import (
+    given_values,
+    linearize_all,
+    linearize_rig,
+    move,
+    select_blocks,
+    select_state,
+    turn_all,
+)
+from imgcal.geometry import RigidTransform, kernels, lens_codes
+from imgcal.types import CameraRig
+from renderers.compiling import njit
+
+LOSS_CODES = {"squared": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
+
+
+def minimize(
+    problem: Problem, start: State, loss: str, threshold: float, max_iterations: int, tolerance: float
+) -> Solution:
+    """Do the work of `levenberg_marquardt.minimize` for tensors on the CPU.
+
+    Args:
+        problem: what is given, batch axis B; one floating-point type throughout.
+        start: first guess.
+        loss: a key of `LOSS_CODES`.
+        threshold: the loss's threshold in standard deviations.
+        max_iterations: linearizations at most, for each rig.
+        tolerance: see `levenberg_marquardt.minimize`.
+    """
+    count = len(problem.uv)
+    own_std, state = _object_spread(problem, start, rows=max(count, 2))
+    blocks = _Blocks.of(problem, rows=max(count, 2))
+    converged = np.zeros(count, dtype=np.bool_)
+    iterations = np.zeros(count, dtype=np.int64)
+    shared, given = shared_arrays(problem), _arrays((*_problem_arrays(problem), own_std))
+    compiled = (_arrays(_parts(state)), _arrays(blocks.parts), *_arrays((blocks.cost,)), converged, iterations)
+    limits = (blocks.cameras_first, LOSS_CODES[loss], threshold, max_iterations)
+    tolerances = (tolerance + pixel_rounding(problem)).numpy()
+    if count == 1:
+        one = (*shared, *(array[0] for array in given))
+        best = _minimize_rig(one, *compiled, limits, tolerances[0])  # type: ignore[call-arg]
+        state, blocks = State(*(part[best : best + 1] for part in _parts(state))), blocks.only(best)
+    else:
+        with _threads_of_torch():
+            _minimize_all((*shared, *given), *compiled, limits, tolerances)  # type: ignore[call-arg]
+    if not own_std.shape[1]:
+        state = replace(state, object_offset=None)
+    return Solution(state, blocks.equations(), torch.from_numpy(converged), int(iterations.max()))
+
+
+@contextmanager
+def _threads_of_torch() -> Iterator[None]:
+    """Let compiled loops use as many threads as torch. Both use OpenMP, and have afterwards what they had before."""
+    threads, compiled = torch.get_num_threads(), numba.get_num_threads()
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        numba.set_num_threads(compiled)
+        torch.set_num_threads(threads)  # the last word: numba's setting is OpenMP's, too
+
+
+def linearize(problem: Problem, state: State, loss: str, threshold: float) -> NormalEquations:
+    """Do the work of `linearization.linearize` for tensors on the CPU, without gradients; the loss as in `minimize`."""
+    own_std, state = _object_spread(problem, state, len(problem.uv))
+    blocks = _Blocks.of(problem, len(problem.uv))
+    given = (*shared_arrays(problem), *_arrays((*_problem_arrays(problem), own_std)))
+    arrays = (_arrays(_parts(state)), _arrays(blocks.parts), *_arrays((blocks.cost,)))
+    linearize_all(given, *arrays, blocks.cameras_first, LOSS_CODES[loss], threshold)  # type: ignore[call-arg]
+    return blocks.equations()
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """The normal equations as the compiled loops lay them out, B rigs; M columns of the object stand behind."""
+
+    cameras_first: bool
+    camera: Tensor  # (B, C, K, K)
+    coupling: Tensor  # (B, C, K, 6 S + M) where cameras are eliminated first, else (B, S, 6, K C + M)
+    pose: Tensor  # (B, S, 6, 6)
+    border: Tensor  # (B, M, as wide), lower triangle
+    camera_gradient: Tensor  # (B, C, K)
+    pose_gradient: Tensor  # (B, S, 6)
+    own_gradient: Tensor  # (B, M)
+    residual: Tensor  # (B, S, C, 2, N)
+    cost: Tensor  # (B,)
+
+    @classmethod
+    def of(cls, problem: Problem, rows: int) -> _Blocks:
+        """Make room for so many of those of a problem."""
+        _, snapshots, cameras, _, fiducials = problem.uv.shape
+        own = 0 if problem.object_prior_std is None else problem.object_prior_std.shape[1]
+        free = problem.prior_std.shape[-1]
+        cameras_first = 6 * snapshots <= free * cameras
+        shape = (cameras, free, 6 * snapshots + own) if cameras_first else (snapshots, 6, free * cameras + own)
+        sizes = (
+            (cameras, free, free), shape, (snapshots, 6, 6), (own, shape[-1]),
+            (cameras, free), (snapshots, 6), (own,), (snapshots, cameras, 2, fiducials), (),
+        )  # fmt: skip
+        return cls(cameras_first, *(problem.uv.new_empty(rows, *size) for size in sizes))
+
+    def only(self, row: int) -> _Blocks:
+        """Keep one row; the cost is the first, the only one."""
+        return _Blocks(self.cameras_first, *[*(part[row : row + 1] for part in self.parts), self.cost[:1]])
+
+    @property
+    def parts(self) -> tuple[Tensor, ...]:
+        """All but the cost, in the order of the compiled loops."""
+        gradients = (self.camera_gradient, self.pose_gradient, self.own_gradient)
+        return (self.camera, self.coupling, self.pose, self.border, *gradients, self.residual)
+
+    def equations(self) -> NormalEquations:
+        """The same as `linearization.linearize` has them."""
+        wide = self.coupling.shape[-1] - self.border.shape[1]
+        coupling, across = self.coupling[..., :wide], self.border[..., :wide]
+        if self.cameras_first:
+            blocks = coupling.unflatten(-1, (-1, 6)).permute(0, 3, 1, 2, 4)
+        else:
+            blocks = coupling.unflatten(-1, (self.camera.shape[1], -1)).permute(0, 1, 3, 4, 2)
+        gradients = (self.camera_gradient, self.pose_gradient)
+        equations = NormalEquations(self.cost, self.camera, blocks, self.pose, *gradients, self.residual)
+        if not self.border.shape[1]:
+            return equations
+        if self.cameras_first:
+            pair = (self.coupling[..., wide:], across.unflatten(-1, (-1, 6)).permute(0, 2, 3, 1))
+        else:
+            pair = (across.unflatten(-1, (self.camera.shape[1], -1)).permute(0, 2, 3, 1), self.coupling[..., wide:])
+        lower = self.border[..., wide:]
+        square = lower.tril() + lower.tril(-1).mT
+        return replace(equations, object=ObjectEquations(*pair, square, self.own_gradient))
+
+
+def _object_spread(problem: Problem, state: State, rows: int) -> tuple[Tensor, State]:
+    """Spread of the object's parameters (B, M), M = 0 where it is exact, and a copy of the state with as many.
+
+    The state of a single rig is copied to all `rows`, else there are as many rigs.
+    """
+    prior_std = (
+        problem.uv.new_empty(len(problem.uv), 0) if problem.object_prior_std is None else problem.object_prior_std
+    )
+    offset = torch.zeros_like(prior_std) if state.object_offset is None else state.object_offset
+    parts = (state.offset, state.rotation, state.centre, offset)
+    return prior_std, State(*(part.expand(rows, *part.shape[1:]).clone() for part in parts))
+
+
+def _problem_arrays(problem: Problem) -> tuple[Tensor, ...]:
+    factory = problem.factory
+    pinhole = (factory.focal_length, factory.principal_point, factory.distortion)
+    rig = (factory.cam_from_rig.rotation.detach(), camera_positions(factory), *pinhole)
+    return (problem.uv, problem.root_weight, *rig, problem.prior_std)
+
+
+def camera_positions(rig: CameraRig) -> Tensor:
+    """The rig's `positions`, without gradients: those of tensors wait for a dozen of small operations."""
+    rotation, translation = rig.cam_from_rig.rotation.detach().numpy(), rig.cam_from_rig.translation.detach().numpy()
+    return torch.from_numpy(-(rotation.swapaxes(-1, -2) @ translation[..., None])[..., 0])
+
+
+def _parts(state: State) -> tuple[Tensor, ...]:
+    assert state.object_offset is not None  # see `_object_spread`
+    return (state.offset, state.rotation, state.centre, state.object_offset)
+
+
+def shared_arrays(problem: Problem) -> tuple[np.ndarray | None, ...]:
+    """What `linearization_cpu` is given of all rigs alike."""
+    points, squared = problem.points, problem.radius_squared
+    if problem.part_of is not None:
+        points = torch.cat((points, problem.part_of[:, None].to(points)), 1)
+    given = _arrays((points, points.new_zeros(len(points)) if squared is None else squared))
+    return (*given, lens_codes(problem.factory.lens_model, *problem.factory.distortion.shape[-2:]))
+
+
+def rig_at(problem: Problem, offset: Tensor) -> CameraRig:
+    """Do the work of `linearize.rig_at` for tensors on the CPU, without gradients."""
+    factory = problem.factory
+    given = (factory.cam_from_rig.rotation, factory.cam_from_rig.translation)
+    rotation, translation = (torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in given)
+    parameters = offset * problem.prior_std
+    turn_all(*_arrays((parameters, *given, rotation, translation)))
+    return replace(
+        factory,
+        focal_length=factory.focal_length + parameters[..., 6:8],
+        principal_point=factory.principal_point + parameters[..., 8:10],
+        distortion=factory.distortion + parameters[..., 10:],
+        cam_from_rig=RigidTransform(rotation, translation),
+    )
+
+
+def _arrays(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:
+    """Share the memory of contiguous tensors; copy the others."""
+    return tuple(tensor.detach().contiguous().numpy() for tensor in tensors)
+
+
+@njit(parallel=True, cache=True, fastmath=kernels.FAST)
+def _minimize_all(given, state, blocks, cost, converged, iterations, limits, tolerances):
+    """Levenberg-Marquardt on all rigs of a batch; the outputs hold the best states and their normal equations."""
+    for b in prange(len(cost)):
+        own, found = select_state(state, b), select_blocks(blocks, b)
+        offset, rotation, centre, own_offset = own
+        camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual = found
+        states = (_pair(offset), _pair(rotation), _pair(centre), _pair(own_offset))
+        tried = (
+            _pair(camera), _pair(coupling), _pair(pose), _pair(border),
+            _pair(camera_gradient), _pair(pose_gradient), _pair(own_gradient), _pair(residual),
+        )  # fmt: skip
+        best = _minimize_rig(
+            given_values(given, b), states, tried, cost[b : b + 1], converged[b : b + 1], iterations[b : b + 1],
+            limits, tolerances[b],
+        )  # fmt: skip
+        _copy(offset, states[0][best])
+        _copy(rotation, states[1][best])
+        _copy(centre, states[2][best])
+        _copy(own_offset, states[3][best])
+        _copy(camera, tried[0][best])
+        _copy(coupling, tried[1][best])
+        _copy(pose, tried[2][best])
+        _copy(border, tried[3][best])
+        _copy(camera_gradient, tried[4][best])
+        _copy(pose_gradient, tried[5][best])
+        _copy(own_gradient, tried[6][best])
+        _copy(residual, tried[7][best])
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _minimize_rig(given, states, blocks, cost, converged, iterations, limits, tolerance):
+    """Levenberg-Marquardt on one rig.
+
+    Args:
+        given: of one rig; see `linearization_cpu`.
+        states: two rows, the best so far and the one that is tried; the first row is the start.
+        blocks: of the normal equations, two rows as well.
+        cost: (1,) of the best.
+        converged: (1,) whether a minimum was found.
+        iterations: (1,) how many were made.
+        limits: whether cameras are eliminated first, the loss and its threshold, iterations at most.
+        tolerance: on the cost.
+
+    Returns:
+        The row of the best.
+    """
+    camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, _ = blocks
+    cameras_first, loss, threshold, max_iterations = limits
+    kind, (count, size, wide) = coupling.dtype, coupling.shape[1:]
+    factor, whitened = np.empty((count, size, size), kind), np.empty((count, size, wide), kind)
+    schur = np.empty((wide, wide), kind)
+    camera_step, pose_step = np.empty(camera_gradient.shape[1:], kind), np.empty(pose_gradient.shape[1:], kind)
+    own_step = np.empty(own_gradient.shape[1], kind)
+    rounding, steady = 4 * np.finfo(kind).eps, np.empty((0, 0))
+    damping, growth, relax, best = LEAST_DAMPING, FIRST_GROWTH, RELAX, 0
+    cost[0] = linearize_rig(
+        given, select_state(states, 0), select_blocks(blocks, 0), cameras_first, loss, threshold, steady
+    )
+    for iteration in range(max_iterations):
+        iterations[0] = iteration + 1
+        b, t = best, 1 - best
+        if cameras_first:
+            gain = _solve(
+                camera[b], coupling[b], pose[b], border[b], camera_gradient[b], pose_gradient[b], own_gradient[b],
+                damping, factor, whitened, schur, camera_step, pose_step, own_step,
+            )  # fmt: skip
+        else:
+            gain = _solve(
+                pose[b], coupling[b], camera[b], border[b], pose_gradient[b], camera_gradient[b], own_gradient[b],
+                damping, factor, whitened, schur, pose_step, camera_step, own_step,
+            )  # fmt: skip
+        better, small = False, False
+        if np.isfinite(gain):
+            trial = select_state(states, t)
+            move(select_state(states, b), camera_step, pose_step, own_step, trial)
+            trial_cost = linearize_rig(given, trial, select_blocks(blocks, t), cameras_first, loss, threshold, steady)
+            small = gain <= tolerance + rounding * cost[0]
+            if trial_cost < cost[0]:
+                relax = min(max(1 - (2 * (cost[0] - trial_cost) / gain - 1) ** 3, RELAX), GREATEST_RELAX)
+                better, best, cost[0] = True, t, trial_cost
+        # See levenberg_marquardt.minimize: only a lightly damped small step shows that this is the minimum.
+        if small and damping <= 1e-3 and np.isfinite(cost[0]):
+            converged[0] = True
+            break
+        damping = min(max(damping * (relax if better else growth), LEAST_DAMPING), MOST_DAMPING)
+        growth = FIRST_GROWTH if better else 2 * growth
+    return best
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _solve(
+    blocks, coupling, kept, border, right_blocks, right_kept, right_border, damping, factor, whitened, schur,
+    step_blocks, step_kept, step_border,
+):  # fmt: skip
+    """Solve the damped arrow for minus the gradients; return the predicted decrease, nan if a factorization fails."""
+    count, size, wide = coupling.shape
+    size_kept = kept.shape[1]
+    first_border = wide - len(border)
+    _copy(factor, blocks)
+    _copy(whitened, coupling)
+    for i in range(wide):
+        for j in range(wide):
+            schur[i, j] = 0
+    for q in range(kept.shape[0]):
+        first = q * size_kept
+        for i in range(size_kept):
+            for j in range(size_kept):
+                schur[first + i, first + j] = kept[q, i, j]
+            schur[first + i, first + i] *= 1 + damping
+    for i in range(len(border)):
+        for j in range(first_border + i + 1):
+            schur[first_border + i, j] = border[i, j]
+        schur[first_border + i, first_border + i] *= 1 + damping
+    for p in range(count):
+        for i in range(size):
+            factor[p, i, i] *= 1 + damping
+        if not kernels.cholesky(factor[p]):
+            return np.nan
+        for i in range(size):
+            # Forward substitution of the coupling and of the right-hand side.
+            value = -right_blocks[p, i]
+            for k in range(i):
+                value -= factor[p, i, k] * step_blocks[p, k]
+                for j in range(wide):
+                    whitened[p, i, j] -= factor[p, i, k] * whitened[p, k, j]
+            inverse = 1 / factor[p, i, i]
+            step_blocks[p, i] = value * inverse
+            for j in range(wide):
+                whitened[p, i, j] *= inverse
+    tall = whitened.reshape(count * size, wide)
+    kernels.subtract_gram(schur, tall)
+    flat, right = np.empty(wide, dtype=schur.dtype), right_kept.reshape(-1)
+    for j in range(wide):
+        flat[j] = -right[j] if j < first_border else -right_border[j - first_border]
+    for r in range(count * size):
+        forward = step_blocks[r // size, r % size]
+        for j in range(wide):
+            flat[j] -= tall[r, j] * forward
+    if not kernels.cholesky(schur):
+        return np.nan
+    kernels.cholesky_solve(schur, flat)
+    gain = 0.0
+    for p in range(count):
+        for i in range(size):
+            value = step_blocks[p, i]
+            for j in range(wide):
+                value -= whitened[p, i, j] * flat[j]
+            step_blocks[p, i] = value
+        for i in range(size - 1, -1, -1):
+            value = step_blocks[p, i]
+            for k in range(i + 1, size):
+                value -= factor[p, k, i] * step_blocks[p, k]
+            step_blocks[p, i] = value / factor[p, i, i]
+            gain -= 0.5 * right_blocks[p, i] * step_blocks[p, i]
+    flat_kept = step_kept.reshape(-1)
+    for j in range(first_border):
+        flat_kept[j] = flat[j]
+        gain -= 0.5 * right[j] * flat[j]
+    for j in range(len(border)):
+        step_border[j] = flat[first_border + j]
+        gain -= 0.5 * right_border[j] * step_border[j]
+    return gain
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _pair(first):
+    """Make room for two arrays like the given one, which becomes the first of them."""
+    both = np.empty((2,) + first.shape, first.dtype)  # noqa: RUF005 (numba knows no other way)
+    _copy(both[0], first)
+    return both
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _copy(destination, source):
+    """Copy an array; a loop of its own, because that compiles several times faster than a slice assignment."""
+    to, of = destination.reshape(-1), source.reshape(-1)
+    for i in range(len(to)):
+        to[i] = of[i]

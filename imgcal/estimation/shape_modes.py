@@ -1,0 +1,130 @@
+"""The modes of an object's shape: a few displacements of all fiducials together, such as the bend of a printed board.
+
+They are few, and every fiducial follows them, so that they are not unknowns of the normal equations: `points` of the
+problem have as much of each as is known so far. A fit says what it leaves of their gradient and of their information
+when rig, poses and tolerances have adapted; a Gauss-Newton step of the modes alone, and the next fit, follow from that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.estimation.levenberg_marquardt import Factorization, Solution
+from imgcal.estimation.linearization import (
+    POSE_PARAMETERS,
+    Problem,
+    Step,
+    append_scale,
+    jacobian_at,
+    object_columns,
+    robust_weight,
+)
+from imgcal.estimation.robust_losses import NamedLoss
+
+POINTS_AT_ONCE = 2**16
+"""Pixels whose derivatives are held in memory together."""
+AT_REST = 0.02
+"""Standard deviations that a step of the modes may still be long."""
+
+
+@dataclass(frozen=True)
+class DirectionEvidence:
+    """What a fit says about displacements of all fiducials together, along K directions."""
+
+    information: Tensor  # (K, K), rig, poses and tolerances marginalized
+    pull: Tensor  # (K,) information times the displacement that the data ask for
+    follow: Tensor  # (K, C, K) change of the cameras' whitened offsets by a unit of each direction
+    alone: float  # largest information of one coordinate of a fiducial, nothing marginalized, mm^-2
+
+
+def direction_evidence(
+    problem: Problem, solution: Solution, loss: NamedLoss, directions: Tensor
+) -> DirectionEvidence | None:
+    """Ask a fit of one rig (B = 1) about directions (K, N, 3) mm, in a time that grows with the fiducials.
+
+    Returns:
+        None where rig and poses are undetermined.
+    """
+    factorization, state = solution.factorization, solution.state
+    if bool(factorization.reduced.failed.any()):
+        return None
+    count, prior_std = len(directions), problem.object_prior_std
+    unit = problem.uv.new_ones(1, 3 * len(problem.points) + 1)
+    own, pull = problem.uv.new_zeros(count, count), problem.uv.new_zeros(count)
+    each, camera, poses = problem.uv.new_zeros(len(problem.points), 3), [], []
+    border = torch.zeros_like(unit).expand(count, -1).clone()
+    together = max(1, POINTS_AT_ONCE // problem.uv[0, 0, :, 0].numel())
+    for first in range(0, problem.uv.shape[1], together):
+        rows = slice(first, first + together)
+        std = unit if prior_std is None else prior_std
+        some = replace(problem, uv=problem.uv[:, rows], root_weight=problem.root_weight[:, rows], object_prior_std=std)
+        at = jacobian_at(some, replace(state, rotation=state.rotation[:, rows], centre=state.centre[:, rows]))
+        assert at.by_fiducial is not None
+        weight = robust_weight(some, at, loss)[0].unsqueeze(-2)  # (S, C, 1, N)
+        along = torch.einsum("scirn,kni->kscrn", at.by_fiducial[0], directions)  # (K, S, C, 2, N)
+        heavy = along * weight
+        own = own + torch.einsum("kscrn,lscrn->kl", heavy, along)
+        pull = pull - (heavy * at.residual[0]).sum((1, 2, 3, 4))
+        each = each + (at.by_fiducial[0].square() * weight.unsqueeze(-3)).sum((0, 1, 3)).mT
+        across = torch.einsum("scirn,kscrn->ksci", at.by_rig[0, ..., :-1, :, :], heavy)  # (K, S, C, K' + 6)
+        camera.append(across[..., :-POSE_PARAMETERS].sum(1))
+        poses.append(across[..., -POSE_PARAMETERS:].sum(2))
+        if prior_std is not None:
+            sums = torch.einsum("scirn,kscrn->kin", append_scale(some, at.by_fiducial)[0], heavy)
+            border = border + object_columns(sums) * prior_std
+    camera_part, pose_part = torch.stack(camera).sum(0), torch.cat(poses, dim=1)
+    taken = [
+        _solve(factorization, Step(camera_part[k], pose_part[k], None if prior_std is None else border[k]))
+        for k in range(count)
+    ]
+    for k, step in enumerate(taken):
+        own[k] -= (camera_part * step.camera).flatten(1).sum(1) + (pose_part * step.pose).flatten(1).sum(1)
+        if step.object is not None:
+            own[k] -= border @ step.object
+    follow = -torch.stack([step.camera for step in taken])
+    return DirectionEvidence(0.5 * (own + own.mT), pull, follow, float(each.max()))
+
+
+def _solve(factorization: Factorization, right: Step) -> Step:
+    return factorization.solve(right.map(lambda part: part[None])).map(lambda part: part[0])
+
+
+@dataclass(frozen=True)
+class ModeEvidence:
+    """How well the modes are known at a fit, in units of their prior standard deviations."""
+
+    offset: NDArray[np.float64]  # (K,) as estimated
+    covariance: NDArray[np.float64]  # (K, K)
+    step: NDArray[np.float64]  # (K,) what the data still ask for
+    follow: Tensor  # (K, C, K) change of the cameras' whitened offsets by a unit of each mode
+
+    @property
+    def at_rest(self) -> bool:
+        """The data ask for nothing more."""
+        return bool((np.abs(self.step) <= AT_REST * np.sqrt(self.covariance.diagonal())).all())
+
+
+def mode_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ModeEvidence | None:
+    """Ask a fit about the object's modes; None where it has none, or rig and poses are undetermined."""
+    if problem.modes is None:
+        return None
+    found = direction_evidence(problem, solution, loss, problem.modes)
+    if found is None:
+        return None
+    offset = np.zeros(len(problem.modes)) if problem.mode_offset is None else problem.mode_offset.numpy()
+    information = found.information.numpy() + np.eye(len(offset))
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    return ModeEvidence(offset, covariance, covariance @ (found.pull.numpy() - offset), found.follow)
+
+
+def bend_object(problem: Problem, evidence: ModeEvidence) -> Problem:
+    """The problem with the step that the evidence asks for in its points."""
+    assert problem.modes is not None
+    step = torch.from_numpy(evidence.step).to(problem.points)
+    points = problem.points + torch.einsum("k,kni->ni", step, problem.modes)
+    return replace(problem, points=points, mode_offset=torch.from_numpy(evidence.offset).to(step) + step)

@@ -1,0 +1,136 @@
+"""Which cameras of a running rig see the object: those that are lost, and those that are back."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.online.events import Event
+from imgcal.types import CameraRig, Detections
+
+LEAST_EXPECTED = 3
+"""Fiducials that a camera should see before it says anything that it sees none."""
+MARGIN = 0.05
+"""Of the image's size, from its border, within which a fiducial may as well be out of view."""
+DOUBTED = 3
+"""Snapshots in a row in which a camera sees nothing of what it should see, from which it is in doubt."""
+ASTRAY = 2
+"""Snapshots in which a camera sees something, and not the object where it should be, before it counts as lost: a single
+one may be garbage. It is in doubt at once."""
+ABSENT_SECONDS, ABSENT_SNAPSHOTS = 2.0, 30
+"""How long, and how often, a camera must miss what it should see before it counts as lost: arms hide objects, too."""
+SILENT_SECONDS = 0.5
+"""How long nothing comes from a camera, at least, before it counts as lost; also, until it is known how often it sends,
+`ABSENT_SECONDS`."""
+RESTS, LATEST = 3.0, 8
+"""Times its usual rest, the median of so many, that a camera that sends less often than the others is waited for."""
+
+
+def well_inside(predicted: NDArray[np.float64], rig: CameraRig) -> NDArray[np.bool_]:
+    """Tell which predictions (C, N, 2) px, NaN = none, are so far inside of their image that they should be seen."""
+    size = rig.image_size.numpy()[:, None]
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((predicted > MARGIN * size) & (predicted < (1 - MARGIN) * size)).all(-1))
+
+
+@dataclass(frozen=True)
+class VisibleObject:
+    """What was looked at in a snapshot."""
+
+    time: float
+    number: int
+    blobs: Detections  # labelled
+    predicted: NDArray[np.float64]  # (C, N, 2), nan where that is not known
+    astray: frozenset[int]  # cameras that see what may be the object, and not where it should be
+    silent: frozenset[int]  # cameras of which nothing came
+
+
+@dataclass
+class CameraVisibility:
+    """Follows every camera."""
+
+    names: tuple[str, ...]
+    seen: set[int] = field(default_factory=set)  # cameras that have ever had labels
+    lost: dict[int, float] = field(default_factory=dict)  # camera -> since when
+    missing: dict[int, tuple[float, int]] = field(default_factory=dict)  # not lost yet: since when, how often
+    silent: dict[int, float] = field(default_factory=dict)  # since when nothing came
+    heard: dict[int, deque[float]] = field(default_factory=dict)  # when something came, the latest times
+    astray: dict[int, tuple[float, int]] = field(default_factory=dict)  # since when, and how often
+
+    @property
+    def doubtful_cameras(self) -> frozenset[int]:
+        """Cameras that may not be where they were."""
+        missing = (camera for camera, (_, times) in self.missing.items() if times >= DOUBTED)
+        return frozenset((*self.astray, *missing))
+
+    def observe(self, rig: CameraRig, look: VisibleObject) -> list[Event]:
+        """Say which cameras are lost or back with a snapshot."""
+        count = np.bincount(look.blobs.camera[look.blobs.fiducial >= 0], minlength=len(self.names))
+        some = set(np.flatnonzero(count).tolist())
+        self.seen |= some
+        labelled = set(np.flatnonzero(count >= least_back(look.predicted.shape[1])).tolist()) - look.astray
+        self._listen(look)
+        absent = self._should_see(rig, look.predicted) - some - look.astray - look.silent
+        for cameras, missed in ((absent, self.missing), (look.astray, self.astray)):
+            for camera in labelled & missed.keys():
+                del missed[camera]
+            for camera in cameras:
+                first, times = missed.get(camera, (look.time, 0))
+                missed[camera] = min(first, look.time), times + 1  # clocks may be set back
+        events = []
+        for camera in range(len(self.names)):
+            why = self._why(camera, look)
+            if why is not None and camera not in self.lost:
+                since, message = why
+                self.lost[camera] = since
+                events.append(self._event("camera_lost", camera, since, message, look))
+            elif camera in self.lost and camera in labelled:
+                since = self.lost.pop(camera)
+                events.append(self._event("camera_back", camera, since, "sees the object again", look))
+        return events
+
+    def _listen(self, look: VisibleObject) -> None:
+        """Note from which cameras something came, and since when nothing does."""
+        for camera in set(range(len(self.names))) - look.silent:
+            heard = self.heard.setdefault(camera, deque(maxlen=LATEST + 1))
+            if heard and look.time < heard[-1]:  # the clocks were set back
+                heard.clear()
+            heard.append(look.time)
+        self.silent = {camera: min(self.silent.get(camera, look.time), look.time) for camera in look.silent}
+
+    def _patience(self, camera: int) -> float:
+        """How long (s) a camera may be silent."""
+        times = self.heard.get(camera, ())
+        if len(times) < 3:
+            return ABSENT_SECONDS
+        return max(SILENT_SECONDS, RESTS * float(np.median(np.diff(times))))
+
+    def _why(self, camera: int, look: VisibleObject) -> tuple[float, str] | None:
+        first, times = self.astray.get(camera, (look.time, 0))
+        if times >= ASTRAY:
+            return min(first, self.missing.get(camera, (first, 0))[0]), (
+                "sees what may be the object, but not where it should be: it has moved far; move the object through "
+                "the middle of its image, and it will be found again"
+            )
+        if camera in self.silent and look.time - self.silent[camera] >= self._patience(camera):
+            return self.silent[camera], "sends nothing at the moments of the other cameras"
+        first, times = self.missing.get(camera, (look.time, 0))
+        if times >= ABSENT_SNAPSHOTS and look.time - first >= ABSENT_SECONDS:
+            return first, "does not see the object, which should be in view: it is covered, or has turned away"
+        return None
+
+    def _should_see(self, rig: CameraRig, predicted: NDArray[np.float64]) -> set[int]:
+        """Cameras in which the object is well inside of the image."""
+        return set(np.flatnonzero(well_inside(predicted, rig).sum(1) >= LEAST_EXPECTED).tolist())
+
+    def _event(self, kind: str, camera: int, since: float, message: str, look: VisibleObject) -> Event:
+        name = self.names[camera]
+        return Event(look.time, look.number, kind, name, since, message=f"{name} {message}")  # type: ignore[arg-type]
+
+
+def least_back(fiducials: int) -> int:
+    """Labels by which a camera that did not see the object is said to see it again: one or two come by chance."""
+    return min(LEAST_EXPECTED, (fiducials + 1) // 2)

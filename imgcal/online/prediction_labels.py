@@ -1,0 +1,130 @@
+"""Labels for a snapshot from what the one before it has shown: near the prediction, or again after a camera moved."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imgcal.association import PipelineOptions, distances_to_nearest, mutual_nearest, track
+from imgcal.geometry import RigidTransform
+from imgcal.types import CalibrationObject, CameraRig, Detections
+
+TOO_NEAR = 0.6
+"""Distance (px) between two predictions below which nearness does not tell which is which."""
+MARGIN = 0.03
+"""Of the image's size, from its border: a fiducial predicted farther out may as well be out of view."""
+LEAST_EXPLAINED = 1 / 3
+"""Of what a camera sees of the object, the share that must have labels."""
+LEAST_SIGHT = 0.6
+"""Blobs that may be fiducials, in parts of the fiducials in view, from which a camera is said to see the object."""
+LEAST_BLOBS = 3
+"""From which a camera is said to see the object at all."""
+TURNS = (0.02, 0.1, 0.4)
+"""Radians, one standard deviation of each axis: how far a camera may have been turned when it is looked for again."""
+
+
+def near_prediction(blobs: Detections, predicted: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Fiducial (M,) whose prediction (C, N, 2) is nearest to each blob, -1 where that is not mutual or not near enough.
+
+    Near is a quarter of the distance between predictions: a pattern that has moved less keeps its labels. Fiducials
+    whose predictions all but coincide get none.
+    """
+    labels = np.full(len(blobs), -1, dtype=np.int64)
+    gaps = distances_to_nearest(predicted)
+    reach = 0.25 * float(np.median(gaps))
+    order = np.argsort(blobs.camera, kind="stable")
+    ends = np.searchsorted(blobs.camera[order], np.arange(len(predicted) + 1))
+    for places, crowded, begin, end in zip(predicted, gaps < TOO_NEAR, ends[:-1], ends[1:], strict=True):
+        rows, found = order[begin:end], np.empty(len(places), dtype=np.int64)
+        mutual_nearest(places, blobs.uv[rows], reach, found)
+        named = np.flatnonzero((found >= 0) & ~crowded)
+        labels[rows[found[named]]] = named
+    return labels
+
+
+def spare_blobs(blobs: Detections, cameras: int) -> NDArray[np.int64]:
+    """Count the blobs without a label in each camera: (C,)."""
+    return np.bincount(blobs.camera[blobs.fiducial < 0], minlength=cameras)
+
+
+def find_displaced_cameras(
+    blobs: Detections, usual: NDArray[np.float64], rig: CameraRig, obj: CalibrationObject, pose: RigidTransform
+) -> NDArray[np.bool_]:
+    """Find cameras that see what may be the object, and hardly any of it where the rig puts it: (C,) bool.
+
+    A camera that sees nothing, or no more false blobs than it always does, is no such camera.
+
+    Args:
+        blobs: of one snapshot, labelled.
+        usual: (C,) blobs without a label that a camera has at other times.
+        rig: as last known.
+        obj: the calibration object.
+        pose: rig_from_object of this snapshot.
+    """
+    labelled = np.bincount(blobs.camera[blobs.fiducial >= 0], minlength=rig.num_cameras)
+    spare = np.maximum(spare_blobs(blobs, rig.num_cameras) - usual, 0)
+    if not ((spare >= LEAST_BLOBS) & (labelled <= LEAST_EXPLAINED * (labelled + spare))).any():
+        return np.zeros(rig.num_cameras, dtype=bool)  # whatever is in view
+    projection = rig.project(pose.apply(obj.points), obj.radius)
+    size = rig.image_size.numpy()[:, None]
+    uv = projection.uv.numpy()
+    inside = ((uv > MARGIN * size) & (uv < (1 - MARGIN) * size)).all(-1) & projection.visible.numpy()
+    expected = inside.sum(-1)
+    unexplained = np.minimum(expected - labelled, spare)
+    few = labelled <= LEAST_EXPLAINED * (labelled + unexplained)
+    return np.asarray(few & (unexplained >= np.maximum(LEAST_BLOBS, LEAST_SIGHT * expected)))
+
+
+def relabel_moved_camera(
+    blobs: Detections,
+    camera: int,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    pose: RigidTransform,
+    std: Tensor,
+    options: PipelineOptions,
+) -> Detections | None:
+    """Label the blobs of a camera that has moved, as its neighbours know where the object is; None = it cannot be.
+
+    Args:
+        blobs: of one snapshot, labelled by the other cameras.
+        camera: its number.
+        rig: as last known.
+        obj: the calibration object.
+        pose: rig_from_object by the other cameras.
+        std: (C, K) how well the rig is known.
+        options: how sure labels must be.
+    """
+    rows = np.flatnonzero(blobs.camera == camera)
+    alone = blobs.select(rows)
+    alone = replace(
+        alone,
+        camera=np.zeros_like(alone.camera),
+        sigma=np.hypot(alone.sigma, options.identity_error),
+        fiducial=np.full(len(rows), -1, dtype=np.int64),
+        camera_names=(rig.camera_names[camera],),
+    )
+    for turn in TURNS:
+        wide = widen_poses(std, rig, [camera], pose, obj, turn)[[camera]]
+        found = track(alone, rig.select([camera]), obj, wide, pose, options.identity)
+        if found.accepted:
+            fiducial = blobs.fiducial.copy()
+            fiducial[rows] = found.labels
+            return replace(blobs, fiducial=fiducial)
+    return None
+
+
+def widen_poses(
+    std: Tensor, rig: CameraRig, cameras: list[int], pose: RigidTransform, obj: CalibrationObject, turn: float
+) -> Tensor:
+    """Let cameras be anywhere within a turn (rad), and as far off as moves the image of the object as much: (C, K)."""
+    std = std.clone()
+    centre = pose.apply(obj.points).mean(0)
+    for camera in cameras:
+        distance = float((rig.positions[camera] - centre).norm())
+        std[camera, :3] = std[camera, :3].clamp_min(turn)
+        std[camera, 3:6] = std[camera, 3:6].clamp_min(turn * distance)
+    return std

@@ -1,0 +1,110 @@
+"""Learn a labelled snapshot: what fits, what waits for the next one, what is asked again with another noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from imgcal.monitoring import MonitorUpdate, RigFilter, RigMonitor
+from imgcal.online.drift_watch import DriftWatch
+from imgcal.online.keeper_memory import LEAST_LOOKS, KeeperMemory
+from imgcal.online.label_consistency import Checked
+from imgcal.online.object_checks import ObjectChecks
+
+
+def learn_snapshot(memory: KeeperMemory, checked: Checked) -> MonitorUpdate:
+    """Absorb a snapshot; what a camera sees that does not fit for the first time waits for the next one.
+
+    Args:
+        memory: what is known, which changes.
+        checked: the snapshot of `memory.time`, with its labels.
+
+    Returns:
+        What it taught, and what became known.
+
+    Raises:
+        RefusedError: see `RigMonitor.update`.
+    """
+    monitor, still_open, time = memory.monitor, memory.monitor.open, memory.time
+    off = {
+        camera: memory.off.get(camera, time)
+        for camera in np.flatnonzero(checked.off & (memory.looks >= LEAST_LOOKS)).tolist()
+    }
+    waiting = [camera for camera in off if camera not in memory.off and camera not in still_open]
+    moved = [camera for camera in off if camera in memory.off and camera not in still_open]
+    fiducial = np.where(np.isin(checked.blobs.camera, waiting), -1, checked.blobs.fiducial)
+    blobs = replace(checked.blobs, fiducial=fiducial)
+    seconds = memory.elapsed(time)
+    observations = memory.observed(blobs)
+    if not off and not still_open:
+        memory.before = memory.belief
+    found = monitor.update(observations, checked.rig_from_object, seconds, moved)
+    if found.restarted:
+        memory.drift_watch = DriftWatch(memory.prior.camera_names)
+        memory.looks[:] = 0
+    memory.times.append((monitor.filter.count - 1, time))
+    if found.changes or monitor.open or found.object_change is not None:
+        memory.doubts = ObjectChecks(memory.obj.num_fiducials)
+    elif memory.doubts.observe(checked, blobs, seconds, time):
+        of_object = test_object(memory, learnt=True)
+        if of_object is not None:
+            found = replace(found, update=of_object.update, object_change=of_object.object_change)
+    memory.looks += observations.seen[0].any(-1).numpy()
+    memory.looks[[change.camera for change in found.changes]] = 0
+    if (horizon := monitor.filter.horizon) is not None:
+        memory.looks[list(horizon.away)] = 0
+        np.minimum(memory.looks, horizon.snapshots, out=memory.looks)
+    seen = np.unique(checked.given.camera[checked.given.fiducial >= 0])
+    waits = {camera: since for camera, since in memory.off.items() if camera not in seen}  # for the next that it shows
+    memory.off, memory.learnt, memory.in_vain = waits | off, time, 0
+    if found.slips:  # poses were off that have been found with blobs of another time
+        memory.poses.clear()
+    memory.poses.append((time, found.update.rig_from_object))
+    memory.labels = checked.labels
+    memory.search.observe(checked.blobs, memory.count - 1)
+    memory.usual.append(checked.usual)
+    steady = not (off or found.changes or monitor.open or found.slips)
+    if memory.noise.observe(blobs, observations, found.update, steady, monitor.filter.count):
+        found = replace(_relearn(memory, found), changes=found.changes)
+    return found
+
+
+def test_object(memory: KeeperMemory, learnt: bool) -> MonitorUpdate | None:
+    """Ask whether labels do not fit because the object is not as its file says; what was learnt then.
+
+    Args:
+        memory: what is known, which changes.
+        learnt: of the snapshots that have been learnt without those labels; else of those that were refused.
+    """
+    doubted = memory.doubts.learnt if learnt else memory.doubts.refused
+    snapshots = [(memory.observed(one.blobs), one.rig_from_object) for one in doubted]
+    first = memory.monitor.filter.count
+    found = memory.monitor.diagnose_object(snapshots, [one.seconds for one in doubted], learnt)
+    if found is not None and not learnt:
+        memory.times.extend((first + n, one.time) for n, one in enumerate(doubted))
+        memory.learnt = doubted[-1].time
+    memory.doubts.record_test(found is not None)
+    return found
+
+
+def test_clocks(memory: KeeperMemory) -> bool:
+    """Ask whether labels fit in no camera because of some that are to be held then."""
+    doubted = memory.doubts.refused
+    snapshots = [(memory.observed(one.blobs), one.rig_from_object) for one in doubted]
+    held = memory.monitor.quarantine_doubtful(snapshots, [one.seconds for one in doubted])
+    if held:
+        memory.off |= dict.fromkeys(held, doubted[0].time)
+        memory.doubts = ObjectChecks(memory.obj.num_fiducials)
+    return bool(held)
+
+
+def _relearn(memory: KeeperMemory, found: MonitorUpdate) -> MonitorUpdate:
+    """Learn the first snapshots again, with the noise that they have shown."""
+    estimation, horizon = memory.options.estimation, memory.horizon
+    monitor = RigMonitor(RigFilter(memory.prior, memory.obj, memory.drift, estimation, horizon=horizon))
+    for blobs, pose in memory.noise.first:
+        found = monitor.update(memory.observed(blobs), pose)
+    memory.monitor = monitor
+    memory.doubts = ObjectChecks(memory.obj.num_fiducials)
+    return found

@@ -1,0 +1,44 @@
+"""Labelled snapshots as estimates take them: arranged densely, each with a pose to begin with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from imgcal.association import Associations, accepted_observations, drop_merged, drop_snapshots
+from imgcal.estimation import UndeterminedPosesError, initial_pose, require_poses
+from imgcal.geometry import RigidTransform
+from imgcal.types import CalibrationObject, CameraRig, Observations
+
+
+@dataclass(frozen=True)
+class LabelledCapture:
+    """Labelled snapshots, all used ones of which say where the object is: S of them."""
+
+    labelled: Associations
+    observations: Observations  # (S, C, N)
+    poses: RigidTransform  # (S,) rig_from_object, the first guess
+
+    def drop_snapshots(self, rows: Sequence[int], rig: CameraRig, obj: CalibrationObject) -> LabelledCapture:
+        """Refuse some of the used snapshots, by their numbers among these."""
+        return arrange_labels(drop_snapshots(self.labelled, rows), rig, obj)
+
+
+def arrange_labels(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> LabelledCapture:
+    """Take blobs of several fiducials out, and snapshots whose labels lie on one line; find poses that are missing.
+
+    Raises:
+        RefusedError: none is left.
+    """
+    observations, poses = accepted_observations(labelled, rig, obj)
+    try:
+        require_poses(observations.seen.numpy(), obj.points, obj.part_of if obj.parts else None)
+    except UndeterminedPosesError as error:
+        return arrange_labels(drop_snapshots(labelled, error.rows), rig, obj)
+    if poses is None:
+        poses, snapshots = initial_pose(observations, rig, obj), list(labelled.snapshots)
+        for row, snapshot in enumerate(labelled.used):
+            snapshots[snapshot] = replace(snapshots[snapshot], rig_from_object=poses[row])
+        labelled = replace(labelled, snapshots=tuple(snapshots))
+    left = drop_merged(labelled, poses, rig, obj)
+    return LabelledCapture(labelled, observations, poses) if left is labelled else arrange_labels(left, rig, obj)

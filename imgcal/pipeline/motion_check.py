@@ -1,0 +1,273 @@
+"""Whether all cameras stood still during a capture, before one rig is estimated from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.stats import hypergeom
+
+from imgcal.association import Associations, PipelineOptions, associate
+from imgcal.errors import RefusedError
+from imgcal.estimation import (
+    CLIP,
+    LEAST_SNAPSHOTS,
+    Problem,
+    Solution,
+    State,
+    find_moves,
+    initial_state,
+    make_problem,
+    minimize,
+    pose_at,
+    rig_at,
+)
+from imgcal.pipeline.label_counts import LabelCounts, count_labels
+from imgcal.pipeline.labelled_capture import LabelledCapture, arrange_labels
+from imgcal.types import CalibrationObject, CameraRig, Detections, MovedCamera, MovedError
+
+MEDIAN = 1.386
+"""Of a squared length with unit variance on both axes."""
+LEAST_AGREEMENT = 0.9
+"""Of the labels of the other cameras, where a snapshot has been labelled twice."""
+MOST_MIXED = 0.2
+"""Share of snapshots of the other kind on either side of the time at which a camera was lost."""
+LEAST_CHANCE = 0.05
+"""That what a camera does not agree with falls so cleanly on one side of a moment; of those that disagree at all."""
+EARLIER = "taken before a camera moved"
+"""Why snapshots before the last move are refused."""
+MOST_MOVES = 8  # parts of a capture that are looked at, one after the other
+
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class SteadyPart:
+    """Snapshots during which no camera moved."""
+
+    arranged: LabelledCapture  # those before the last move refused
+    moved: tuple[MovedCamera, ...] = ()  # in the order of time
+    fits: tuple[Solution, ...] = ()  # of one rig to all labels: with the noise that identity allows, with their own
+
+
+def steady_part(
+    arranged: LabelledCapture, detections: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> SteadyPart:
+    """Leave out the snapshots before the last move of a camera.
+
+    Args:
+        arranged: all snapshots.
+        detections: the same as they were given, with the labels of the input alone.
+        rig: the factory calibration.
+        obj: the calibration object.
+        options: whether to go on when a camera has moved.
+
+    Raises:
+        MovedError: a camera has moved, and the options do not say what then.
+        RefusedError: after the last move no snapshot could be decided.
+    """
+    found, fits = _moves(arranged, rig, obj, options)
+    if not found:
+        return SteadyPart(arranged, fits=fits)
+    labelled, moved = arranged.labelled, list(found)
+    total, first, names = len(detections.snapshot_names), 0, detections.snapshot_names
+    for _ in range(MOST_MOVES):
+        first = max(names.index(move.snapshot) for move in found if move.snapshot is not None)
+        explained = _are_explained(found, detections, first, rig, obj, options)
+        if not (options.after_last_move and explained):
+            raise MovedError(moved, total - first, total, explained, labelled.detections)
+        part = associate(detections.of_snapshots(first, total), rig, obj, options)
+        found = list_moves(part, rig, obj, options)
+        if not found:
+            return SteadyPart(arrange_labels(_prepend_earlier(part, labelled, names[first]), rig, obj), tuple(moved))
+        moved += found
+    raise MovedError(moved, total - first, total, labelled=labelled.detections)
+
+
+def _are_explained(
+    moves: tuple[MovedCamera, ...], detections: Detections, first: int, rig: CameraRig, obj: CalibrationObject,
+    options: PipelineOptions,
+) -> bool:  # fmt: skip
+    """Tell whether cameras that were lost at a moment fit the others on either side of it, by themselves.
+
+    A motion whose size is known has been measured on both sides. Of a camera that fits on one side only, nothing says
+    that it moved: its labels or frames may be wrong on the other.
+
+    Args:
+        moves: what was found.
+        detections: as they were given.
+        first: number of the first snapshot after the last move.
+        rig: the factory calibration.
+        obj: the calibration object.
+        options: how sure identity must be.
+    """
+    lost = [rig.camera_names.index(move.camera) for move in moves if move.size is None]
+    for begin, end in ((0, first), (first, len(detections.snapshot_names))) if lost else ():
+        try:
+            part = arrange_labels(associate(detections.of_snapshots(begin, end), rig, obj, options), rig, obj)
+            counts = _fit(part, rig, obj, options).tally
+        except RefusedError:
+            return False
+        if (counts.unexplained > counts.kept)[:, lost].sum() > MOST_MIXED * (counts.usable > 0)[:, lost].sum():
+            return False
+    return True
+
+
+def _prepend_earlier(part: Associations, labelled: Associations, first: str) -> Associations:
+    """Put the snapshots before a part of a capture, which begins with the snapshot `first`, back, refused."""
+    rows = labelled.detections.snapshot_names.index(first)
+    moment = int(labelled.moments[rows])
+    earlier = tuple(
+        s if s.status == "refused" else replace(s, status="refused", reason=EARLIER, rig_from_object=None)
+        for s in labelled.snapshots[:rows]
+    )
+    # Rows of several objects were made anew; those of unknown markers are what they were.
+    later = tuple(
+        replace(s, moment=labelled.snapshots[row].moment) if s.moment < 0 else replace(s, moment=moment + s.moment)
+        for row, s in enumerate(part.snapshots, rows)
+    )
+    late = labelled.detections.snapshot >= rows
+    fiducial = np.full(len(labelled.detections), -1, dtype=np.int64)
+    snapshot = labelled.detections.snapshot.copy()
+    fiducial[late], snapshot[late] = part.detections.fiducial, rows + part.detections.snapshot
+    names = (*labelled.detections.snapshot_names[:rows], *part.detections.snapshot_names)
+    table = replace(labelled.detections, fiducial=fiducial, snapshot=snapshot, snapshot_names=names)
+    return Associations(table, (*earlier, *later))
+
+
+def list_moves(
+    labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> tuple[MovedCamera, ...]:
+    """Say which cameras moved between two snapshots, in the order of time."""
+    return _moves(arrange_labels(labelled, rig, obj), rig, obj, options)[0]
+
+
+def _moves(
+    arranged: LabelledCapture, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> tuple[tuple[MovedCamera, ...], tuple[Solution, ...]]:
+    """Do the work of `list_moves`, and give the fits of all labels, too.
+
+    A camera that has moved far is not labelled any more by what identity has learnt from the snapshots before. Such
+    snapshots are labelled afresh, so that how far it moved can be measured.
+    """
+    labelled = arranged.labelled
+    if len(labelled.used) < 2 * LEAST_SNAPSHOTS:
+        return (), ()
+    fit = _fit(arranged, rig, obj, options)
+    fits, lost = fit.fits, _find_unlabelled(fit.tally)
+    if (lost.sum(0) >= LEAST_SNAPSHOTS).any():
+        again = _label_again(labelled, lost, rig, obj, options)
+        fit = _fit(arrange_labels(again, rig, obj), rig, obj, options)
+    names = tuple(labelled.snapshots[s].name for s in labelled.used)
+    found = find_moves(fit.problem, fit.state, rig.camera_names, names, options.estimation)
+    gone = _find_gone(fit.tally, labelled, rig, {move.camera for move in found})
+    return tuple(sorted((*found, *gone), key=lambda move: names.index(move.snapshot))), fits
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """One rig for all labels, however badly some of them fit."""
+
+    problem: Problem
+    state: State
+    tally: LabelCounts
+    fits: tuple[Solution, ...]  # with the noise that identity allows, with that of the residuals
+
+
+def _fit(arranged: LabelledCapture, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> _Fit:
+    """Estimate one rig, no label left out, with the noise that the residuals show.
+
+    Where one rig cannot fit, this is slow to settle, and need not: what it leaves is asked for steps.
+    """
+    observations = arranged.observations
+    own, seen = observations.sigma.square(), observations.seen
+    problem = make_problem(observations, rig, obj, None)
+    state, noise = initial_state(problem, arranged.poses, None), own + options.identity_error**2
+    solutions: list[Solution] = []
+    for _ in range(2):
+        problem = replace(problem, root_weight=torch.where(seen, noise.rsqrt(), 0.0)[None])
+        solutions.append(minimize(problem, state, options.estimation))
+        state = solutions[-1].state
+        squared, used = solutions[-1].equations.residual[0].square().sum(-2), noise
+        taken = rig.num_parameters * rig.num_cameras + float(problem.pose_freedom)
+        free = max(1 - taken / (2 * int(seen.sum())), 0.2)
+        noise = own + (squared[seen].median() / (MEDIAN * free) - own[seen].median()).clamp_min(0)
+    fitting = (squared <= CLIP**2 * used) & seen
+    poses, fitted = pose_at(problem, state)[0], rig_at(problem, state.offset)[0]
+    counts = count_labels(arranged.labelled, fitting.numpy(), poses, rig, obj, fitted)
+    return _Fit(problem, state, counts, tuple(solutions))
+
+
+def _find_unlabelled(counts: LabelCounts) -> Bools:
+    """Snapshots in which most of what a camera may see of the object has no label: (S, C)."""
+    in_view = np.minimum(counts.expected, counts.usable)
+    return (in_view > 0) & (2 * counts.labelled < in_view)
+
+
+def _label_again(
+    labelled: Associations, lost: Bools, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> Associations:
+    """Label the snapshots in which cameras are `lost` (S, C) without what the others have taught; take those labels."""
+    detections, moments = labelled.detections, labelled.moments
+    asked = np.isin(moments, moments[lost.any(1)])
+    rows = np.flatnonzero(asked[detections.snapshot])
+    try:
+        given = labelled.by_moment() if obj.parts else detections
+        given = replace(given.select(rows), fiducial=np.full(len(rows), -1))
+        again = associate(given, rig, obj, options).detections
+    except RefusedError:
+        return labelled
+    old, new = detections.fiducial[rows], again.fiducial
+    snapshot = _row_of(labelled, detections.snapshot[rows], new, obj)
+    here = (snapshot >= 0) & lost[snapshot, detections.camera[rows]]
+    # A symmetric object may have been labelled in another turn, which the labels of the other cameras show.
+    both = (old >= 0) & (new >= 0) & ~here
+    count = len(labelled.snapshots)
+    same = np.bincount(snapshot[both & (old == new)], minlength=count)
+    agreed = same >= np.maximum(LEAST_AGREEMENT * np.bincount(snapshot[both], minlength=count), 3)
+    taken = here & agreed[snapshot]
+    fiducial, row = detections.fiducial.copy(), detections.snapshot.copy()
+    fiducial[rows], row[rows] = np.where(taken, new, old), np.where(taken, snapshot, row[rows])
+    return Associations(replace(detections, fiducial=fiducial, snapshot=row), labelled.snapshots)
+
+
+def _row_of(
+    labelled: Associations, row: NDArray[np.int64], fiducial: NDArray[np.int64], obj: CalibrationObject
+) -> NDArray[np.int64]:
+    """Number of the row (M,) to which blobs of some rows belong with other labels; -1 = that object has none."""
+    if not obj.parts:
+        return row
+    table = np.full((int(labelled.moments[-1]) + 1, len(obj.parts)), -1, dtype=np.int64)
+    table[labelled.moments[labelled.used], labelled.part_of_rows] = labelled.used
+    return np.where(fiducial >= 0, table[labelled.moments[row], obj.part_of[fiducial]], row)
+
+
+def _find_gone(counts: LabelCounts, labelled: Associations, rig: CameraRig, known: set[str]) -> list[MovedCamera]:
+    """Cameras that saw the object where it is at first, and then elsewhere, or the other way round.
+
+    That snapshots in which a camera agrees and in which it does not are parted so cleanly by a moment has a probability
+    when nothing but chance decides which are which.
+    """
+    moves = []
+    agrees, differs = counts.kept > counts.unexplained, counts.unexplained > counts.kept
+    differs &= 2 * counts.unexplained >= counts.expected
+    doubtful = int((differs.sum(0) >= LEAST_SNAPSHOTS).sum())
+    for camera, name in enumerate(rig.camera_names):
+        rows = np.flatnonzero(agrees[:, camera] | differs[:, camera])
+        wrong = differs[rows, camera]
+        total, count = len(rows), int(wrong.sum())
+        if name in known or not LEAST_SNAPSHOTS <= count <= total - LEAST_SNAPSHOTS:
+            continue
+        place = np.arange(LEAST_SNAPSHOTS, total - LEAST_SNAPSHOTS + 1)
+        before = np.cumsum(wrong)[place - 1]
+        chance = np.minimum(
+            hypergeom.sf(before - 1, total, count, place), hypergeom.sf(count - before - 1, total, count, total - place)
+        )
+        best = int(chance.argmin())
+        shares = before[best] / place[best], (count - before[best]) / (total - place[best])
+        parted = min(shares) <= MOST_MIXED and max(shares) >= 1 - MOST_MIXED
+        if parted and 2 * len(place) * doubtful * chance[best] < LEAST_CHANCE:
+            moves.append(MovedCamera(name, labelled.snapshots[rows[place[best]]].name, "unknown"))
+    return moves

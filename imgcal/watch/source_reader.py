@@ -1,0 +1,232 @@
+"""A source that is read by a thread of its own, and the few snapshots that wait to be worked on."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections import Counter, deque
+from dataclasses import dataclass
+from types import TracebackType
+
+from imgcal.errors import InputError
+from imgcal.messages import one_line
+from imgcal.types import CameraRig
+from imgcal.watch.exposures import CameraBlobs, Exposure, Item, Source, Unreadable, check_exposure
+from imgcal.watch.synchronization import Synchronizer, TimedSnapshot
+from imgcal.watch.timing import Timing
+
+MOST_WAITING = 8
+"""Snapshots that wait; more, and the oldest is dropped where the source is live. Otherwise the source waits."""
+MOST_BYTES = 2**30
+"""Memory of their frames; more, and the oldest go as well."""
+LATELY = 3  # reasons that are kept
+WOKEN = 0.2  # s
+LONGEST_OPENING = 10.0  # s
+
+
+@dataclass(frozen=True)
+class Known:
+    """How far an earlier run has worked on a recording."""
+
+    time: float  # s, of the last snapshot
+    name: str | None = None  # of it, where the recording names snapshots
+    another: bool = False  # that was another recording: all of this one must be later
+
+    def includes(self, snapshot: TimedSnapshot) -> bool:
+        """Tell whether a snapshot has been worked on: all up to the one of that name, or else of that time.
+
+        Raises:
+            InputError: it is of another recording, and not later.
+        """
+        if self.another:
+            if snapshot.time > self.time:
+                return False
+            raise InputError(
+                f"found a recording that is not the one before, and begins at {snapshot.time:.9g} s, expected one "
+                f"after {self.time:.9g} s; --fresh begins anew"
+            )
+        return self._is_named(snapshot) or snapshot.time <= self.time
+
+    def ends_with(self, snapshot: TimedSnapshot) -> bool:
+        """Tell whether this is the last one that has been worked on."""
+        return self._is_named(snapshot) and snapshot.name == self.name
+
+    def _is_named(self, snapshot: TimedSnapshot) -> bool:
+        return self.name is not None and snapshot.name is not None
+
+
+class SourceReader:
+    """Snapshots of a source as they become complete. A context manager: leaving it ends the thread.
+
+    What cannot be read is counted and left out; what ends the source is raised by `next`.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        rig: CameraRig,
+        timing: Timing = Timing(),
+        keep_all: bool = False,
+        waiting: int = MOST_WAITING,
+        known: Known | None = None,
+    ) -> None:
+        """Prepare to read.
+
+        Args:
+            source: where exposures come from.
+            rig: what they are compared with.
+            timing: when they belong together.
+            keep_all: drop nothing, even if the source is live: it is taken for a recording.
+            waiting: most snapshots that wait.
+            known: how far an earlier run has worked on this recording; None = not at all.
+        """
+        self.synchronizer = Synchronizer(rig.camera_names, timing)
+        self.dropped = 0
+        """Snapshots that were complete and not worked on in time."""
+        self.unreadable: Counter[str] = Counter()
+        """By camera; "" = not known."""
+        self.reasons: deque[str] = deque(maxlen=LATELY)
+        """Why the latest ones could not be read."""
+        self.known_before = 0
+        """Snapshots of a recording that an earlier run has worked on."""
+        self._source, self._rig, self._most, self._keep_all = source, rig, waiting, keep_all
+        self._known = known
+        self._snapshots: deque[TimedSnapshot] = deque()
+        self._bytes = 0
+        self._blobs: bool | None = None  # whether blobs come, or frames; None = nothing has come
+        self._changed = threading.Condition()
+        self._closing = self._ended = self._begun = False
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._read, name="intake", daemon=True)  # a read may hang in a driver
+
+    def __enter__(self) -> SourceReader:
+        """Begin to read."""
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End reading."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join(timeout=2.0)
+
+    @property
+    def live(self) -> bool:
+        """Whether what is not worked on in time is dropped."""
+        return self._source.live and not self._keep_all
+
+    @property
+    def waiting(self) -> int:
+        """Number of snapshots that wait to be worked on."""
+        return len(self._snapshots)
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more will come."""
+        with self._changed:
+            return self._ended and not self._snapshots
+
+    def wait_until_open(self, timeout: float = LONGEST_OPENING) -> SourceReader:
+        """Wait until the source has been opened, so long at most; returns itself.
+
+        Raises:
+            InputError: it cannot be.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._begun or self._ended, timeout)
+            if self._error is not None and not self._begun:
+                raise self._error
+        return self
+
+    def next(self, timeout: float) -> TimedSnapshot | None:
+        """Take the oldest snapshot that waits; None = none came within so many seconds.
+
+        Raises:
+            InputError: the source cannot go on. All that came before has been taken.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._snapshots or self._ended, timeout)
+            if self._snapshots:
+                snapshot = self._snapshots.popleft()
+                self._bytes -= snapshot.num_bytes
+                self._changed.notify_all()
+                return snapshot
+            if self._error is not None:
+                raise self._error
+            return None
+
+    def _read(self) -> None:
+        items = self._source.items()
+        try:
+            with contextlib.closing(items):  # type: ignore[type-var]  # a generator
+                for item in items:
+                    if self._closing:
+                        return
+                    if not self._begun:
+                        with self._changed:
+                            self._begun = True
+                            self._changed.notify_all()
+                    self._take(item)
+            for snapshot in self.synchronizer.flush():
+                self._put(snapshot)
+        except BaseException as error:
+            self._error = error
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify_all()
+
+    def _take(self, item: Item) -> None:
+        now = time.monotonic() if self.live else 0.0
+        if isinstance(item, Exposure):
+            try:
+                done = self.synchronizer.add(self._check_kind(check_exposure(item, self._rig)), now)
+            except InputError as error:
+                known = item.camera if item.camera in self._rig.camera_names else ""
+                self._note(Unreadable(str(error), known))
+                return
+        else:
+            if item is not None:
+                self._note(item)
+            done = self.synchronizer.release_due(now)
+        for snapshot in done:
+            self._put(snapshot)
+
+    def _check_kind(self, exposure: Exposure) -> Exposure:
+        """Compare an exposure with the first one.
+
+        Raises:
+            InputError: a frame among blobs, or blobs among frames: nobody works on both.
+        """
+        blobs = isinstance(exposure.content, CameraBlobs)
+        self._blobs = blobs if self._blobs is None else self._blobs
+        if blobs != self._blobs:
+            found, expected = ("blobs", "a frame") if blobs else ("a frame", "blobs")
+            raise InputError(f"{exposure.camera}: found {found}, expected {expected} as in what came first")
+        return exposure
+
+    def _note(self, item: Unreadable) -> None:
+        self.unreadable[item.camera or ""] += 1
+        self.reasons.append(one_line(item.reason))
+
+    def _put(self, snapshot: TimedSnapshot) -> None:
+        if self._known is not None:
+            included = self._known.includes(snapshot)
+            self.known_before += included
+            if not included or self._known.ends_with(snapshot):
+                self._known = None  # what comes from now on is new
+            if included:
+                return
+        with self._changed:
+            while not self.live and len(self._snapshots) >= self._most and not self._closing:
+                self._changed.wait(WOKEN)
+            self._snapshots.append(snapshot)
+            self._bytes += snapshot.num_bytes
+            while len(self._snapshots) > 1 and (len(self._snapshots) > self._most or self._bytes > MOST_BYTES):
+                self._bytes -= self._snapshots.popleft().num_bytes
+                self.dropped += 1
+            self._changed.notify_all()
