@@ -50,7 +50,7 @@ class Problem:
     factory: CameraRig  # (B,)
     prior_std: Tensor  # (B, C, K) prior standard deviation of each parameter
     object_prior_std: Tensor | None = None  # (B, M) prior standard deviation of the object's parameters; None = exact
-    modes: Tensor | None = None  # (K, N, 3) mm, about the centroid, by one prior standard deviation; see `modes.py`
+    modes: Tensor | None = None  # (K, N, 3) mm, about the centroid, by one prior standard deviation; see `shape_modes`
     mode_offset: Tensor | None = None  # (K,) how much of each `points` have, whitened; None = nothing
     part_of: Tensor | None = None  # (N,) object to which each fiducial belongs, where there are several; None = one
 

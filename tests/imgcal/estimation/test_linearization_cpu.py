@@ -5,7 +5,6 @@ from functools import partial
 
 import pytest
 import torch
-from tests.imgcal.estimation.test_levenberg_marquardt_cpu import CASES, seen_only
 
 import imgcal
 from imgcal.estimation import (
@@ -23,6 +22,7 @@ from imgcal.estimation.linearization import retract
 from imgcal.estimation.robust_losses import LOSSES, NamedLoss
 from imgcal.synthesis import simulate_truth
 from imgcal.types import CalibrationObject, Observations
+from tests.imgcal.estimation.test_levenberg_marquardt_cpu import CASES, seen_only
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.4])
