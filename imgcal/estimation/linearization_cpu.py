@@ -3,8 +3,9 @@
 Three tuples of arrays go in and out: what is `given` (points of the object and their squared radii, the lenses' models,
 observations and the roots of their weights, the factory rig, the prior, that of the object), the `state`, and the
 `blocks` of the normal equations. Layouts: `levenberg_marquardt_cpu._Blocks`; what fits each camera and what each
-snapshot is summed up before it is written. The object's own parameters stand behind the coupled ones, and have a border of their own.
-Where several objects were in view, the points have a fourth column: the number of the object; each row shows one.
+snapshot is summed up before it is written. The object's own parameters stand behind the coupled ones, and have a border
+of their own. Where several objects were in view, the points have a fourth column: the number of the object; each row
+shows one.
 
 Where a camera shakes, all that it sees in a snapshot is shifted alike, by nobody knows how much: the most probable
 shift is taken out of the residuals, and what it might have been instead out of the normal equations (Schur complement).
