@@ -258,7 +258,7 @@ class LivePage:
             taken = True
         except queue.Full:
             if not taken:
-                self._fail("commands", f"{MOST_COMMANDS} are waiting and none is fetched")
+                self._fail("commands", f"{MOST_COMMANDS} waiting, none fetched")
         with self._news:
             if taken:
                 self._notes.apply_command(command, self._actions)

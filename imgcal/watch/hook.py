@@ -110,6 +110,10 @@ class Hook:
             process.communicate()
             self._fail(f"was killed after {timeout:.3g} s")
             return
+        finally:
+            if process.stdin is not None:  # still open where there was no time to write
+                with contextlib.suppress(OSError):
+                    process.stdin.close()
         if process.returncode:
             self._fail(f"ended with exit code {process.returncode}")
 

@@ -93,7 +93,7 @@ def test_a_calibration_that_holds_the_distortion_goes_back_where_another_is_refu
     assert "or convert the file with --hold-distortion and calibrate again" in outcomes[1][2]
     for more in (["--into", original, "--out", tmp_path / "x.xcp"], ["--to", "kalibr", "--out", tmp_path / "x.yaml"]):
         code, _, err = run(capsys, held, "--hold-distortion", *more)
-        assert code == 2 and "--hold-distortion: only for a rig file of ours" in err
+        assert code == 2 and "--hold-distortion: only when writing an imgcal rig file" in err
 
 
 def test_into_without_a_file_or_into_a_rig_file_of_ours_is_told(tmp_path, capsys):

@@ -51,7 +51,7 @@ def after(owner, name, counts):
 
 if moment == "learnt":  # the state of a while ago is what is there
     loop.SAVED_EVERY = 0.3
-    after(loop.Watch, "take", lambda self, snapshot: True)
+    after(loop.Watch, "process", lambda self, snapshot: True)
 elif moment == "told":
     after(event_log.EventLog, "append", lambda self, event: event.kind == "moved")
 elif moment == "saving":  # the new state is written beside the old one, and has not taken its place

@@ -36,7 +36,7 @@ def test_a_training_of_positions_says_no_rig(tmp_path) -> None:
     trained = load_checkpoint(POINTS)
     file = tmp_path / "positions.safetensors"
     replace(trained, experiment=trained.experiment.model_copy(update={"task": "positions"})).save(file)
-    with pytest.raises(InputError, match=r"positions\.safetensors: found a training of positions, whose trunk has"):
+    with pytest.raises(InputError, match=r"found a training of positions, whose trunk is untrained"):
         load_models([file])
     with pytest.raises(InputError, match=r"positions\.safetensors: found a training of positions"):
         load_initializer(str(file), load_rig("O10"), load_object("asymmetric8"))

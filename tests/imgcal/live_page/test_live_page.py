@@ -20,7 +20,7 @@ def test_a_taken_address_is_an_error_before_anything_is_started(served, o10, asy
 
 def test_windows_is_refused_in_a_line(o10, asymmetric8, monkeypatch):
     monkeypatch.setattr("imgcal.live_page.live_page.sys.platform", "win32")
-    with pytest.raises(InputError, match="live page: not on Windows"):
+    with pytest.raises(InputError, match="live page: not available on Windows"):
         LivePage(o10, asymmetric8, Address(port=0))
 
 
@@ -189,7 +189,7 @@ def test_a_command_that_the_loop_never_gets_is_shown_as_done_nowhere(o10, asymme
         late = Stream(page)
         assert late.wait("controls") == {"paused": False, "on": ["warm"]} == page._notes.controls()
         assert [command.name for command in page.commands()] == ["warm"]
-        assert told == ["live page: commands: 1 wait, and nobody fetches them"]
+        assert told == ["live page: commands: 1 waiting, none fetched"]
         assert client.command({"name": "pause"})[0] == 200 and [c.name for c in page.commands()] == ["pause"]
         for one in (reader, late):
             one.close()
