@@ -37,6 +37,7 @@ class Quarantine:
     uncertain: bool = False  # it is hardly known where they are
     unsynchronized: bool = False  # they see the object at moments of their own, or are being shaken ...
     reported: bool = False  # ... and it was reported that it is the former
+    least: int = 0  # sightings before the first case
 
     def add(self, cameras: Collection[int], uncertain: bool) -> None:
         """Add cameras, and begin anew where one of them is new."""
@@ -69,7 +70,8 @@ class Quarantine:
         if self.passing and self.snapshots > episode > 1:
             self._forget_episode()
         self.passing = self.snapshots <= episode and episode > 1
-        return not self.passing and (self.sightings in CASE_AFTER or self.sightings % CASE_EVERY == 0)
+        due = self.sightings in CASE_AFTER or self.sightings % CASE_EVERY == 0
+        return due and not self.passing and self.sightings >= self.least
 
     def _is_sighting(self, observations: Observations) -> bool:
         return bool(observations.seen[:, list(self.cameras)].any())
@@ -82,7 +84,12 @@ class Quarantine:
         self.sightings = min(len(shown), 2)
 
     def add_unsynchronized(
-        self, snapshots: Sequence[Snapshot], pauses: Sequence[float], cameras: Collection[int], uncertain: bool
+        self,
+        snapshots: Sequence[Snapshot],
+        pauses: Sequence[float],
+        cameras: Collection[int],
+        uncertain: bool,
+        least: int = 0,
     ) -> None:
         """Add cameras that seem to have moments of their own.
 
@@ -91,8 +98,10 @@ class Quarantine:
             pauses: s before each of them.
             cameras: those.
             uncertain: it is hardly known where they are.
+            least: sightings before there is a case.
         """
         self.add(cameras, uncertain)
+        self.least = max(self.least, least)
         for (observations, _), seconds in zip(snapshots, pauses, strict=True):
             self.observe(observations, seconds)
         self.unsynchronized = True
@@ -126,5 +135,5 @@ class Quarantine:
         """Begin with cameras of which nothing has been seen yet."""
         self.cameras, self.uncertain = cameras, uncertain
         self.snapshots, self.sightings, self.passing = 0, 0, True
-        self.seconds, self.unsynchronized, self.reported = 0.0, False, False
+        self.seconds, self.unsynchronized, self.reported, self.least = 0.0, False, False, 0
         self.seen.clear()

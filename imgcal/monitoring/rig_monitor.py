@@ -45,6 +45,9 @@ OBJECT_SNAPSHOTS = 8
 """... and no change of the object is looked for before so many have been learnt."""
 UNDECIDED_SNAPSHOTS = 16
 """Snapshots for which a camera is in doubt that seemed to have moved, and of which nothing could be decided."""
+SETTLED_SNAPSHOTS, LEAST_AGAIN = 16, 8
+"""Snapshots within which a camera does not move twice without a doubt, and those that decide what it does instead: a
+late camera looks moved in any two snapshots in a row, and in no eight."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,7 @@ class RigMonitor:
         "pending": ("_pending", PendingChange | None),
         "prior": ("_prior", RigBelief),
         "moved_early": ("_moved_early", set[int]),
+        "moved_at": ("_moved_at", dict[int, int]),
         "suspect": ("_suspect", int | None),
     }
 
@@ -103,6 +107,7 @@ class RigMonitor:
         self._pending: PendingChange | None = None
         self._prior = rig_filter.belief
         self._moved_early: set[int] = set()  # cameras of which the factory knows nothing more
+        self._moved_at: dict[int, int] = {}  # snapshots learnt when it was last said of a camera that it had moved
         self._suspect: int | None = None  # the camera without which the last snapshot would not have been refused
 
     def update(
@@ -287,7 +292,31 @@ class RigMonitor:
         verdict = self._diagnosis.decide(case, patient=self._pending is None)
         if verdict.best.name != Moved.name:
             return self._adopt(case, verdict)
+        again = [camera for camera in free if camera not in self.open and self._moved_lately(camera)]
+        if again and self._pending is None and self.filter.horizon is None:
+            return self._doubt(case, again)
         return self._learn_moved(case, free, LARGE, seconds, evidence)
+
+    def _moved_lately(self, camera: int) -> bool:
+        """Tell whether it was said of a camera not long ago that it had moved."""
+        return camera in self._moved_at and self.filter.count - self._moved_at[camera] < SETTLED_SNAPSHOTS
+
+    def _doubt(self, case: Case, cameras: Sequence[int]) -> MonitorUpdate:
+        """Put cameras into quarantine that seem to move again and again: two snapshots cannot tell why, eight can.
+
+        Raises:
+            RefusedError: see `absorb`; the monitor stays as it was.
+        """
+        new, pauses = self._is_new(case.count), case.pauses[-case.count :]
+        anywhere = dict.fromkeys(cameras)
+        before = free_cameras(case.before, anywhere, JUMPS[-1])
+        if new:
+            before = self._anywhere(self._moved_early | set(cameras))
+        result = self._restart(before, [(drop_cameras(one, cameras), pose) for one, pose in case.latest], pauses)
+        if new:
+            self.known_since = self.filter.count - case.count
+        self.quarantine.add_unsynchronized(case.latest, pauses, cameras, uncertain=True, least=LEAST_AGAIN)
+        return MonitorUpdate(result)
 
     def _case(self, before: RigBelief, age: int, cameras: tuple[int, ...], excluded: Mapping[str, str]) -> Case:
         """Put together a case of cameras that seem to have moved before the latest `age` snapshots."""
@@ -370,6 +399,7 @@ class RigMonitor:
         else:
             self.open |= new
             self._begin_pending(result, case.before, seconds, dict(free))
+        self._moved_at |= dict.fromkeys(new, self.filter.count)
         return MonitorUpdate(result, tuple(new.values()))
 
     def _anywhere(self, cameras: Collection[int]) -> RigBelief:
