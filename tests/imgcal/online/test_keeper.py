@@ -309,7 +309,7 @@ def test_a_camera_that_is_late_from_the_first_snapshot_on_is_told_as_that_or_dou
 @pytest.mark.parametrize(("seed", "late"), [(2, -0.01), (3, 0.02)])
 def test_a_camera_that_is_late_from_the_first_snapshot_on_does_not_move_again_and_again(seed: int, late: float) -> None:
     made = stream(seed, conditions=Conditions(rate=60.0), slips=[Slip(0, 1, late)])
-    events, last = events_of(made, 130)  # the first move cannot be told from a late clock; 28 and 33 events without doubt
+    events, last = events_of(made, 130)  # the first move looks like a late clock; 28 and 33 events without doubt
     assert [event.kind for event in events].count("moved") <= 2 and {event.camera for event in events} <= {"cam02"}
     assert last.cameras["cam02"] != "ok"
 
