@@ -292,9 +292,9 @@ class RigMonitor:
         verdict = self._diagnosis.decide(case, patient=self._pending is None)
         if verdict.best.name != Moved.name:
             return self._adopt(case, verdict)
-        again = [camera for camera in free if camera not in self.open and self._moved_lately(camera)]
-        if again and self._pending is None and self.filter.horizon is None:
-            return self._doubt(case, again)
+        restless = [camera for camera in free if camera not in self.open and self._moved_lately(camera)]
+        if restless and self._pending is None and self.filter.horizon is None:
+            return self._doubt(case, restless)
         return self._learn_moved(case, free, LARGE, seconds, evidence)
 
     def _moved_lately(self, camera: int) -> bool:
