@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from imgcal.estimation.linearization_cpu import loss_and_slope, take_shift
+from imgcal.estimation.linearization_cpu import loss_and_slope, take_shift, write_derivative
 from imgcal.geometry import NEAREST_DEPTH, kernels, lens_kernels
 from renderers.compiling import njit
 
@@ -101,10 +101,7 @@ def linearize_lights(given, places, blocks, loss, threshold, shake):
             cost += 0.5 * value
             weight *= np.sqrt(slope)
             fx_w, fy_w = fx * weight, fy * weight
-            derivative[0, 0], derivative[0, 1] = fx_w * per_depth * jxx, fx_w * per_depth * jxy
-            derivative[0, 2] = fx_w * log_slope * (jxx * x + jxy * y)
-            derivative[1, 0], derivative[1, 1] = fy_w * per_depth * jxy, fy_w * per_depth * jyy
-            derivative[1, 2] = fy_w * log_slope * (jxy * x + jyy * y)
+            write_derivative((per_depth, log_slope, x, y, jxx, jxy, jyy), fx_w, fy_w, derivative)
             away = max(1.0, np.sqrt(places[n, 0] ** 2 + places[n, 1] ** 2 + places[n, 2] ** 2))
             for r in range(2):
                 d0, d1, d2 = derivative[r, 0], derivative[r, 1], derivative[r, 2]

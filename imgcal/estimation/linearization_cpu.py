@@ -175,10 +175,7 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
                 cost += 0.5 * value
                 weight *= np.sqrt(slope)
                 fx_w, fy_w = fx * weight, fy * weight
-                derivative[0, 0], derivative[0, 1] = fx_w * per_depth * jxx, fx_w * per_depth * jxy
-                derivative[0, 2] = fx_w * log_slope * (jxx * x + jxy * y)
-                derivative[1, 0], derivative[1, 1] = fy_w * per_depth * jxy, fy_w * per_depth * jyy
-                derivative[1, 2] = fy_w * log_slope * (jxy * x + jyy * y)
+                write_derivative((per_depth, log_slope, x, y, jxx, jxy, jyy), fx_w, fy_w, derivative)
 
                 for r in range(2):
                     d0, d1, d2 = derivative[r, 0], derivative[r, 1], derivative[r, 2]
@@ -397,6 +394,16 @@ def _distribute(products, gradient, c, s, free, camera, coupling, pose, camera_g
                 coupling[c, j, 6 * s + i] = products[free + i, j]
             else:
                 coupling[s, i, free * c + j] = products[free + i, j]
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def write_derivative(image, fx, fy, derivative):
+    """Write the derivative (2, 3) of a pixel by its point in the camera, from parts of `lens_kernels.image_of`."""
+    per_depth, log_slope, x, y, jxx, jxy, jyy = image
+    derivative[0, 0], derivative[0, 1] = fx * per_depth * jxx, fx * per_depth * jxy
+    derivative[0, 2] = fx * log_slope * (jxx * x + jxy * y)
+    derivative[1, 0], derivative[1, 1] = fy * per_depth * jxy, fy * per_depth * jyy
+    derivative[1, 2] = fy * log_slope * (jxy * x + jyy * y)
 
 
 @njit(cache=True, fastmath=kernels.FAST)

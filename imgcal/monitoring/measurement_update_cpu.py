@@ -297,7 +297,7 @@ def _gather(unit, known, rigs, states, blocks, gathered, half, pull, b):
                 pull[s, at + i] = -camera_gradient[b, s, c, i]
                 for j in range(i + 1):
                     gathered[at + i, at + j] += block[i, j]
-            _take_steps(states[2], coupling[b, s, 0], at, free, basis[c])
+            _take_steps(coupling[b, s, 0], at, free, basis[c])
             for i in range(size):
                 times_basis(border[b, s, i, at : at + free], basis[c])
         for i in range(size):
@@ -309,34 +309,24 @@ def _gather(unit, known, rigs, states, blocks, gathered, half, pull, b):
                 border[b, s, j, first_own + i] = border[b, s, i, first_own + j]
         if not kernels.cholesky(pose[b, s, 0]):
             return 1
-        _take_out(states[2], pose[b, s, 0], pose_gradient[b, s, 0], coupling[b, s, 0], half[s], pull[s])
+        _take_out(pose[b, s, 0], pose_gradient[b, s, 0], coupling[b, s, 0], half[s], pull[s])
         kernels.subtract_gram(gathered, coupling[b, s, 0])
     return 0
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _take_steps(centre, coupling, at, free, basis):
-    """Multiply a camera's part of the coupling (P, D) of a pose by the steps by its errors."""
-    if centre.ndim == 3:
-        for i in range(6):
-            times_basis(coupling[i, at : at + free], basis)
-    else:
-        for i in range(len(coupling)):
-            times_basis(coupling[i, at : at + free], basis)
+def _take_steps(coupling, at, free, basis):
+    """Multiply a camera's part of the coupling (P, D) of a pose, or of places, by the steps by its errors."""
+    for i in range(len(coupling)):
+        times_basis(coupling[i, at : at + free], basis)
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _take_out(centre, lower, gradient, carried, half, pull):
-    """Solve by the factor (P, P) of a pose for its gradient (P,) and its coupling (P, D); add what that pulls (D,)."""
-    if centre.ndim == 3:
-        _take_pose_out(lower, gradient, carried, half, pull)
-    else:
-        _take_places_out(lower, gradient, carried, half, pull)
+def _take_out(lower, gradient, carried, half, pull):
+    """Solve by the factor (P, P) of a pose for its gradient (P,) and its coupling (P, D); add what that pulls (D,).
 
-
-@njit(cache=True, fastmath=kernels.FAST)
-def _take_places_out(lower, gradient, carried, half, pull):
-    """Do the work of `_take_pose_out` for any number of places: most of the factor is zero."""
+    Most of the factor of places is zero.
+    """
     for i in range(len(lower)):
         value, inverse = gradient[i], 1 / lower[i, i]
         for k in range(i):
@@ -344,21 +334,6 @@ def _take_places_out(lower, gradient, carried, half, pull):
                 value -= lower[i, k] * half[k]
                 for j in range(len(pull)):
                     carried[i, j] -= lower[i, k] * carried[k, j]
-        half[i] = value * inverse
-        for j in range(len(pull)):
-            carried[i, j] *= inverse
-            pull[j] += carried[i, j] * half[i]
-
-
-@njit(cache=True, fastmath=kernels.FAST)
-def _take_pose_out(lower, gradient, carried, half, pull):
-    """Do that for the six numbers of an object's pose."""
-    for i in range(6):
-        value, inverse = gradient[i], 1 / lower[i, i]
-        for k in range(i):
-            value -= lower[i, k] * half[k]
-            for j in range(len(pull)):
-                carried[i, j] -= lower[i, k] * carried[k, j]
         half[i] = value * inverse
         for j in range(len(pull)):
             carried[i, j] *= inverse
