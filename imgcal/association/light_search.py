@@ -1,4 +1,4 @@
-"""Compiled search for markers of which nothing is known: places on which the rays of three cameras or more agree."""
+"""Compiled search for unknown markers: places on which the rays of three cameras or more agree."""
 
 # Compiled functions take their types from their arguments.
 # ruff: noqa: ANN001, ANN201, ANN202

@@ -1,6 +1,6 @@
-"""Markers of which nothing is known: which blobs of different cameras are the same one, moment by moment.
+"""Unknown markers: which blobs of different cameras are the same one, moment by moment.
 
-`associate_lights` needs a rig that is right to a few pixels (how many, it is told). Where the rig is farther off than
+`associate_lights` needs a rig that is right to a few pixels (`error`). Where the rig is farther off than
 markers are apart, `align_rig` brings it nearer first, from the blobs of many moments at once and without labels.
 """
 

@@ -28,7 +28,7 @@ def linearize_lights(given, places, blocks, loss, threshold, shake):
             (C, K) of their errors.
         places: (N, 3) mm.
         blocks: of this snapshot, filled: information of each camera (C, K, K) with one added to its diagonal, coupling
-            (3 N, D), information of the places (3 N, 3 N), one on the diagonal for a light that nobody sees; gradients
+            (3 N, D), information of the places (3 N, 3 N), one on the diagonal for a hidden light; gradients
             (C, K) and (3 N,), residuals (C, 2, N).
         loss: code of the robust loss.
         threshold: of it.

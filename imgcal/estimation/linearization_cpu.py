@@ -7,7 +7,7 @@ snapshot is summed up before it is written. The object's own parameters stand be
 of their own. Where several objects were in view, the points have a fourth column: the number of the object; each row
 shows one.
 
-Where a camera shakes, all that it sees in a snapshot is shifted alike, by nobody knows how much: the most probable
+Where a camera shakes, all that it sees in a snapshot is shifted alike, by an unknown amount: the most probable
 shift is taken out of the residuals, and what it might have been instead out of the normal equations (Schur complement).
 """
 

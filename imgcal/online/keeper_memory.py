@@ -49,7 +49,7 @@ LEAST_USUAL = 8
 class KeeperMemory:
     """What is known of a rig, of its object and of what is going on; changed in place."""
 
-    options: PipelineOptions = field(metadata=NOT_SAVED)  # whoever goes on has their own
+    options: PipelineOptions = field(metadata=NOT_SAVED)  # the caller gives its own on resuming
     factory: CameraRig
     obj: CalibrationObject  # as its file says
     drift: DriftRate | None

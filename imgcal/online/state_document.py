@@ -31,7 +31,7 @@ from imgcal.online.state_checks import CHECKS
 from imgcal.types import CalibrationObject, UnknownLights
 
 NOT_SAVED: Mapping[str, bool] = {"saved": False}
-"""Metadata of a field that is given anew by whoever resumes."""
+"""Metadata of a field that the caller gives anew on resuming."""
 VARIANTS: Mapping[type, Mapping[str, type]] = {CalibrationObject: {"body": CalibrationObject, "lights": UnknownLights}}
 """Classes with subclasses that may be saved in their place, and what the document calls them."""
 DTYPES = {name: np.dtype(name) for name in ("float64", "float32", "int64", "int32", "bool", "uint8")}

@@ -15,7 +15,7 @@ FIELDS = 8
 UNDETERMINED = 0.8
 """A value is not determined by the data when its standard deviation is still this share of the prior's."""
 HELD = 1e-5
-"""A value whose prior is narrower is held: nobody asks the data for it."""
+"""A value whose prior is narrower is fixed: the data are not asked for it."""
 LITTLE = 0.5
 """Share of its image that a camera has seen the object in, below which it is said where to go."""
 LEAST_SEEN = 4

@@ -1,4 +1,4 @@
-"""Markers of which nothing is known: every blob may be one. Which blobs belong together, and whether that can be true.
+"""Unknown markers: every blob may be one. Which blobs belong together, and whether that can be true.
 
 That labels fit the rig which was made from them proves nothing: dense markers fit many rigs. What proves it are moments
 that took no part, seen by cameras that took no part: the markers that the other cameras find there must be where blobs

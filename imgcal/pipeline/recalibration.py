@@ -138,7 +138,7 @@ def _calibrate_lights(
     options: PipelineOptions,
     detecting: float,
 ) -> Calibration:
-    """Calibrate from markers of which nothing is known; `detecting` has taken so many seconds."""
+    """Calibrate from unknown markers; `detecting` has taken so many seconds."""
     started = time.perf_counter()
     with require_solvable():
         lights = find_lights(detections, rig, obj, options)

@@ -1,4 +1,4 @@
-"""`UnknownLights`: markers of which nothing is known, each of them with a place of its own in every snapshot."""
+"""`UnknownLights`: unknown markers, each of them with a place of its own in every snapshot."""
 
 from __future__ import annotations
 
