@@ -7,11 +7,10 @@ from pathlib import Path
 
 from imgcal import io
 from imgcal.errors import InputError
-from imgcal.formats.conversion import NATIVE, fill_image_sizes, fit_to_target, to_camera_rig
+from imgcal.formats.conversion import NATIVE, fill_image_sizes, fit_to_target, in_millimetres, to_camera_rig
 from imgcal.formats.foreign_rig import ForeignRig
 from imgcal.formats.limits import LIMIT
 from imgcal.formats.registry import is_foreign, read_foreign_lenses, read_foreign_rig
-from imgcal.formats.units import in_millimetres
 from imgcal.types import CameraRig
 
 Size = tuple[int, int]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +27,7 @@ from imgcal.formats import (
 )
 from imgcal.formats.file_storage import is_matrix, merge_storages
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
-from imgcal.formats.format import Format
+from imgcal.formats.format import Files, Format
 from imgcal.formats.source import Source
 from imgcal.io import is_file_name
 from imgcal.types import limits
@@ -92,6 +93,22 @@ def read_foreign_lenses(path: str | Path, name: str | None = None) -> ForeignRig
         return _read(source, one)
     read = one.read_lenses
     return _read(source, replace(one, read=lambda found: ForeignRig(one.name, tuple(read(found)), None, "unknown")))
+
+
+def read_back(files: Files, name: str, rig: str | None = None) -> ForeignRig:
+    """Read files that are not written yet; arguments as for `read_foreign_rig`.
+
+    Raises:
+        FormatError: they cannot be read.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(folder) / (file or "calibration.txt") for file in files]
+        for path, content in zip(paths, files.values(), strict=True):
+            path.write_bytes(content)
+        try:
+            return read_foreign_rig(paths[0] if len(paths) == 1 else folder, name, rig)
+        except InputError as error:
+            raise FormatError(f"what was written cannot be read back: {str(error).replace(folder, '')}") from error
 
 
 def find_format(name: str) -> Format:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -11,17 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.formats.conversion import describe_lens
+from imgcal.formats.conversion import fit_note, lens_refusal, millimetres
 from imgcal.formats.documents import read_bytes
 from imgcal.formats.fitting import Fit, fit_lens_like
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, worst_difference
 from imgcal.formats.limits import LIMIT
 from imgcal.formats.patching import Change, TextFile, patch_bytes
-from imgcal.formats.registry import find_format, is_foreign, read_foreign_rig
+from imgcal.formats.registry import find_format, is_foreign, read_back, read_foreign_rig
 from imgcal.formats.source import SUFFIXES, Source
-from imgcal.formats.units import millimetres
 from imgcal.formats.values import name_cameras
-from imgcal.formats.verification import worst_difference
 
 DIGITS = (0, 9, 12, 17)  # tried in this order: those of the file first
 ROUNDING = 1e-3  # px that the digits of a file may cost: a hundredth of how well markers are measured
@@ -123,7 +120,9 @@ def _written(
     sized = _fill_sizes(wanted, rig)
     for digits in DIGITS:
         files, stamps = _patch(contents, changes, digits, now)
-        back = _read_back(files, old, original_rig)
+        back = read_back(files, old.format, original_rig)
+        if back.names != old.names:
+            raise FormatError("what was written is read back with other cameras")
         reread, points = worst_difference(sized, _fill_sizes(back, rig))
         if reread <= ROUNDING:
             break
@@ -135,12 +134,7 @@ def _written(
     kept = tuple(camera.name for camera in old.cameras if camera.name not in fits)
     inexact = [fit for fit in fits.values() if not fit.exact]
     worst = max(inexact, key=lambda fit: fit.worst, default=None)
-    for camera_name, fit in fits.items():
-        if not fit.exact:
-            notes.append(
-                f"camera {camera_name}: {describe_lens(found[camera_name].lens)} -> {describe_lens(fit.lens)}, fitted "
-                f"over the image: worst {fit.worst:.2g} px, RMS {fit.rms:.2g} px"
-            )
+    notes += [fit_note(found[camera], fit) for camera, fit in fits.items() if not fit.exact]
     return Updated(files, title, tuple(notes), tuple(fits), kept, reread, worst, points)
 
 
@@ -158,11 +152,9 @@ def _check_fits(
     lenses = {camera.name: camera.lens for camera in old.cameras}
     for camera, fit in fits.items():
         if not fit.worst <= limit:
-            off = f"by {fit.worst:.3g} px" if np.isfinite(fit.worst) else "by any amount in a part of the image"
+            nearest = f"the nearest with the file's {len(lenses[camera].coefficients)} coefficients"
             raise RefusedError(
-                f"camera {camera}: {title} cannot say its lens ({describe_lens(found[camera].lens)}): the nearest with "
-                f"the file's {len(lenses[camera].coefficients)} coefficients is off {off}, more than the limit of "
-                f"{limit:g} px",
+                lens_refusal(found[camera], fit, title, nearest, limit),
                 command="--fit-limit allows more; or convert the file with --hold-distortion and calibrate again",
                 python="`limit` allows more",
             )
@@ -263,20 +255,6 @@ def _patch(
                     notes.append(f"{path.name}: {', '.join(left)} left as it is: a time in no known form")
         files[path.name] = made
     return files, notes
-
-
-def _read_back(files: Mapping[str, bytes], old: ForeignRig, rig: str | None) -> ForeignRig:
-    with tempfile.TemporaryDirectory() as folder:
-        paths = [Path(folder) / name for name in files]
-        for path in paths:
-            path.write_bytes(files[path.name])
-        try:
-            back = read_foreign_rig(paths[0] if len(paths) == 1 else Path(folder), old.format, rig)
-        except InputError as error:
-            raise FormatError(f"what was written cannot be read back: {str(error).replace(folder, '')}") from error
-    if back.names != old.names:
-        raise FormatError("what was written is read back with other cameras")
-    return back
 
 
 def _fill_sizes(one: ForeignRig, rig: ForeignRig) -> ForeignRig:
