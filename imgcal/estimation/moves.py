@@ -32,7 +32,7 @@ from imgcal.estimation.correlation import correlation_time
 from imgcal.estimation.linearization import Problem, State, points_at, pose_at, rig_at
 from imgcal.estimation.map_estimate import equations_at, minimize
 from imgcal.estimation.robust_losses import NamedLoss, huber
-from imgcal.types import Kind, MovedCamera
+from imgcal.types import PARAMETER_KINDS, Kind, MovedCamera
 
 ERROR = 1e-5
 """Probability of naming a camera in a capture in which none has moved, as far as noise is what it is said to be."""
@@ -56,9 +56,9 @@ LEAST_LABELS = 2
 """Labels of a camera from which the shift of its image in a snapshot counts."""
 
 KINDS: dict[Kind, tuple[slice, float]] = {
-    "rotation": (slice(0, 3), 180 / np.pi),
-    "position": (slice(3, 6), 1.0),
-    "focal_length": (slice(6, 8), 0.5**0.5),
+    "rotation": (PARAMETER_KINDS["rotation"], 180 / np.pi),
+    "position": (PARAMETER_KINDS["position"], 1.0),
+    "focal_length": (PARAMETER_KINDS["focal_length"], 0.5**0.5),
 }
 """Which values of a camera, and the factor from their length to what is told: degrees, mm, px along one axis."""
 

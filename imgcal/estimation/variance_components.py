@@ -26,14 +26,8 @@ from imgcal.estimation.object_shape import (
 )
 from imgcal.estimation.pose_support import require_poses
 from imgcal.estimation.shape_modes import ModeEvidence, bend_object, mode_evidence
+from imgcal.types import PARAMETER_KINDS
 
-KINDS = {
-    "rotation": slice(0, 3),
-    "position": slice(3, 6),
-    "focal_length": slice(6, 8),
-    "principal_point": slice(8, 10),
-    "distortion": slice(10, None),
-}
 ROUNDS = 40
 """Of fits at most: noise, outliers, object and prior follow each other, and most captures need three to six."""
 BENT = 5.0
@@ -284,7 +278,7 @@ def _require_scale(shape: ShapeEvidence | ScaleEvidence, fit: _Fit, least: float
 
     How far they have moved otherwise says how far the prior can be trusted to know them.
     """
-    position, problem = KINDS["position"], fit.problem
+    position, problem = PARAMETER_KINDS["position"], fit.problem
     offset, prior_std = (tensor[0, :, position].numpy() for tensor in (fit.solution.state.offset, problem.prior_std))
     places = problem.factory.positions[0].numpy() + offset * prior_std
     direction = np.where(prior_std > 0, (places - places.mean(0)) / np.maximum(prior_std, 1e-30), 0.0).ravel()
@@ -359,7 +353,7 @@ def _too_narrow(offset: NDArray[np.floating], remaining: NDArray[np.float64]) ->
     those of which they leave little (C, K) of the prior's variance.
     """
     factors = {}
-    for kind, part in KINDS.items():
+    for kind, part in PARAMETER_KINDS.items():
         freedom = float((1 - remaining[:, part]).sum())
         if freedom > 1:
             excess = float(np.square(offset[:, part]).sum()) / freedom
@@ -372,5 +366,5 @@ def _widen(problem: Problem, state: State, factors: Mapping[str, float]) -> tupl
     """Widen the prior; the state, counted in prior standard deviations, stays where it is."""
     scale = torch.ones_like(problem.prior_std[0, 0])
     for kind, factor in factors.items():
-        scale[KINDS[kind]] = factor
+        scale[PARAMETER_KINDS[kind]] = factor
     return replace(problem, prior_std=problem.prior_std * scale), replace(state, offset=state.offset / scale)

@@ -10,15 +10,16 @@ import numpy as np
 from imgcal.geometry import LENS_MODELS
 from imgcal.report import svg
 from imgcal.report.content import ReportContent
+from imgcal.types import PARAMETER_KINDS
 
 MINUS = "\N{MINUS SIGN}"
 
 GROUPS: tuple[tuple[str, slice, tuple[str, ...], float], ...] = (
-    ("focal length (px)", slice(6, 8), ("fx", "fy"), 1.0),
-    ("principal point (px)", slice(8, 10), ("cx", "cy"), 1.0),
-    ("distortion (10⁻³)", slice(10, None), (), 1e3),
-    ("rotation (deg)", slice(0, 3), ("x", "y", "z"), 180 / math.pi),
-    ("position (mm)", slice(3, 6), ("x", "y", "z"), 1.0),
+    ("focal length (px)", PARAMETER_KINDS["focal_length"], ("fx", "fy"), 1.0),
+    ("principal point (px)", PARAMETER_KINDS["principal_point"], ("cx", "cy"), 1.0),
+    ("distortion (10⁻³)", PARAMETER_KINDS["distortion"], (), 1e3),
+    ("rotation (deg)", PARAMETER_KINDS["rotation"], ("x", "y", "z"), 180 / math.pi),
+    ("position (mm)", PARAMETER_KINDS["position"], ("x", "y", "z"), 1.0),
 )
 """Columns: heading, which parameters, their names (none = those of the camera's lens), factor to the unit shown."""
 

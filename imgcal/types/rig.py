@@ -38,6 +38,14 @@ PINHOLE = (
 """Free parameters of a camera before its lens: rotation (3, rad), position (3, mm), focal length (2, pixels), principal
 point (2, pixels). The K parameters of a rig's cameras are these and the D coefficients of `distortion`. Rotation:
 cam_from_rig = exp(w) cam_from_rig0. Position: of the camera in the rig."""
+PARAMETER_KINDS = {
+    "rotation": slice(0, 3),
+    "position": slice(3, 6),
+    "focal_length": slice(6, 8),
+    "principal_point": slice(8, 10),
+    "distortion": slice(10, None),
+}
+"""Where each kind of value, as a rig file's `prior` names it, stands among the parameters of a camera."""
 
 
 def parameter_names(lens_models: Sequence[str], width: int | None = None) -> tuple[str, ...]:
