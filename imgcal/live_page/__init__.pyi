@@ -2,6 +2,7 @@ from .address import Address, parse_address
 from .commands import Action, Command
 from .demonstration import Demonstration
 from .live_page import LivePage
+from .page import content_policy, to_json
 from .security import Gate
 
 __all__ = [
@@ -11,5 +12,7 @@ __all__ = [
     "Demonstration",
     "Gate",
     "LivePage",
+    "content_policy",
     "parse_address",
+    "to_json",
 ]

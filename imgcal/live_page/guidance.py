@@ -14,7 +14,7 @@ from torch import Tensor
 from imgcal.estimation import Gauge, WorkingVolume, pixel_jacobian, uncertainty_over
 from imgcal.geometry import cross_matrix
 from imgcal.io import DEFAULT_SIGMA
-from imgcal.live_page.text import round_values
+from imgcal.live_page.page import round_values
 from imgcal.monitoring import RigBelief
 from imgcal.types import CameraRig
 

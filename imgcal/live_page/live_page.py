@@ -41,7 +41,7 @@ from imgcal.live_page.contents import (
     rig_message,
     state_message,
 )
-from imgcal.live_page.viewing_volume import viewing_volume
+from imgcal.live_page.rig_drawing import viewing_volume
 from imgcal.live_page.wire import frame_message
 from imgcal.messages import shorten
 from imgcal.online import Event, RigState

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import json
 import math
 from collections import Counter
 from dataclasses import dataclass
@@ -17,10 +14,11 @@ import numpy as np
 from markupsafe import Markup
 
 from imgcal.io import write_text
+from imgcal.live_page import content_policy, to_json
 from imgcal.pipeline import MOVED, UNDETERMINED
 from imgcal.report import accuracy, charts, overlay, scene, svg, tables
 from imgcal.report.content import ReportContent
-from imgcal.report.rig_view import Scene, rig_view_script
+from imgcal.report.rig_view import rig_view_script
 from imgcal.report.verdict import judge
 
 LARGEST_SNAPSHOT_TABLE = 400
@@ -52,7 +50,7 @@ def render(content: ReportContent) -> str:
         verdict=judge(content),
         style=Markup(_resource("report.css")),
         scripts=[Markup(script) for script in scripts],
-        policy=_policy(scripts),
+        policy=content_policy(scripts, "'unsafe-inline'", "data:"),
         snapshots=_snapshots(content),
         residuals=_residuals(content),
         coverage=_coverage(content),
@@ -81,22 +79,6 @@ def _template() -> jinja2.Template:
 
 def _resource(name: str) -> str:
     return files("imgcal.report").joinpath("templates", name).read_text(encoding="utf-8")
-
-
-def _policy(scripts: tuple[str, ...]) -> str:
-    """Forbid the page every connection, and every script but those that it carries."""
-    digests = (hashlib.sha256(text.encode()).digest() for text in scripts)
-    hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
-    return (
-        f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data:; "
-        "base-uri 'none'; form-action 'none'"
-    )
-
-
-def _values(scene: Scene) -> Markup:
-    """JSON that stands safely inside `<script>`."""
-    text = json.dumps(scene, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
-    return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
 
 
 def _snapshots(content: ReportContent) -> dict[str, object]:
@@ -194,7 +176,7 @@ def _rig(content: ReportContent) -> dict[str, object]:
     drawn = scene.describe_scene(content)
     snapshots, fiducials = scene.choose_fiducials(content)
     return {
-        "scene": _values(drawn.values),
+        "scene": Markup(to_json(drawn.values)),
         "factors": drawn.factors,
         "start": drawn.start,
         "snapshots": len(snapshots),
