@@ -16,6 +16,7 @@ from imgcal.cli import arguments
 from imgcal.cli.common import (
     check_folder,
     drop_cameras,
+    keep_memory,
     open_rig,
     parse_range,
     progress,
@@ -23,11 +24,8 @@ from imgcal.cli.common import (
     select_cameras,
     start_pose,
 )
-from imgcal.cli.counts import doubtful_cameras
 from imgcal.cli.describe import describe, describe_refusal
-from imgcal.cli.findings import findings
-from imgcal.cli.memory import keep_memory
-from imgcal.cli.outcome import print_outcome, refused_summary, summary
+from imgcal.cli.outcome import doubtful_cameras, findings, print_outcome, refused_summary, summary
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import Gauge
 from imgcal.extras import advice, missing

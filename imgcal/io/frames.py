@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
 import struct
+import threading
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +20,40 @@ from imgcal.errors import InputError
 from imgcal.io.atomic import write_bytes
 from imgcal.io.image_headers import PNG_SIGNATURE, Size, check_pixels, has_kind, image_size, tiff_pages
 from imgcal.io.names import check_regular
-from imgcal.io.silence import silence_stderr
+
+_lock = threading.Lock()
+_within = 0  # decodings that are under way, in any thread
+_kept = -1  # standard error meanwhile
+
+
+@contextlib.contextmanager
+def silence_stderr() -> Iterator[None]:
+    """Redirect file descriptor 2 to nowhere: libpng, libjpeg and FFmpeg write there regardless of settings."""
+    global _within, _kept
+    with _lock:
+        if _within == 0:
+            _kept = _lead_away()
+        _within += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _within -= 1
+            if _within == 0 and _kept >= 0:
+                os.dup2(_kept, 2)
+                os.close(_kept)
+
+
+def _lead_away() -> int:
+    try:
+        kept = os.dup(2)
+    except OSError:  # a service without standard error
+        return -1
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    os.close(nowhere)
+    return kept
+
 
 Frame = NDArray[np.uint8] | NDArray[np.uint16]  # (H, W) grey
 

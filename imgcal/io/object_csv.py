@@ -20,8 +20,7 @@ from imgcal.errors import InputError
 from imgcal.io.atomic import write_text
 from imgcal.io.board_yaml import board_from_yaml, board_text
 from imgcal.io.csv_file import Chunk, read_chunks
-from imgcal.io.names import LONGEST_NAME, check_regular, find_file, title_from_name
-from imgcal.io.resources import data_path, shipped_names
+from imgcal.io.names import LONGEST_NAME, check_regular, data_path, find_file, shipped_names, title_from_name
 from imgcal.messages import shorten
 from imgcal.types import CalibrationObject, limits
 from renderers.palette import palette

@@ -4,7 +4,7 @@ import pytest
 
 from imgcal.errors import InputError
 from imgcal.io import load_object, load_rig, open_capture, open_input, resources
-from imgcal.io.resources import data_path, sample_path, shipped_names
+from imgcal.io.names import data_path, sample_path, shipped_names
 
 
 def test_what_ships_is_there_and_can_be_read() -> None:
