@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -92,10 +92,7 @@ class Calibrate(arguments.Calibrate):
         detections, frames = read_detections(source, self.snapshots, self.detection, measurer, obj.board)
         detections = select_cameras(detections, rig)
         seconds = {"loading": loaded - started, "reading and detection": time.perf_counter() - loaded}
-
-        def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
-            return progress(snapshots, total, "identifying")
-
+        bar = partial(progress, label="identifying")
         outcome: Calibration | RefusedError
         try:
             if self.cameras is not None:

@@ -98,14 +98,11 @@ def read_detections(
 
 
 def progress(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
-    """Show a progress bar on standard error, if that is a terminal, while going through `items`."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    console = Console(file=sys.stderr)
-    if not console.is_terminal:  # some versions of rich write a line even where it is disabled
-        yield from items
-        return
-    with Progress(*columns, console=console, transient=True) as bar:
-        yield from bar.track(items, total=total, description=label)
+    """Show a progress bar while going through `items`; see `progress_bar`."""
+    with progress_bar(label, total) as advance:
+        for item in items:
+            yield item
+            advance(1)
 
 
 def start_pose(values: StartPose | None) -> RigidTransform | None:
@@ -153,9 +150,9 @@ def check_folder(path: Path) -> None:
 
 @contextmanager
 def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar on standard error, if that is a terminal; yields what is to be told of each advance."""
+    """Show a progress bar on standard error, if that is a terminal; yields a function to call with each advance."""
     console = Console(file=sys.stderr)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     if not console.is_terminal:  # some versions of rich write a line even where it is disabled
         yield lambda done: None
         return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from functools import partial
 
 from imgcal.cli import arguments
 from imgcal.cli.common import check_folder, open_rig, parse_range, progress, read_detections
@@ -47,10 +47,7 @@ class Harvest(arguments.Harvest):
         sight = None
         if self.detector != "classical" and obj.board is None:
             sight = capture_sight(capture, self.detector, self.detection, first)
-
-        def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
-            return progress(snapshots, total, "harvesting")
-
+        bar = partial(progress, label="harvesting")
         splits = harvest(
             lambda snapshot: capture.frames_of(first + snapshot), detections, rig, obj,
             detection=self.detection, sight=sight, size=self.size, seed=self.seed, progress=bar,

@@ -11,7 +11,6 @@ import numpy as np
 
 from imgcal.errors import InputError, RefusedError
 from imgcal.formats.conversion import fit_note, lens_refusal, millimetres
-from imgcal.formats.documents import read_bytes
 from imgcal.formats.fitting import Fit, fit_lens_like
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, worst_difference
 from imgcal.formats.limits import LIMIT
@@ -19,6 +18,7 @@ from imgcal.formats.patching import Change, TextFile, patch_bytes
 from imgcal.formats.registry import find_format, is_foreign, read_back, read_foreign_rig
 from imgcal.formats.source import SUFFIXES, Source
 from imgcal.formats.values import name_cameras
+from imgcal.io import read_bytes
 
 DIGITS = (0, 9, 12, 17)  # tried in this order: those of the file first
 ROUNDING = 1e-3  # px that the digits of a file may cost: a hundredth of how well markers are measured

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from imgcal.errors import InputError
 from imgcal.io.atomic import write_bytes
 from imgcal.io.image_headers import PNG_SIGNATURE, Size, check_pixels, has_kind, image_size, tiff_pages
-from imgcal.io.names import check_regular
+from imgcal.io.names import check_regular, read_bytes
 
 _lock = threading.Lock()
 _within = 0  # decodings that are under way, in any thread
@@ -267,10 +267,7 @@ def _grey(image: Any, path: Path) -> Frame:
 
 def _content(path: Path) -> bytes:
     """Read an image file of the kind that its suffix names."""
-    check_regular(path)
-    if path.stat().st_size > LARGEST_IMAGE_FILE:
-        raise InputError(f"{path}: found {path.stat().st_size:,} bytes, expected at most {LARGEST_IMAGE_FILE:,}")
-    content = path.read_bytes()
+    content = read_bytes(path, LARGEST_IMAGE_FILE)
     suffix = path.suffix.lower()
     if not content:
         raise InputError(f"{path}: found an empty file, expected an image")

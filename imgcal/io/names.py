@@ -60,6 +60,7 @@ MOST_NAMES = 8  # that a message lists
 MODEL, SUFFIX = "model.safetensors", ".safetensors"  # what `imgcal train` calls a network in the folder of a run
 IN_SAMPLE = {"rigs": "rig.yaml", "objects": "object.csv"}
 """Files of a sample capture, by the kind of shipped data that each of them is."""
+MOST_BYTES = 2**26  # of a file of values
 LONGEST_NAME = 200  # bytes: file systems end at 255, and something is put behind
 
 
@@ -91,6 +92,21 @@ def check_regular(path: Path) -> None:
     """Raise `InputError` at a folder, a device or a pipe: reading one may wait for ever."""
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: found a folder, device or pipe, expected a file")
+
+
+def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
+    """Read a regular file of a bounded size.
+
+    Raises:
+        InputError: it is none, cannot be read, or is larger.
+    """
+    check_regular(path)
+    try:
+        if path.stat().st_size > most:
+            raise InputError(f"{path}: found {path.stat().st_size:,} bytes, expected at most {most:,}")
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def model_file(path: str | Path) -> Path:

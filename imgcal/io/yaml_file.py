@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 import yaml
 
 from imgcal.errors import InputError
-from imgcal.io.names import check_regular
+from imgcal.io.names import MOST_BYTES, read_bytes
 from imgcal.io.validation import Model, validate
 from imgcal.messages import shorten
 
@@ -208,7 +208,6 @@ def _fail(problem: str, mark: Mark) -> NoReturn:
     raise yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
 
 
-MOST_BYTES = 2**26
 INSTEAD = {
     ("imgcal-rig/1", "imgcal-cameras/1"): ": these cameras have no places yet; imgcal calibrate finds them where the "
     "file is given as --cameras instead of --rig (in Python: load_cameras, calibrate_from_scratch)",
@@ -240,7 +239,7 @@ def read_yaml(path: Path, model: type[Model], file_format: str, entry_names: Map
     Raises:
         InputError: one line with the file, what was found and what was expected.
     """
-    return record_from_yaml(_content(path), str(path), model, file_format, entry_names)
+    return record_from_yaml(read_bytes(path), str(path), model, file_format, entry_names)
 
 
 def record_from_yaml(
@@ -256,7 +255,7 @@ def read_yaml_mapping(path: Path, file_format: str) -> dict[str, Any]:
     Raises:
         InputError: one line with the file, what was found and what was expected.
     """
-    return _check_format(_content(path), str(path), file_format)
+    return _check_format(read_bytes(path), str(path), file_format)
 
 
 def is_prose(text: str) -> bool:
@@ -343,16 +342,6 @@ _Dumper.add_implicit_resolver(
 )
 _Dumper.add_representer(Flow, lambda d, v: d.represent_sequence("tag:yaml.org,2002:seq", v, flow_style=True))
 _Dumper.add_representer(FlowMap, lambda d, v: d.represent_mapping("tag:yaml.org,2002:map", v.items(), flow_style=True))
-
-
-def _content(path: Path) -> bytes:
-    check_regular(path)
-    try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(f"{path}: found {path.stat().st_size:,} bytes, expected at most {MOST_BYTES:,}")
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def _parse(content: bytes, where: str, mapping_tags: frozenset[str] = frozenset()) -> Any:
