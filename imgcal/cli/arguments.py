@@ -203,7 +203,7 @@ class Watch:
     a rosbag2 folder or .mcap file; a table of blobs (.csv, .csv.gz).
 
     OUT gets rig.yaml (the rig as it is now, replaced in one step), history/ (as it was), events.jsonl (what happened:
-    a line of JSON each) and state.json, from which the same command goes on after any end, even a power failure.
+    a line of JSON each) and state.json, from which the same command resumes after any end, even a power failure.
     Ends with the input, or at Ctrl-C. Example: imgcal watch tcp://127.0.0.1:5555 --rig factory.yaml --object
     object.csv --out out/watch
     """
@@ -355,7 +355,7 @@ class Harvest:
     object: str  #: object file, or the name of a shipped object
     out: Path  #: folder to write
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
-    detector: str = "auto"  #: who finds the object where blobs decide nothing: auto, both, or classical for nobody
+    detector: str = "auto"  #: what finds the object where blobs decide nothing: auto, both, or classical for none
     size: int = 96  #: crop pixels, each way: as the network takes them
     seed: int = 0  #: of the crops' places
     videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
@@ -367,7 +367,8 @@ class Train:
     """Train a network as an experiment file says.
 
     Writes OUT/model.safetensors, resolved.yaml, metrics.jsonl and TensorBoard's files.
-    Ctrl-C saves the state first; so do steps on the way, and --resume goes on from there, with the same result.
+    Ctrl-C saves the state first, as the training does from time to time; --resume continues from there, with the same
+    result.
     Several processes: torchrun --nproc-per-node 2 -m imgcal train ...; on GPUs also accelerate launch -m imgcal ...
     Example: imgcal train table1-row01 --out out/row01
     """

@@ -213,7 +213,7 @@ def _shorten(problem: str, command: str = "") -> str:
 
 
 def _verdict(error: BaseException, given: list[str]) -> tuple[int, str]:
-    """Say what a failure means to the user: exit code and message."""
+    """Translate a failure into an exit code and a message."""
     match error:
         case InputError():
             return UNUSABLE, str(error)

@@ -34,7 +34,7 @@ from imgcal.types import CalibrationObject, CameraRig, Detections, MovedCamera, 
 
 @dataclass(frozen=True)
 class Findings:
-    """The same for the printed lines, for result.json and for the report."""
+    """What printed lines, result.json and the report share."""
 
     motion: Motion
     knowledge: Coverage
@@ -44,7 +44,7 @@ class Findings:
 
     @property
     def values(self) -> dict[str, Any]:
-        """The form that scripts read."""
+        """Plain values for result.json."""
         motion, known = self.motion, self.knowledge
         reference = motion.gauge.reference
         since_factory = () if self.from_scratch else motion.moves
@@ -90,7 +90,7 @@ UNKNOWN: dict[str, Any] = {"motion": None, "timing_untested": None, "knowledge":
 
 
 def findings(calibration: Calibration, gauge: Gauge, covariance: RigCovariance) -> Findings:
-    """Look at what was found."""
+    """Derive motion and coverage from a calibration."""
     motion, knowledge = motion_since_factory(calibration, gauge), measure_coverage(calibration, covariance.std)
     return Findings(motion, knowledge, calibration.from_scratch, calibration.moved, calibration.untimed)
 
@@ -116,14 +116,14 @@ def counts_by_snapshot(calibration: Calibration) -> dict[str, dict[str, int]]:
 
 
 def blobs_by_camera(detections: Detections, rig: CameraRig) -> dict[str, dict[str, Any]]:
-    """What is known of each camera where nothing could be decided."""
+    """Count the blobs of each camera of a refused capture."""
     found = np.bincount(detections.camera, minlength=len(detections.camera_names)).tolist()
     blobs = dict(zip(detections.camera_names, found, strict=True))
     return {name: {"blobs": blobs.get(name, 0), "labelled": None, "outliers": None} for name in rig.camera_names}
 
 
 def doubtful_cameras(calibration: Calibration) -> list[str]:
-    """Say of which cameras a part of what they see of the object is not where it should be."""
+    """Name the cameras that see a part of the object in the wrong place."""
     kept, unexplained = calibration.tally.kept.sum(0), calibration.tally.unexplained.sum(0)
     doubtful = np.flatnonzero(unexplained > DOUBTFUL * np.maximum(kept + unexplained, 1))
     stopped = [str(camera) for camera in calibration.doubtful]
@@ -139,7 +139,7 @@ def _counts(counts: LabelCounts, part: Any) -> dict[str, int]:
 
 
 def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, Any]:
-    """Put a calibration into the form that scripts read."""
+    """Summarize a calibration as plain values for result.json."""
     labelled, snapshots = calibration.labelled, calibration.labelled.snapshots
     used, total = labelled.moment_counts
     seen = calibration.observations.seen
@@ -241,7 +241,7 @@ def _object_summary(calibration: Calibration) -> list[dict[str, Any]]:
 
 
 def _named(obj: CalibrationObject, fiducial: int) -> int | str:
-    """What people call a fiducial: its row; with several objects, also that of its object."""
+    """Name a fiducial by its row; with several objects, by the object and its row there."""
     if not obj.parts:
         return fiducial
     part = int(obj.part_of[fiducial])
@@ -260,7 +260,7 @@ def _guess_summary(calibration: Calibration) -> dict[str, Any] | None:
 def refused_summary(
     refusal: RefusedError, detections: Detections, rig: CameraRig, seconds: dict[str, float]
 ) -> dict[str, Any]:
-    """Say why there is no result, with the same keys."""
+    """Summarize a refusal under the same keys."""
     moved = refusal.moved if isinstance(refusal, MovedError) else ()
     return {
         "version": imgcal.__version__,
@@ -303,7 +303,7 @@ def refused_summary(
 
 
 def predicted_line(predicted: dict[str, Any]) -> str:
-    """Say in one line how good the rig is where it is used."""
+    """Describe in one line the predicted error where the rig is used."""
     lengths = [
         f"{value:.2g} {unit} (95 %: {p95:.2g})"
         for unit in ("mm", "px")
@@ -325,7 +325,7 @@ def _offsets(result: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bool) -> None:
-    """Say on the terminal what was found, and where it is written; notes go to standard error."""
+    """Print what was found and where it was written; notes go to standard error."""
     guess = result["first_guess"]
     alone = None if guess is None else guess["rms_px"]
     network = "" if alone is None else f"network alone {alone:.3f} px, "

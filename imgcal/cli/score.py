@@ -30,7 +30,7 @@ class Score(arguments.Score):
 
 
 def summary(scored: RigScore, rig: CameraRig) -> dict[str, object]:
-    """Put a score into the form that scripts read: robust figures first."""
+    """Summarize a score as plain values, robust figures first."""
     per_camera = {}
     for camera, name in enumerate(rig.camera_names):
         seen, outlier = scored.seen[:, camera], scored.outliers[:, camera]

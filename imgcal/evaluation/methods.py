@@ -107,7 +107,7 @@ class Method:
 def keep_factory_rig(given: Given) -> Prediction:
     """Keep the factory rig and fit only the object's pose: what a tracking system does that is not recalibrated.
 
-    With the true pose RE would be larger, and nobody knows it. Least squares over all cameras, Huber's loss beyond what
+    With the true pose, which is not known, RE would be larger. Least squares over all cameras, Huber's loss beyond what
     a drifted rig misses by.
     """
     observations = make_observations(given.uv, given.seen, max(given.sigma, DRIFTED_SIGMA))
@@ -130,7 +130,7 @@ def factory_from_pnp(given: Given) -> Prediction:
 def steps_from_factory(count: int) -> Predict:
     """Make so many Levenberg-Marquardt steps of MAP estimation from the factory rig and a pose by PnP.
 
-    The same compiled steps, loss and prior as in `map_from_pnp`, which goes on until it has converged. What a network
+    The same compiled steps, loss and prior as in `map_from_pnp`, which continues until it has converged. What a network
     alone must be measured by: it, too, is given labelled points, the factory rig and the spread of its drift.
     """
     return partial(map_from_pnp, options=EstimationOptions(max_iterations=count))

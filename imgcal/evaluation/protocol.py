@@ -193,8 +193,8 @@ def evaluate(
         conditions: what rigs are drawn from, and how their views are corrupted.
         protocol: how many rigs; the same seed gives the same rigs, whatever the methods are.
         progress: called after each batch.
-        mapped: who measures batches; called as `map` is. Rigs are drawn here and travel, so that their random numbers
-            depend on nobody: the numbers are the same, whoever measures (`imgcal.fleet.workers`).
+        mapped: measures batches; called like `map`. Rigs are drawn here and sent along, so that the results do not
+            depend on who measures (`imgcal.fleet.workers`).
 
     Raises:
         RefusedError: too few random rigs see the whole object.

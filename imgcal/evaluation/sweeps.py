@@ -64,7 +64,7 @@ def sweep(
 ) -> Sweep:
     """Evaluate along an axis, everything else as it stands, from equal random numbers.
 
-    The spread that refinement is told is that of the drift at each point; networks stay what they were trained for.
+    Refinement gets the spread of the drift at each point; networks stay what they were trained for.
 
     Args:
         methods: by name.

@@ -26,7 +26,7 @@ FORMAT = "imgcal-evaluation/1"
 
 @dataclass(frozen=True)
 class Facts:
-    """What is known about a network beside its errors."""
+    """Facts about a network other than its errors."""
 
     parameters: int
     size: int  # bytes of the file

@@ -24,7 +24,7 @@ from imgcal.fleet.drift_information import KINDS, DriftInformation
 from imgcal.types import PARAMETER_KINDS, RigPrior
 
 SIGMAS = 5.0
-"""How surely a camera must be out of the fleet's spread to be called an outlier (two sides of a Gaussian)."""
+"""Standard deviations (two-sided) outside the fleet's spread from which a camera is an outlier."""
 LEAST_KNOWN = 0.01
 """Part of a direction's prior variance that the images must take away for the direction to be tested."""
 LEAST_DEVICES = 8
@@ -317,8 +317,8 @@ def _outliers(drift: DriftInformation, model: _Model, theta: Tensor) -> list[Out
 def _surprise(drift: DriftInformation, variance: Tensor, freed: Tensor) -> tuple[Tensor, Tensor]:
     """How many standard deviations (D, C) each camera is out of the spread, and the kind that says most (D, C).
 
-    Each kind of value is tested by itself and all of a camera together; what is said is of the least probable, paid
-    for by the number of tests.
+    Each kind of value is tested by itself and all of a camera together; the least probable one counts, corrected
+    for the number of tests.
     """
     cameras = freed.shape[1]
     variance = variance * _freeing(freed, drift.parameters)

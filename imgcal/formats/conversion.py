@@ -31,7 +31,7 @@ LENGTH = re.compile(r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)?\s*([a-z]+)")
 
 @dataclass(frozen=True)
 class Held:
-    """A rig whose lenses a target format can express."""
+    """A rig whose lenses a target format can store."""
 
     rig: ForeignRig
     fits: tuple[Fit, ...]  # one a camera
@@ -65,7 +65,7 @@ def millimetres(unit: str, what: str = "--unit") -> float:
 def in_millimetres(
     rig: ForeignRig, where: str, unit: str | None = None, distance: tuple[str, str, float] | None = None
 ) -> ForeignRig:
-    """Put a rig's lengths into millimetres.
+    """Convert a rig's lengths to millimetres.
 
     Args:
         rig: as it was read.
@@ -83,7 +83,7 @@ def in_millimetres(
     stated = unit if unit is not None else rig.unit
     if stated is None and len(rig.cameras) > 1:
         raise InputError(
-            f"{where}: its unit of length is not said in the file: state it with --unit mm, cm, m, inch, or the length "
+            f"{where}: the file does not state its unit of length: give it with --unit mm, cm, m, inch, or the length "
             "of one unit (--unit 417.2mm), or give a known distance of two cameras (--distance NAME NAME MM), to "
             'imgcal convert; in Python load_rig(..., unit="mm")'
         )
@@ -141,7 +141,7 @@ def fill_image_sizes(rig: ForeignRig, where: str, sizes: Mapping[str, tuple[int,
 
 
 def fit_to_target(rig: ForeignRig, holds: Holds, title: str, limit: float = LIMIT) -> Held:
-    """Say every lens in a model of the target.
+    """Express every lens in a model of the target.
 
     Raises:
         RefusedError: the target's models are farther than `limit` pixels from a lens, somewhere in its image.
@@ -164,7 +164,7 @@ def fit_to_target(rig: ForeignRig, holds: Holds, title: str, limit: float = LIMI
 
 
 def lens_refusal(camera: ForeignCamera, fit: Fit, title: str, nearest: str, limit: float) -> str:
-    """Say that a lens does not come near enough; `nearest` names what comes nearest."""
+    """Explain that no lens of the target comes near enough; `nearest` names the one that comes nearest."""
     off = f"by {fit.worst:.3g} px" if np.isfinite(fit.worst) else "by any amount in a part of the image"
     return (
         f"camera {camera.name}: {title} cannot say its lens ({describe_lens(camera.lens)}): {nearest} is off {off}, "
@@ -173,7 +173,7 @@ def lens_refusal(camera: ForeignCamera, fit: Fit, title: str, nearest: str, limi
 
 
 def fit_note(camera: ForeignCamera, fit: Fit) -> str:
-    """Say how well a lens that was fitted takes the place of a camera's own."""
+    """Describe how well a fitted lens replaces the camera's own."""
     return (
         f"camera {camera.name}: {describe_lens(camera.lens)} -> {describe_lens(fit.lens)}, fitted over the image: "
         f"worst {fit.worst:.2g} px, RMS {fit.rms:.2g} px"
@@ -181,14 +181,14 @@ def fit_note(camera: ForeignCamera, fit: Fit) -> str:
 
 
 def describe_lens(lens: Lens) -> str:
-    """Say in a few words what a lens is."""
+    """Describe a lens in a few words."""
     kinds = {"opencv": "OpenCV", "fisheye": "fisheye, equidistant", "to_ideal": "image to ideal"}
     skew = ", skewed" if lens.skew else ""
     return f"{kinds[lens.model]}, {lens.length} coefficient{'s' if lens.length != 1 else ''}{skew}"
 
 
 def to_camera_rig(rig: ForeignRig, name: str) -> CameraRig:
-    """Make a `CameraRig` of a rig in millimetres whose lenses it can say (`fit_to_target`); `name` is for one without.
+    """Make a `CameraRig` of a rig in millimetres whose lenses it can store (`fit_to_target`); `name` is the default.
 
     Raises:
         InputError: a value that no rig has.

@@ -19,7 +19,7 @@ DEPTHS = (0.5, 1.0, 4.0)  # in units of the rig's size
 
 
 class FormatError(InputError):
-    """Why a file that was recognized holds no calibration; who reads it puts the file and the format before it."""
+    """A recognized file holds no calibration. The reader prepends the file and the format."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Place:
 
 @dataclass(frozen=True)
 class ForeignCamera:
-    """One camera of a file that knows where it stands."""
+    """One camera of a file, with its pose."""
 
     name: str
     lens: Lens
@@ -71,7 +71,7 @@ def unplaced_camera(name: str, lens: Lens, image_size: tuple[int, int] | None) -
 
 @dataclass(frozen=True)
 class ForeignRig:
-    """Cameras in a common frame, as a file of another tool has them."""
+    """Cameras in a common frame, as in another tool's file."""
 
     format: str  # name, as `--from` and `--to` have it
     cameras: tuple[ForeignCamera, ...]
@@ -80,7 +80,9 @@ class ForeignRig:
     notes: tuple[str, ...] = ()  # what was assumed, and what was left out
     covariance: RigCovariance | None = None
     root: int | None = None  # the camera whose frame is the rig's by definition; None = the frame is a world
-    own: CameraRig | None = None  # that it was made of: what other tools have no words for (prior, volume, ...)
+    own: CameraRig | None = (
+        None  # what this was made from, for values that other tools lack (prior, volume, ...)
+    )
 
     @property
     def names(self) -> list[str]:
@@ -101,7 +103,7 @@ class ForeignRig:
 
 
 def known_points(rig: ForeignRig) -> list[Array]:
-    """Points before each camera, all over its image and in three depths: (N, 3) in the rig's frame, one array a camera.
+    """Points in front of each camera, all over its image at three depths: (N, 3) in the rig's frame, one array each.
 
     Pixels that a lens has no ray for (beyond its fold) give none.
     """
@@ -118,7 +120,7 @@ def known_points(rig: ForeignRig) -> list[Array]:
 
 
 def worst_difference(rig: ForeignRig, other: ForeignRig) -> tuple[float, int]:
-    """How far two rigs in the same unit are apart in the images, cameras in the same order.
+    """Compare two rigs in the same unit, with cameras in the same order, by the pixels of known points.
 
     The rig's frame is free: points are taken from one to the other through the first camera.
 

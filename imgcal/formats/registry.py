@@ -140,7 +140,7 @@ def recognize_format(source: Source) -> Format:
 
 
 def _check_requested(source: Source, one: Format) -> Format:
-    """A format that the user names instead of the content: the file must be able to be one."""
+    """Check that a file can be of the format that the user names."""
     try:
         if (one.accepts or one.recognizes)(source):
             return one
@@ -150,7 +150,7 @@ def _check_requested(source: Source, one: Format) -> Format:
 
 
 def _other(source: Source) -> str:
-    """Which format it is instead, in words; empty where it is none."""
+    """Name the format that it is instead; empty if none."""
     try:
         found = recognize_format(source)
     except InputError:
@@ -170,7 +170,7 @@ def is_foreign(path: Path) -> bool:
 
 
 def _instead(source: Source) -> str:
-    """What a source without a rig is, as far as can be told."""
+    """Explain what a source without a rig is, as far as it can be recognized."""
     values = merge_storages(source)
     if is_matrix(values.get("camera_matrix")) or is_matrix(values.get("cameraMatrix")) or is_matrix(values.get("K")):
         return (

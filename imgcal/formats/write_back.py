@@ -1,4 +1,4 @@
-"""A recalibrated rig in the user's own file: its numbers replaced, and read back before anybody gets it."""
+"""Write a recalibrated rig into the user's own file: replace its numbers, and read them back before writing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STAYED = 1e-6  # px: a camera that is off by less from what the file says has no
 
 @dataclass(frozen=True)
 class Updated:
-    """The files of a calibration with other numbers, and how well they say the rig."""
+    """The files of a calibration with new numbers, and how well they represent the rig."""
 
     files: dict[str, bytes]
     title: str  # of the format
@@ -36,7 +36,7 @@ class Updated:
     changed: tuple[str, ...]  # cameras
     kept: tuple[str, ...]  # cameras that stayed as they were
     reread: float  # px, of what is read back against what was to be written
-    loss: Fit | None  # of the lens that is said worst; None = all are exact
+    loss: Fit | None  # of the lens that fits worst; None = all are exact
     points: int  # known points that were compared
 
 
@@ -63,7 +63,7 @@ def write_into(
 
     Raises:
         InputError: one line: the files cannot be read or are our own, have other cameras, or cannot be followed.
-        RefusedError: the file's lens model comes not near enough.
+        RefusedError: the file's lens model does not come near enough.
     """
     where = ", ".join(map(str, original))
     for path in original:
@@ -161,7 +161,7 @@ def _check_fits(
 
 
 def _is_unchanged(camera: ForeignCamera, new: ForeignCamera) -> bool:
-    """Tell whether the file says a camera as it is now."""
+    """Tell whether the file already has a camera as it is now."""
     one, other = (ForeignRig("", (replace(c, image_size=new.image_size),), None, "") for c in (camera, new))
     near = np.allclose(camera.centre, new.centre, rtol=1e-9, atol=1e-9)
     turned = np.allclose(camera.rotation, new.rotation, rtol=0, atol=1e-10)
@@ -169,7 +169,7 @@ def _is_unchanged(camera: ForeignCamera, new: ForeignCamera) -> bool:
 
 
 def _frame_notes(where: str, old: ForeignRig, wanted: ForeignRig, found: Mapping[str, ForeignCamera]) -> list[str]:
-    """Say where the frame of the rig is not that of the file: cameras that are not in the rig would stay behind.
+    """Report a rig whose frame is not the file's: cameras that are not in the rig would stay behind.
 
     Raises:
         FormatError: there are some.
@@ -219,11 +219,11 @@ def _list_files(original: Sequence[Path]) -> list[Path]:
 
 
 def _changes(old: ForeignRig, wanted: ForeignRig) -> dict[Path, list[Change]]:
-    """What is to stand where: the numbers of the same places, of the cameras before and after."""
+    """Collect the numbers to replace: for each place in the files, those of the camera before and after."""
     changes: dict[Path, list[Change]] = {}
     for camera, new in zip(old.cameras, wanted.cameras, strict=True):
         if not camera.places:
-            raise FormatError(f"camera {camera.name}: where its numbers stand is not known: it is only read")
+            raise FormatError(f"camera {camera.name}: this format can only be read, not written back")
         for place in camera.places:
             base = place.relative_to
             before = camera if base is None else camera.in_frame_of(old.cameras[base])
@@ -238,7 +238,7 @@ def _changes(old: ForeignRig, wanted: ForeignRig) -> dict[Path, list[Change]]:
 def _patch(
     contents: Mapping[Path, bytes], changes: Mapping[Path, list[Change]], digits: int, now: datetime
 ) -> tuple[dict[str, bytes], list[str]]:
-    """The files of a calibration by name, and what is to be said of their times."""
+    """Patch the files of a calibration, by name; also returns notes about their time stamps."""
     files: dict[str, bytes] = {}
     notes: list[str] = []
     for path, content in contents.items():

@@ -1,4 +1,4 @@
-"""A rig in the files of a tool, read back and compared before anybody gets them."""
+"""Write a rig as another tool's files; they are read back and compared before they are written."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MOST_PX = 1e-6  # that a file may be off when it is read back: the digits of a d
 
 @dataclass(frozen=True)
 class Written:
-    """Files that say a rig, and how well they say it."""
+    """The files of a rig, and how well they represent it."""
 
     files: Files
     notes: tuple[str, ...]  # what the target has no place for, and which lenses were fitted
@@ -58,7 +58,7 @@ def convert_rig(
 
     Raises:
         InputError: the format is only read, or it cannot hold so many cameras.
-        RefusedError: a lens cannot be said within `limit`.
+        RefusedError: a lens cannot be expressed within `limit`.
     """
     if to == OURS:
         held = fit_to_target(rig, NATIVE, "a rig file of ours", limit)
@@ -103,7 +103,7 @@ def convert_rig(
 
 
 def _valid_covariance(held: Held) -> RigCovariance | None:
-    """The uncertainty is that of the parameters as they were: with fitted ones it is another."""
+    """The uncertainty of the rig, where no lens was fitted: fitted parameters have another one."""
     return held.rig.covariance if all(fit.exact for fit in held.fits) else None
 
 

@@ -113,7 +113,7 @@ def model_file(path: str | Path) -> Path:
     """Find a trained network: a file, the folder of a training run, or the bare name of a shipped one.
 
     Returns:
-        A path that may not exist: who reads it says so.
+        A path that may not exist; reading it reports that.
 
     Raises:
         InputError: a folder without a trained network.

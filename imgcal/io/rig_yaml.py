@@ -1,4 +1,4 @@
-"""Reading and writing rig files: YAML, `format: imgcal-rig/1`; what one may hold is said in `rig_schema.py`."""
+"""Reading and writing rig files: YAML, `format: imgcal-rig/1`; `rig_schema.py` defines what they may hold."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def save_rig(
         path: the file to write.
         covariance: one standard deviation of every parameter goes to its camera, to 6 digits; None = not written.
         full: write the whole covariance matrix, too (half a megabyte for 10 cameras).
-        posterior: goes to a file beside it, from which `load_rig` attaches it to the rig; None = not written.
+        posterior: written to a file beside it, from which `load_rig` attaches it to the rig; None = not written.
 
     Raises:
         InputError: the file cannot be written, or the rig could not be read again (NaN, for example).

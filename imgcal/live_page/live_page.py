@@ -141,8 +141,8 @@ class LivePage:
         if self.address.local:
             return f"live page: {self.url} (this machine only)"
         return (
-            f"live page: {self.url}\nwhoever has this address with its token can watch and command the rig; what is "
-            "sent is not encrypted"
+            f"live page: {self.url}\nanyone with this address and its token can watch and command the rig; the "
+            "connection is not encrypted"
         )
 
     def publish(self, state: RigState, frames: Mapping[str, Frame | None] | None = None) -> None:

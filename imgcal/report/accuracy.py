@@ -25,7 +25,7 @@ MAP = len(MAP_DEPTHS) // 2
 
 
 def sentences(content: ReportContent) -> tuple[str, ...]:
-    """Say in plain words how well the working volume is known, and where it is not; nothing if nothing is known."""
+    """Describe in plain words how accurate the rig is over the working volume; nothing if that is not known."""
     predicted = content.predicted
     if predicted is None or not math.isfinite(predicted.median_px):
         return ()

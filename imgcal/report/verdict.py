@@ -15,7 +15,7 @@ from imgcal.report.content import NOT_IDENTIFIED, ReportContent
 from imgcal.report.svg import group_digits, pixels
 
 CROWDED = 1.0
-"""Blobs that belong to nothing, in parts of those that are used, from which on it is said."""
+"""Blobs without a label, as a share of the used ones, from which the report mentions them."""
 
 
 def unexplained_sentences(content: ReportContent) -> list[tuple[str, str]]:
@@ -28,7 +28,7 @@ def unexplained_sentences(content: ReportContent) -> list[tuple[str, str]]:
         for move in content.moves
     ]
     notes += [
-        (f"{words[:1].upper()}{words[1:]}; these took no part.", "Export the frames of that camera anew, all of them.")
+        (f"{words[:1].upper()}{words[1:]}; these took no part.", "Export all frames of that camera again.")
         for words in content.late
     ]
     notes += [

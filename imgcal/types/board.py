@@ -14,7 +14,7 @@ from imgcal.errors import InputError
 
 BoardKind = Literal["charuco", "aprilgrid", "checkerboard", "circles"]
 WARP = 0.002
-"""Of the longer side: deflection in its middle, one standard deviation, of a board of which nothing is said."""
+"""Of the longer side: deflection in its middle, one standard deviation, of a board whose file does not say."""
 
 
 @dataclass(frozen=True)
