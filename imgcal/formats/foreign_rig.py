@@ -80,9 +80,7 @@ class ForeignRig:
     notes: tuple[str, ...] = ()  # what was assumed, and what was left out
     covariance: RigCovariance | None = None
     root: int | None = None  # the camera whose frame is the rig's by definition; None = the frame is a world
-    own: CameraRig | None = (
-        None  # what this was made from, for values that other tools lack (prior, volume, ...)
-    )
+    own: CameraRig | None = None  # what this was made from, for values that other tools lack (prior, volume, ...)
 
     @property
     def names(self) -> list[str]:

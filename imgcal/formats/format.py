@@ -23,9 +23,7 @@ class Format:
     read: Callable[[Source], ForeignRig]
     write: Callable[[ForeignRig], Files] | None = None  # in `unit`; None = read only
     holds: Holds = Holds()  # which lenses it can store
-    accepts: Callable[[Source], bool] | None = (
-        None  # what to read if the user names the format; None = `recognizes`
-    )
+    accepts: Callable[[Source], bool] | None = None  # what to read if the user names the format; None = `recognizes`
     unit: str = "m"  # of what is written
     states_unit: bool = False  # the file, or the tool's custom, says what its unit is
     from_first: bool = False  # its rig frame is its first camera's
