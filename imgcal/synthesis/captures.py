@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
+from typing import Any
 
 import numpy as np
 import torch
@@ -159,13 +160,9 @@ def _joined(parts: Sequence[Spots]) -> Spots:
     if len(parts) == 1:
         return parts[0]
     smears = [part.smear for part in parts if part.smear is not None]
-    spots = Spots(
-        uv=torch.cat([part.uv for part in parts], 1),
-        shape=torch.cat([part.shape for part in parts], 1),
-        intensity=torch.cat([part.intensity for part in parts], 1),
-        visible=torch.cat([part.visible for part in parts], 1),
-        depth=torch.cat([part.depth for part in parts], 1),
-    )
+    names = ("uv", "shape", "intensity", "visible", "depth")
+    joined: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts], 1) for name in names}
+    spots = Spots(**joined)
     if not smears:
         return spots
     return replace(

@@ -398,11 +398,5 @@ class CameraRig:
 
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> CameraRig:
         """Change the floating-point type, move to a device, or both."""
-        return replace(
-            self,
-            focal_length=self.focal_length.to(dtype=dtype, device=device),
-            principal_point=self.principal_point.to(dtype=dtype, device=device),
-            distortion=self.distortion.to(dtype=dtype, device=device),
-            cam_from_rig=self.cam_from_rig.to(dtype=dtype, device=device),
-            image_size=self.image_size.to(device=device),
-        )
+        moved = self.map_tensors(lambda tensor, _: tensor.to(dtype=dtype, device=device))
+        return replace(moved, image_size=self.image_size.to(device=device))
