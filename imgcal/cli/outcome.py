@@ -117,7 +117,7 @@ def counts_by_snapshot(calibration: Calibration) -> dict[str, dict[str, int]]:
 
 def blobs_by_camera(detections: Detections, rig: CameraRig) -> dict[str, dict[str, Any]]:
     """Count the blobs of each camera of a refused capture."""
-    found = np.bincount(detections.camera, minlength=len(detections.camera_names)).tolist()
+    found = detections.count_by_camera().tolist()
     blobs = dict(zip(detections.camera_names, found, strict=True))
     return {name: {"blobs": blobs.get(name, 0), "labelled": None, "outliers": None} for name in rig.camera_names}
 

@@ -136,7 +136,7 @@ class ReportContent:
     @cached_property
     def observations(self) -> NDArray[np.int64]:
         """Used blobs of each camera: (C,)."""
-        return np.bincount(self.detections.camera[self.used], minlength=len(self.cameras))
+        return self.detections.count_by_camera(self.used)
 
     @cached_property
     def change(self) -> Array | None:

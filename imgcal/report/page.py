@@ -123,7 +123,7 @@ def _coverage(content: ReportContent) -> dict[str, object]:
     limits = charts.coverage_limits(content)
     fitted, labelled = content.used.any(), content.labels >= 0
     rows = content.used if fitted else labelled if labelled.any() else np.ones_like(labelled)
-    counts = np.bincount(content.detections.camera[rows], minlength=len(content.cameras))
+    counts = content.detections.count_by_camera(rows)
 
     def words(camera: int) -> str:
         number = f"{svg.group_digits(int(counts[camera]))} blobs"
@@ -207,7 +207,7 @@ def _subsampling(content: ReportContent) -> list[str]:
             f"The scatter shows {svg.group_digits(charts.LARGEST_SCATTER)} of {svg.group_digits(used)} residuals."
         )
     panel = charts.panel_size(content)
-    if len(content.detections) and int(np.bincount(content.detections.camera).max()) > panel:
+    if int(content.detections.count_by_camera().max()) > panel:
         notes.append(f"The coverage shows at most {panel} observations of each camera.")
     snapshots, fiducials = scene.choose_fiducials(content)
     total = 0 if content.object_points is None else len(content.object_points)
@@ -215,7 +215,6 @@ def _subsampling(content: ReportContent) -> list[str]:
     if len(snapshots) and (len(snapshots) < known or len(fiducials) < total):
         notes.append(f"The rig shows {len(snapshots)} snapshots and {len(fiducials)} of {total} fiducials in each.")
     d = content.detections
-    in_frame = np.bincount(d.camera[d.snapshot == content.frame_snapshot], minlength=1)
-    if int(in_frame.max()) > overlay.blobs_drawn(content):
+    if int(d.count_by_camera(d.snapshot == content.frame_snapshot).max()) > overlay.blobs_drawn(content):
         notes.append(f"The overlays show at most {overlay.blobs_drawn(content)} blobs of each camera.")
     return notes

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from imgcal.geometry import LENS_MODELS
 from imgcal.report import svg
 from imgcal.report.content import ReportContent
@@ -64,7 +62,7 @@ def camera_rows(content: ReportContent) -> list[CameraRow]:
     count = len(content.cameras)
     before = content.rms_by(content.detections.camera, content.residual_before, count)
     after = content.rms_by(content.detections.camera, content.residual_after, count)
-    blobs = np.bincount(content.detections.camera, minlength=count)
+    blobs = content.detections.count_by_camera()
     rows = []
     for i, name in enumerate(content.cameras):
         groups = tuple(_changes(content, i, *group[1:]) for group in GROUPS) if content.change is not None else ()

@@ -38,8 +38,8 @@ def unexplained_sentences(content: ReportContent) -> list[tuple[str, str]]:
         )
         for words in content.doubtful
     ]
-    used = np.bincount(content.detections.camera[content.used], minlength=len(content.cameras))
-    blobs = np.bincount(content.detections.camera, minlength=len(content.cameras))
+    used = content.observations
+    blobs = content.detections.count_by_camera()
     if content.unexplained is not None:
         for camera in np.flatnonzero(content.unexplained > DOUBTFUL * np.maximum(content.unexplained + used, 1)):
             name = content.cameras[camera]
@@ -229,7 +229,7 @@ def _figures(content: ReportContent) -> tuple[KeyFigure, ...]:
 
 def _refused_verdict(content: ReportContent) -> Verdict:
     d = content.detections
-    blobs = np.bincount(d.camera, minlength=len(content.cameras))
+    blobs = d.count_by_camera()
     labelled = int((content.labels >= 0).sum())
     total = len(content.snapshots)
     used = sum(not s.reason for s in content.snapshots)
@@ -258,7 +258,7 @@ def _helpful(content: ReportContent) -> list[str]:
             "Look at the frames of that camera before and after: a hand or a reflection in front of it, or a frame of "
             "another moment, can look like a motion.",
         ]
-    blobs = np.bincount(content.detections.camera, minlength=len(content.cameras))
+    blobs = content.detections.count_by_camera()
     total, labelled = len(content.detections), int((content.labels >= 0).sum())
     blind = [name for name, n in zip(content.cameras, blobs, strict=True) if n == 0]
     steps = []
