@@ -37,7 +37,7 @@ Status = Literal["calibrated", "refused", "wrong"]
 
 @dataclass(frozen=True)
 class Scene:
-    """What captures are drawn from; the seed of a capture decides the rest."""
+    """What captures are drawn from; the seed of a capture determines the rest."""
 
     rig: CameraRig  # factory, float64, without batch axes
     obj: CalibrationObject

@@ -78,7 +78,7 @@ Passes = Callable[[Given], tuple[Prediction, ...]]
 
 @dataclass(frozen=True)
 class Refined:
-    """What a refinement came to, and where it has to be said that it failed."""
+    """The result of a refinement, and where it failed."""
 
     prediction: Prediction  # (B,)
     found: Tensor  # (B,) bool; False: what was seen contradicts the rig, or no minimum was found
@@ -128,7 +128,7 @@ def factory_from_pnp(given: Given) -> Prediction:
 
 
 def steps_from_factory(count: int) -> Predict:
-    """Make so many Levenberg-Marquardt steps of MAP estimation from the factory rig and a pose by PnP.
+    """Make a method of `count` Levenberg-Marquardt steps of MAP estimation from the factory rig and a pose by PnP.
 
     The same compiled steps, loss and prior as in `map_from_pnp`, which continues until it has converged. What a network
     alone must be measured by: it, too, is given labelled points, the factory rig and the spread of its drift.
@@ -143,7 +143,7 @@ def robust_from_pnp(given: Given) -> Prediction:
 
 
 def refine_by_points(prediction: Prediction, given: Given) -> Refined:
-    """`refine_robustly` with what is given; it has failed where most points are outliers to the rig that it found."""
+    """Refine robustly; it has failed where most points are outliers to the rig that it found."""
     options = RobustOptions()
     known, sigma = (given.factory, given.obj, given.prior_std), given.sigma
     result = refine_robustly(prediction, given.views, *known, sigma=sigma, options=options)

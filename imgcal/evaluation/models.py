@@ -42,7 +42,7 @@ class Model:
 
     @property
     def facts(self) -> Facts:
-        """What reports say about it."""
+        """What reports show about it."""
         spec = self.checkpoint.experiment.model_dump()  # with what networks do not know of it
         seed = (spec.get("training") or {}).get("seed", 0)
         return Facts(self.parameters, self.size, self.history, spec.get("name"), int(seed))

@@ -53,7 +53,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Trend:
-    """How a value follows something that was measured, temperature for example."""
+    """How a value depends on something that was measured, such as temperature."""
 
     covariate: str
     camera: str
@@ -89,7 +89,7 @@ class LearntPrior:
 
 @dataclass(frozen=True)
 class _Model:
-    """Which variances there are: rows of a matrix whose sum, weighted with them, is each parameter's variance."""
+    """The variances to find; masks weighted with them add up to each parameter's variance."""
 
     masks: Tensor  # (K, P) of zeros and ones
     features: Tensor  # (K, D) factor of each device: 1, or hours

@@ -65,12 +65,12 @@ LONGEST_NAME = 200  # bytes: file systems end at 255, and something is put behin
 
 
 def natural_key(name: str) -> tuple[list[str | int], str]:
-    """Sort key that counts: "2" before "10"; equal numbers ("1", "01") stay apart."""
+    """Make a sort key in which "2" comes before "10"; equal numbers ("1", "01") stay apart."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)], name
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Name the known name that was probably meant: `, nearest: cam01`, or nothing if none is near."""
+    """Suggest the known name that was probably meant: `, nearest: cam01`, or nothing if none is near."""
     names = {candidate.lower(): candidate for candidate in known}
     matches = difflib.get_close_matches(name.lower(), names, n=1)
     return f", nearest: {names[matches[0]]}" if matches else ""

@@ -83,7 +83,7 @@ def rig_from_text(text: str, where: str) -> CameraRig:
 
 
 def load_rig_covariance(path: str | Path) -> RigCovariance | None:
-    """Read the uncertainty that stands in a rig file; None when it has none. Arguments and errors as for `load_rig`."""
+    """Read the uncertainty in a rig file; None if it has none. Arguments and errors as for `load_rig`."""
     content, _ = _read(path)
     if content.covariance is None:
         return None
@@ -223,7 +223,7 @@ def _volume_entry(volume: Volume) -> dict[str, Any]:
 
 
 def _narrow(covariance: RigCovariance, rig: CameraRig) -> RigCovariance:
-    """Leave out coefficients that no camera has: some of a wider rig."""
+    """Leave out coefficients that no camera of the rig has."""
     cameras, kept = rig.num_cameras, len(parameter_names(rig.lens_models))
     matrix = covariance.matrix
     if matrix is not None and kept < covariance.std.shape[1]:

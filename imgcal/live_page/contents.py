@@ -39,7 +39,7 @@ def greeting(
     actions: Sequence[Action],
     title: str,
 ) -> dict[str, Any]:
-    """The first message to the server."""
+    """Make the first message to the server."""
     return {
         "address": address,
         "token": token,
@@ -58,7 +58,7 @@ def greeting(
 
 
 def state_message(state: RigState, obj: CalibrationObject) -> dict[str, Any]:
-    """What changes with every snapshot."""
+    """Describe what changes with every snapshot."""
     pose = state.rig_from_object
     points = None if pose is None else pose.apply(obj.points.to(pose.translation)).detach().reshape(-1, 3).numpy()
     blobs = state.detections
@@ -76,7 +76,7 @@ def state_message(state: RigState, obj: CalibrationObject) -> dict[str, Any]:
 
 
 def event_message(event: Event) -> dict[str, Any]:
-    """One event; numbers that are not finite are left out."""
+    """Describe one event; numbers that are not finite are left out."""
     return {
         name: getattr(event, name)
         for name in ("time", "snapshot", "kind", "camera", "since", "change", "size", "sigma", "unit", "message")

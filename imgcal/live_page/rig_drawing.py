@@ -107,7 +107,7 @@ def arrangement(rig: CameraRig, volume: WorkingVolume) -> dict[str, Any]:
 
 
 def upright(centres: Array, axes: Array, middle: Array) -> Array:
-    """Which way is up (3,): where most cameras' images have their top, or away from the object, across the cameras.
+    """Find the up direction (3,): the top of most cameras' images, or away from the object, across the cameras.
 
     Examples:
         >>> upright(np.eye(3), np.stack([np.eye(3)] * 3), np.zeros(3))  # upright OpenCV cameras: y is down
@@ -123,7 +123,7 @@ def upright(centres: Array, axes: Array, middle: Array) -> Array:
 
 
 def forward(centres: Array, axes: Array, up: Array) -> Array:
-    """Which way most cameras look (3,), level; the longest side of a rig that looks inwards."""
+    """Find the level direction (3,) in which most cameras look; the longest side of a rig that looks inwards."""
     mean = axes[:, 2].mean(0)
     level = mean - (mean @ up) * up
     if np.linalg.norm(level) < CLEAR:

@@ -37,7 +37,7 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Taught:
-    """One kind of rig, and what its devices teach; or why they do not."""
+    """One kind of rig, and the prior learnt from its devices, or why there is none."""
 
     kind: KindOfRig
     learnt: LearntPrior | None
@@ -130,7 +130,7 @@ def _finite(values: Sequence[float | None]) -> NDArray[np.float64]:
 
 
 def _histogram(title: str, values: NDArray[np.float64], normal: bool = False) -> Markup:
-    """Draw how values are distributed; beside the unit normal where that is what they should follow."""
+    """Draw the distribution of values, beside the unit normal where they should follow it."""
     values = values[np.isfinite(values)]
     if not len(values):
         return Markup("<p>Nothing to show.</p>")

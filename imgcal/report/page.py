@@ -199,7 +199,7 @@ def _overlays(content: ReportContent) -> dict[str, object]:
 
 
 def _subsampling(content: ReportContent) -> list[str]:
-    """Say what is not drawn in full. All numbers and the histogram use everything."""
+    """List what is drawn only in part. All numbers and the histogram use everything."""
     notes = []
     used = int(content.used.sum())
     if used > charts.LARGEST_SCATTER:

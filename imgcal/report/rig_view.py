@@ -77,7 +77,7 @@ def rig_view_script() -> str:
 
 
 def up_axis(rig: CameraRig) -> Array:
-    """What is up for most cameras, in the rig's frame: (3,) of length 1; an axis of the frame where one is near.
+    """The up direction of most cameras, in the rig's frame: (3,) of length 1; an axis of the frame where one is near.
 
     Where the cameras do not agree, the frame's own up is taken, that of an image: -y.
     """

@@ -101,7 +101,7 @@ class Verdict:
 
 
 def judge(content: ReportContent) -> Verdict:
-    """Put the result into words."""
+    """Summarize the result in words."""
     if content.status == "refused" or content.recalibrated is None:
         return _refused_verdict(content)
     reservations = _reservations(content)
@@ -135,7 +135,7 @@ def _improvement(content: ReportContent) -> str:
 
 
 def _movement(content: ReportContent) -> tuple[str, ...]:
-    """Say which cameras moved most."""
+    """Name the cameras that moved most."""
     if content.change is None or content.std is None or content.from_scratch:
         return ()
     if len(content.cameras) == 1:
@@ -251,7 +251,7 @@ def _refused_verdict(content: ReportContent) -> Verdict:
 
 
 def _helpful(content: ReportContent) -> list[str]:
-    """What would help a refused run, as far as the detections show."""
+    """Advise what would help a refused run, as far as the detections show."""
     if content.moves:
         return [
             "Fasten what has moved, and capture again.",

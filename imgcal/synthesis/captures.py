@@ -32,7 +32,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Truth:
-    """What a capture was made from."""
+    """The truth behind a capture."""
 
     rig: CameraRig  # the drifted rig
     rig_from_object: RigidTransform  # (S,)
@@ -125,7 +125,7 @@ def simulate_shots(
 
 
 def join_truths(truths: Sequence[Truth]) -> Truth:
-    """Put objects that move by themselves before one rig into one capture."""
+    """Join captures of one rig, in each of which another object moves by itself."""
     if len(truths) == 1:
         return truths[0]
     visible = None

@@ -53,7 +53,7 @@ class Degradation(StrictRecord):
         options: ImageOptions,
         generator: torch.Generator,
     ) -> tuple[Tensor, Corrupted]:
-        """Draw what an image network is given of labelled points, everything on their device.
+        """Draw the images of labelled points that an image network gets, on the device of the points.
 
         Args:
             views: uv (B, C, N, 2) pixels of the sensor, and seen (B, C, N).

@@ -90,7 +90,7 @@ class Board:
 
     @property
     def warp_std(self) -> float:
-        """What each deflection may be off, mm."""
+        """Standard deviation of each deflection, mm."""
         return WARP * float(np.ptp(self._flat, axis=0).max()) if self.warp is None else self.warp
 
     @cached_property
