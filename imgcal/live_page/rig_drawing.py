@@ -13,6 +13,8 @@ from imgcal.estimation import WorkingVolume
 from imgcal.live_page.page import round_values
 from imgcal.types import CameraRig
 
+Array = NDArray[np.float64]
+
 USUAL_DISTANCE = 1000.0  # mm, of cameras whose axes meet nowhere
 PARALLEL = 0.02
 """Of the mean square of the sine between axes: below it, where they meet is not known."""
@@ -21,6 +23,8 @@ REACH = 0.6
 """Half a side of the searched cube, of the distance to where the axes meet."""
 ENOUGH = 0.6
 """Of the most cameras that see a point together: what belongs to the volume."""
+CLEAR = 0.3
+"""Length of the mean of unit vectors from which on they agree."""
 
 
 def viewing_volume(rig: CameraRig) -> WorkingVolume:
@@ -39,7 +43,7 @@ def viewing_volume(rig: CameraRig) -> WorkingVolume:
     if rig.volume is not None:
         low, high = torch.tensor([rig.volume.low, rig.volume.high], dtype=torch.float64)
         return WorkingVolume(low, high)
-    middle = _meeting_point(rig)
+    middle = meeting_point(rig)
     distance = float((rig.positions - middle).norm(dim=-1).median())
     half = max(REACH * distance, 1.0)
     searched = WorkingVolume(middle - half, middle + half)
@@ -56,7 +60,7 @@ def viewing_volume(rig: CameraRig) -> WorkingVolume:
     return WorkingVolume(low - margin, high + margin)
 
 
-def _meeting_point(rig: CameraRig) -> Tensor:
+def meeting_point(rig: CameraRig) -> Tensor:
     """Where the cameras look: the point nearest to all axes, or the working distance ahead where they are parallel."""
     axes, centres = rig.cam_from_rig.rotation[:, 2], rig.positions
     across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None, :]
@@ -70,12 +74,6 @@ def _meeting_point(rig: CameraRig) -> Tensor:
         if bool((depth > 0).float().mean() > 0.5):
             return point
     return centres.mean(0) + ahead * mean / mean.norm().clamp_min(1e-9)
-
-
-Array = NDArray[np.float64]
-
-CLEAR = 0.3
-"""Length of the mean of unit vectors from which on they agree."""
 
 
 def arrangement(rig: CameraRig, volume: WorkingVolume) -> dict[str, Any]:
