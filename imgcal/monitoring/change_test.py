@@ -27,7 +27,7 @@ from imgcal.estimation import step_by_error
 from imgcal.types import PARAMETER_KINDS, CameraRig
 
 CHANGES: Mapping[str, slice] = {kind: part for kind, part in PARAMETER_KINDS.items() if kind != "distortion"}
-"""Kinds of change, and where they stand among a camera's parameters."""
+"""Kinds of change, and the camera parameters that each one covers."""
 JUMPS = (0.6, 6.0, 60.0, 600.0)
 """Pixels, standard deviations of a change, before anything is known of it, each as probable as the others: by how much
 it moves the image, whatever its kind, so that no kind is preferred."""
