@@ -30,6 +30,8 @@ from imgcal.pipeline import LearnedMeasurer, detect_capture
 from imgcal.types import Board, CameraRig, Detections
 
 Item = TypeVar("Item")
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # as glibc's malloc.h numbers them
+KEPT, LARGEST = 256 << 20, 32 << 20  # bytes: that are free and kept, and of an array that is
 
 
 def open_rig(given: str) -> CameraRig:
@@ -159,10 +161,6 @@ def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda done: bar.advance(task, done)
-
-
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # as glibc's malloc.h numbers them
-KEPT, LARGEST = 256 << 20, 32 << 20  # bytes: that are free and kept, and of an array that is
 
 
 def keep_memory() -> bool:

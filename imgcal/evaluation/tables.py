@@ -22,6 +22,10 @@ from imgcal.io import write_text
 from imgcal.synthesis import RelativeDrift
 
 FORMAT = "imgcal-evaluation/1"
+RESULT, TABLES = "evaluation.json", "evaluation.md"
+PLOTS = (*(f"error-{axis}.png" for axis in AXES), "training.png", "latency.png")
+MISSING = "–"
+HUGE = 1e4  # pixels and so on, above which a table does not say how much
 
 
 @dataclass(frozen=True)
@@ -151,12 +155,6 @@ def _finite(values: Any) -> Any:
     if isinstance(values, list | tuple):
         return [_finite(value) for value in values]
     return None if isinstance(values, float) and not math.isfinite(values) else values
-
-
-RESULT, TABLES = "evaluation.json", "evaluation.md"
-PLOTS = (*(f"error-{axis}.png" for axis in AXES), "training.png", "latency.png")
-MISSING = "–"
-HUGE = 1e4  # pixels and so on, above which a table does not say how much
 
 
 @dataclass(frozen=True)

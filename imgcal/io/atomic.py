@@ -18,6 +18,11 @@ from typing import BinaryIO
 
 from imgcal.errors import InputError
 
+PREFIX, OLD = ".unfinished-", ".old"
+PREVIOUS = "previous"
+"""Folder beside the files of a run without a result: what the last run with one wrote, one generation."""
+DEAD_AFTER = 3600.0  # s without a new file: the run that was filling the folder has been killed
+
 
 @contextlib.contextmanager
 def replacing(path: str | Path) -> Iterator[BinaryIO]:
@@ -59,13 +64,6 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 def write_text(path: str | Path, content: str) -> None:
     """Replace a file by `content`, in UTF-8, in one step."""
     write_bytes(path, content.encode())
-
-
-PREFIX, OLD = ".unfinished-", ".old"
-PREVIOUS = "previous"
-"""Folder beside the files of a run without a result: what the last run with one wrote, one generation."""
-
-DEAD_AFTER = 3600.0  # s without a new file: the run that was filling the folder has been killed
 
 
 @contextlib.contextmanager

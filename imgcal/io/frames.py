@@ -24,6 +24,18 @@ from imgcal.io.names import check_regular, read_bytes
 _lock = threading.Lock()
 _within = 0  # decodings that are under way, in any thread
 _kept = -1  # standard error meanwhile
+Frame = NDArray[np.uint8] | NDArray[np.uint16]  # (H, W) grey
+TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
+IMAGE_SUFFIXES = frozenset({".png", ".bmp", ".pgm", ".jpg", ".jpeg"}) | TIFF_SUFFIXES
+VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov"})
+VIDEO_PROPERTIES = (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
+JPEG_END, END_OF_JPEG = b"\xff\xd9", 2**16  # some cameras write a few bytes behind it
+LOSSY_SUFFIXES = JPEG_SUFFIXES | VIDEO_SUFFIXES
+LOSSY_TOLERANCE = 4  # grey levels by which lossy compression may tear the channels of a grey frame apart
+LARGEST_IMAGE_FILE = 2**30  # bytes
+LEAST_OF_A_FRAME = 4  # bytes that a frame takes in a video, at least
+USUAL_RATE = 30.0  # frames a second of a video that does not say
 
 
 @contextlib.contextmanager
@@ -53,23 +65,6 @@ def _lead_away() -> int:
     os.dup2(nowhere, 2)
     os.close(nowhere)
     return kept
-
-
-Frame = NDArray[np.uint8] | NDArray[np.uint16]  # (H, W) grey
-
-TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
-IMAGE_SUFFIXES = frozenset({".png", ".bmp", ".pgm", ".jpg", ".jpeg"}) | TIFF_SUFFIXES
-VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov"})
-VIDEO_PROPERTIES = (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
-
-JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
-JPEG_END, END_OF_JPEG = b"\xff\xd9", 2**16  # some cameras write a few bytes behind it
-LOSSY_SUFFIXES = JPEG_SUFFIXES | VIDEO_SUFFIXES
-LOSSY_TOLERANCE = 4  # grey levels by which lossy compression may tear the channels of a grey frame apart
-
-LARGEST_IMAGE_FILE = 2**30  # bytes
-LEAST_OF_A_FRAME = 4  # bytes that a frame takes in a video, at least
-USUAL_RATE = 30.0  # frames a second of a video that does not say
 
 
 def count_frames(path: Path) -> int:

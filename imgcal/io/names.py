@@ -11,6 +11,12 @@ from imgcal.errors import InputError
 
 SAMPLE = "sample"
 """What the names of shipped captures begin with, before a colon."""
+MOST_NAMES = 8  # that a message lists
+MODEL, SUFFIX = "model.safetensors", ".safetensors"  # what `imgcal train` calls a network in the folder of a run
+IN_SAMPLE = {"rigs": "rig.yaml", "objects": "object.csv"}
+"""Files of a sample capture, by the kind of shipped data that each of them is."""
+MOST_BYTES = 2**26  # of a file of values
+LONGEST_NAME = 200  # bytes: file systems end at 255, and something is put behind
 
 
 def data_path(*parts: str) -> Path:
@@ -54,14 +60,6 @@ def sample_path(path: str | Path) -> Path:
     if name not in names:
         raise InputError(f"{path}: no such sample, expected {' or '.join(f'{SAMPLE}:{known}' for known in names)}")
     return data_path("samples", name)
-
-
-MOST_NAMES = 8  # that a message lists
-MODEL, SUFFIX = "model.safetensors", ".safetensors"  # what `imgcal train` calls a network in the folder of a run
-IN_SAMPLE = {"rigs": "rig.yaml", "objects": "object.csv"}
-"""Files of a sample capture, by the kind of shipped data that each of them is."""
-MOST_BYTES = 2**26  # of a file of values
-LONGEST_NAME = 200  # bytes: file systems end at 255, and something is put behind
 
 
 def natural_key(name: str) -> tuple[list[str | int], str]:

@@ -35,6 +35,15 @@ DECIMAL = re.compile(r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))([eE][-+]?[0
 
 MERGE = object()  # stands for the key `<<`
 Mark = Any  # of PyYAML: where in the text
+INSTEAD = {
+    ("imgcal-rig/1", "imgcal-cameras/1"): ": these cameras have no places yet; imgcal calibrate finds them where the "
+    "file is given as --cameras instead of --rig (in Python: load_cameras, calibrate_from_scratch)",
+}
+"""What to do with a file of another format (the second) than the one that was expected."""
+WORD = re.compile(r"[^\W\d_]{2}['\u2019\w]*[,.;:]?")
+SHARE_OF_PROSE = 0.2
+"""Of the lines of a text for people, at least, have four words in a row; few of a damaged file of values do."""
+_BaseDumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
 def read_values(content: bytes, mapping_tags: frozenset[str] = frozenset()) -> Any:
@@ -206,17 +215,6 @@ def _check_tag(event: Any, allowed: frozenset[str]) -> None:
 
 def _fail(problem: str, mark: Mark) -> NoReturn:
     raise yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
-
-
-INSTEAD = {
-    ("imgcal-rig/1", "imgcal-cameras/1"): ": these cameras have no places yet; imgcal calibrate finds them where the "
-    "file is given as --cameras instead of --rig (in Python: load_cameras, calibrate_from_scratch)",
-}
-"""What to do with a file of another format (the second) than the one that was expected."""
-WORD = re.compile(r"[^\W\d_]{2}['\u2019\w]*[,.;:]?")
-SHARE_OF_PROSE = 0.2
-"""Of the lines of a text for people, at least, have four words in a row; few of a damaged file of values do."""
-_BaseDumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
 class Flow(list[Any]):

@@ -15,6 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+SCRIPTS = ("words", "scene", "timelines", "cameras", "pictures", "volume", "events", "controls", "main")
+"""Files of the script, in the order in which they stand in the page: later ones use earlier ones."""
+
 
 def round_values(values: NDArray[np.float64], digits: int = 5) -> Any:
     """Nested lists of numbers of so many significant digits; None for nan and infinity.
@@ -46,10 +49,6 @@ def to_json(content: Any) -> str:
 def stream_event(kind: str, content: Any) -> bytes:
     """Write a server-sent event."""
     return f"event: {kind}\ndata: {to_json(content)}\n\n".encode()
-
-
-SCRIPTS = ("words", "scene", "timelines", "cameras", "pictures", "volume", "events", "controls", "main")
-"""Files of the script, in the order in which they stand in the page: later ones use earlier ones."""
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,10 @@ HEADER_SECONDS = 5.0
 """Within which the head of a request must have come, from its first byte or from the beginning of the connection."""
 MOST_CONNECTIONS = 256
 MOST_OF_ONE_ADDRESS = 128
+POLITE = 5  # how much rather the loop runs than this
+GUIDANCE_SECONDS = 3.0  # rest between two computations, and twice as long as the last one took
+MOST_HEADERS = 16384  # bytes
+BUFFER = 1 << 20
 
 
 class Connection(H11Protocol):
@@ -83,12 +87,6 @@ class Connection(H11Protocol):
         self._due = None
         if self.waits:
             self.transport.abort()
-
-
-POLITE = 5  # how much rather the loop runs than this
-GUIDANCE_SECONDS = 3.0  # rest between two computations, and twice as long as the last one took
-MOST_HEADERS = 16384  # bytes
-BUFFER = 1 << 20
 
 
 def main(listening: int, pipe: int) -> None:

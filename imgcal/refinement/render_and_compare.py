@@ -28,6 +28,8 @@ Attempt = Literal["relabel", "near", "far"]
 """What to try for rigs that images do not confirm: dots in each other's colours; from near, as the rig mostly knows
 where dots are that its cameras have taken for each other; or from afar again.
 """
+RIDGE = 0.05  # relative to a dot's own weight: dots at the same place share the light there
+MOST_DIFFERENCE = 0.3  # largest RGB distance between the colours of a dot and of a fiducial
 
 
 @dataclass(frozen=True)
@@ -317,10 +319,6 @@ def _check(images: Tensor, factory: CameraRig, options: ImageRefinementOptions) 
         raise InputError(
             f"images: found shape {tuple(images.shape)}, expected (rigs, {factory.num_cameras}, 3, {size}, {size})"
         )
-
-
-RIDGE = 0.05  # relative to a dot's own weight: dots at the same place share the light there
-MOST_DIFFERENCE = 0.3  # largest RGB distance between the colours of a dot and of a fiducial
 
 
 def colours_at(images: Tensor, uv: Tensor, dot: float) -> Tensor:

@@ -16,6 +16,25 @@ from imgcal.report.svg import group_digits, pixels
 
 CROWDED = 1.0
 """Blobs without a label, as a share of the used ones, from which the report mentions them."""
+GOOD_CHI2 = 1.5  # above, the residuals are larger than the stated noise
+SMALL_CHI2 = 0.5  # below, the noise was overstated
+MOST_FIGURES = 6  # at the top of the page: one row
+FEW_OBSERVATIONS = 15  # of a camera: fewer than its parameters
+ABOUT_OBJECT = ("object:", "estimation: the object", "estimation: fiducial")
+"""Refusals that begin so found that the object is not what its file says."""
+IDENTITY = {
+    "coded": "The fiducials came labelled with the input.",
+    "unique": "Every fiducial was recognized, and only one labelling explains what the cameras saw.",
+    "by_prior": "The pose that was given decided between look-alike orientations of the object.",
+    "by_tracking": "The labels were carried from snapshot to snapshot; the motion excluded look-alike positions.",
+    "ambiguous": (
+        "The object can be turned into itself, so its absolute orientation is not known. All cameras use the same "
+        "choice, so the rig is valid."
+    ),
+}
+_CHECK = "Check the new rig on snapshots that took no part here: imgcal score CAPTURE --rig rig.yaml --object OBJECT."
+_FIRST = "Then use rig.yaml as the factory file from now on."
+_KEEP = "Then use rig.yaml in place of the factory file; keep the factory file for the next recalibration."
 
 
 def unexplained_sentences(content: ReportContent) -> list[tuple[str, str]]:
@@ -56,26 +75,6 @@ def unexplained_sentences(content: ReportContent) -> list[tuple[str, str]]:
             "Cover or mask reflections there.",
         ))  # fmt: skip
     return notes
-
-
-GOOD_CHI2 = 1.5  # above, the residuals are larger than the stated noise
-SMALL_CHI2 = 0.5  # below, the noise was overstated
-MOST_FIGURES = 6  # at the top of the page: one row
-FEW_OBSERVATIONS = 15  # of a camera: fewer than its parameters
-
-ABOUT_OBJECT = ("object:", "estimation: the object", "estimation: fiducial")
-"""Refusals that begin so found that the object is not what its file says."""
-
-IDENTITY = {
-    "coded": "The fiducials came labelled with the input.",
-    "unique": "Every fiducial was recognized, and only one labelling explains what the cameras saw.",
-    "by_prior": "The pose that was given decided between look-alike orientations of the object.",
-    "by_tracking": "The labels were carried from snapshot to snapshot; the motion excluded look-alike positions.",
-    "ambiguous": (
-        "The object can be turned into itself, so its absolute orientation is not known. All cameras use the same "
-        "choice, so the rig is valid."
-    ),
-}
 
 
 @dataclass(frozen=True)
@@ -120,11 +119,6 @@ def judge(content: ReportContent) -> Verdict:
     headline = f"{done}{where}: the result explains the images as well as the measurement noise allows"
     keep = _FIRST if content.from_scratch else _KEEP
     return Verdict("good", headline, found, (), content.unknown, (*further, _CHECK, keep), _figures(content))
-
-
-_CHECK = "Check the new rig on snapshots that took no part here: imgcal score CAPTURE --rig rig.yaml --object OBJECT."
-_FIRST = "Then use rig.yaml as the factory file from now on."
-_KEEP = "Then use rig.yaml in place of the factory file; keep the factory file for the next recalibration."
 
 
 def _improvement(content: ReportContent) -> str:
