@@ -40,7 +40,7 @@ class Simulate:
     object: tuple[str, ...]
     """object: file, or the name of a shipped one (asymmetric8, cube8, cube27, sphere64, wand4; printed boards: charuco,
     aprilgrid, checkerboard, circles); several, each of which moves by itself: --object A B; lights = a body with
-    markers of which nothing is known (--lights)"""
+    unknown markers (--lights)"""
     out: Path  #: folder to write; must not hold a capture yet
     lights: int = 15  #: number of markers on the body, with --object lights
     snapshots: int = 10  #: number of poses of the object
@@ -88,7 +88,7 @@ class LookAt:
 
 @dataclass(frozen=True)
 class Cameras:
-    """Make a file of cameras of which nothing is known but their images and roughly how much they see.
+    """Make a file of cameras whose image size and rough field of view are all that is known.
 
     It is what imgcal calibrate --cameras begins with where there is no factory calibration.
     Example: imgcal rig cameras my_capture --field-of-view-deg 65 --out cameras.yaml
@@ -146,15 +146,13 @@ class Calibrate:
     input: Annotated[Path, tyro.conf.Positional]  #: capture folder, detections file, or a shipped sample (sample:O10)
     object: tuple[str, ...]
     """object: file, or the name of a shipped one; several, any of which may be in view: INPUT --object A B; lights =
-    every blob may be a marker of its own, and nothing is known of them: the scale then rests on the factory positions
-    of the cameras"""
+    unknown markers, every blob may be one: the scale then rests on the factory positions of the cameras"""
     out: Path  #: folder to write
     rig: str | None = None  #: factory rig: file, or the name of a shipped one
     cameras: Path | None = None
-    """instead of --rig, where there is no factory calibration: cameras of which only the size of the images and a rough
-    focal length or field of view is known (imgcal rig cameras writes such a file), or a calibration whose places do not
-    count; carry the whole object through what neighbouring cameras see together; the rig's frame is that of its first
-    camera"""
+    """instead of --rig, without a factory calibration: a file with each camera's image size and rough focal length or
+    field of view (imgcal rig cameras writes one), or a calibration whose camera places do not count;
+    carry the whole object through what neighbouring cameras see together; the rig's frame is that of its first camera"""
     distance: tuple[str, str, float] | None = None
     """with --cameras and --object lights: CAMERA CAMERA MM, the distance of two cameras, which gives the scale; without
     it the rig is known up to scale. The first is in the origin of the rig's frame, the second on its x axis"""

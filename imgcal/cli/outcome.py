@@ -40,7 +40,7 @@ class Findings:
     knowledge: Coverage
     from_scratch: bool = False  # there was no factory calibration since which a camera could have moved
     moved: tuple[MovedCamera, ...] = ()  # during the capture
-    untimed: tuple[str, ...] = ()  # cameras of which nothing tells whether their frames are of the same moments
+    untimed: tuple[str, ...] = ()  # cameras without evidence that their frames show the same moments
 
     @property
     def values(self) -> dict[str, Any]:
