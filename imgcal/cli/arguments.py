@@ -151,8 +151,8 @@ class Calibrate:
     rig: str | None = None  #: factory rig: file, or the name of a shipped one
     cameras: Path | None = None
     """instead of --rig, without a factory calibration: a file with each camera's image size and rough focal length or
-    field of view (imgcal rig cameras writes one), or a calibration whose camera places do not count;
-    carry the whole object through what neighbouring cameras see together; the rig's frame is that of its first camera"""
+    field of view (imgcal rig cameras writes one), or a calibration whose camera places do not count; carry
+    the whole object through what neighbouring cameras see together; the rig's frame is that of its first camera"""
     distance: tuple[str, str, float] | None = None
     """with --cameras and --object lights: CAMERA CAMERA MM, the distance of two cameras, which gives the scale; without
     it the rig is known up to scale. The first is in the origin of the rig's frame, the second on its x axis"""
