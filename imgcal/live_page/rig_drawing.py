@@ -25,6 +25,8 @@ ENOUGH = 0.6
 """Of the most cameras that see a point together: what belongs to the volume."""
 CLEAR = 0.3
 """Length of the mean of unit vectors from which on they agree."""
+ALONG_AXIS = 0.97
+"""Cosine up to which a direction counts as that of an axis of the rig's frame."""
 
 
 def viewing_volume(rig: CameraRig) -> WorkingVolume:
@@ -43,7 +45,7 @@ def viewing_volume(rig: CameraRig) -> WorkingVolume:
     if rig.volume is not None:
         low, high = torch.tensor([rig.volume.low, rig.volume.high], dtype=torch.float64)
         return WorkingVolume(low, high)
-    middle = meeting_point(rig)
+    middle = _meeting_point(rig)
     distance = float((rig.positions - middle).norm(dim=-1).median())
     half = max(REACH * distance, 1.0)
     searched = WorkingVolume(middle - half, middle + half)
@@ -60,7 +62,7 @@ def viewing_volume(rig: CameraRig) -> WorkingVolume:
     return WorkingVolume(low - margin, high + margin)
 
 
-def meeting_point(rig: CameraRig) -> Tensor:
+def _meeting_point(rig: CameraRig) -> Tensor:
     """Where the cameras look: the point nearest to all axes, or the working distance ahead where they are parallel."""
     axes, centres = rig.cam_from_rig.rotation[:, 2], rig.positions
     across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None, :]
@@ -104,6 +106,19 @@ def arrangement(rig: CameraRig, volume: WorkingVolume) -> dict[str, Any]:
     }
 
 
+def up_and_forward(rig: CameraRig) -> tuple[Array, Array]:
+    """Find which way is up, and the level direction in which most cameras look, both (3,).
+
+    A direction that is nearly that of an axis of the rig's frame is that of the axis.
+
+    Args:
+        rig: float64, without batch axes.
+    """
+    centres, axes = rig.positions.numpy(), rig.cam_from_rig.rotation.numpy()
+    up = _snap(upright(centres, axes, _meeting_point(rig).numpy()))
+    return up, _snap(forward(centres, axes, up))
+
+
 def upright(centres: Array, axes: Array, middle: Array) -> Array:
     """Find the up direction (3,): the top of most cameras' images, or away from the object, across the cameras.
 
@@ -133,6 +148,13 @@ def forward(centres: Array, axes: Array, up: Array) -> Array:
         level = level - (level @ up) * up
     ahead: Array = level / np.linalg.norm(level)
     return ahead
+
+
+def _snap(direction: Array) -> Array:
+    axis = int(np.argmax(np.abs(direction)))
+    if abs(direction[axis]) < ALONG_AXIS:
+        return direction
+    return np.asarray(np.eye(3)[axis] * np.sign(direction[axis]))
 
 
 def _level(vector: Array, up: Array) -> float:

@@ -15,14 +15,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from imgcal.live_page.rig_drawing import forward, meeting_point, upright
+from imgcal.live_page import up_and_forward
 from imgcal.report.svg import Array
 from imgcal.types import CameraRig
 
 Scene = dict[str, Any]
-
-ALONG_AXIS = 0.97
-"""Cosine up to which a direction counts as that of an axis of the rig's frame."""
 
 
 @dataclass(frozen=True)
@@ -75,19 +72,6 @@ def rig_view_script() -> str:
     return files("imgcal.report").joinpath("templates", "rig_view.js").read_text(encoding="utf-8")
 
 
-def up_and_forward(rig: CameraRig) -> tuple[Array, Array]:
-    """Find which way is up, and the level direction in which most cameras look, as the live page does: both (3,).
-
-    A direction that is nearly that of an axis of the rig's frame is that of the axis.
-
-    Args:
-        rig: float64, without batch axes.
-    """
-    centres, axes = rig.positions.numpy(), rig.cam_from_rig.rotation.numpy()
-    up = _snap(upright(centres, axes, meeting_point(rig).numpy()))
-    return up, _snap(forward(centres, axes, up))
-
-
 def frustum_length(rig: CameraRig, points: Array | None = None) -> float:
     """Size of the drawn cameras, mm: so small beside the distances between neighbours that they stay apart."""
     centres = rig.positions.double().numpy()
@@ -117,13 +101,6 @@ def frustums(rig: CameraRig, length: float) -> Array:
     corners = [(zero, zero, zero), (left, top, one), (right, top, one), (right, bottom, one), (left, bottom, one)]
     rays = torch.stack([torch.stack(corner, -1) for corner in corners], dim=1) * depth[:, None, None]
     return (rays @ rig.cam_from_rig.rotation + rig.positions[:, None]).detach().cpu().numpy()
-
-
-def _snap(direction: Array) -> Array:
-    axis = int(np.argmax(np.abs(direction)))
-    if abs(direction[axis]) < ALONG_AXIS:
-        return direction
-    return np.asarray(np.eye(3)[axis] * np.sign(direction[axis]))
 
 
 def _round(points: Array) -> list[Any]:

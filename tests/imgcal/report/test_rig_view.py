@@ -13,8 +13,9 @@ import torch
 
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import load_rig
+from imgcal.live_page import up_and_forward
 from imgcal.report import DrawnRig, rig_scene, rig_view_script
-from imgcal.report.rig_view import frustum_length, frustums, up_and_forward
+from imgcal.report.rig_view import frustum_length, frustums
 from tests.imgcal.report.browser import measured
 
 if TYPE_CHECKING:
