@@ -25,6 +25,8 @@ MOST_IN_VAIN = 8_000_000
 
 MOST_LOOKS_IN_VAIN = 8
 """Snapshots in which a proposer finds nothing, after which it looks at no more: as often again for each success."""
+PATTERN = 3
+"""Blobs of one camera that are likely to show the object, not only stray lights."""
 LEAST_CERTAIN_FIRST = ("ambiguous", "by_prior", "unique", "coded", "by_tracking")
 
 Progress = Callable[[Iterable[int], int], Iterable[int]]
@@ -187,6 +189,7 @@ class _Series:
         self.rows = _rows_by_snapshot(detections, self.count)
         self.results: dict[int, tuple[SnapshotIdentity, NDArray[np.int64]]] = {}
         self.looked: dict[int, Detections] = {}  # what was measured in the frames instead of blobs
+        self.rigs: dict[int, CameraRig] = {}  # the rig with which each snapshot was decided
 
     @property
     def accepted(self) -> NDArray[np.int64]:
@@ -211,11 +214,16 @@ class _Series:
         for number, s in enumerate(sorted(incomplete, key=lambda s: _gap(s, accepted))):
             first = self.results[s][0]
             if patience.tries(number, tracker.in_vain):
+                tracker.pose = self._nearest_pose(s, accepted) or tracker.pose
                 self.decide(s)
             found, labels = self.results[s]
             if first.status != "refused" and found.status != "refused":
                 # The rig that it helped to find labels more of it, but says nothing new of how sure it is.
                 self.results[s] = replace(found, status=first.status, alternatives=first.alternatives), labels
+
+    def _nearest_pose(self, s: int, accepted: NDArray[np.int64]) -> RigidTransform | None:
+        """Pose of the nearest of the accepted snapshots, which may be the snapshot itself."""
+        return self.results[int(accepted[np.abs(accepted - s).argmin()])][0].rig_from_object
 
     def where_blobs_fail(self, sight: Sight, accepted: NDArray[np.int64]) -> None:
         """Look at the frames of what is refused."""
@@ -226,6 +234,7 @@ class _Series:
     def decide(self, s: int) -> None:
         """Decide about one snapshot, by the labels it has, its frames or its blobs."""
         name = self.detections.snapshot_names[s]
+        self.rigs[s] = self.tracker.rig
         if self.coded[s]:
             self.results[s] = self.tracker.accept(name, self.detections.fiducial[self.rows[s]])
         elif self.sight is not None and not self.sight.where_blobs_fail:
@@ -251,10 +260,18 @@ class _Series:
         self.results[s] = SnapshotIdentity(name, "refused", NOT_TRIED, 0, None), np.full_like(self.rows[s], -1)
 
     def _incomplete(self, s: int) -> bool:
-        """Tell whether another try may help: the snapshot was refused, or no blob of some camera has a label."""
+        """Tell whether another try may help.
+
+        It may where the snapshot was refused, where a camera has as many blobs as a pattern and no label, and where a
+        camera has any blob and no label, but the rig is better known by now.
+        """
         snapshot, labels = self.results[s]
+        if snapshot.status == "refused":
+            return True
         camera = self.looked[s].camera if s in self.looked else self.detections.camera[self.rows[s]]
-        return snapshot.status == "refused" or not np.isin(camera, camera[labels >= 0]).all()
+        blobs, labelled = np.bincount(camera), np.bincount(camera[labels >= 0], minlength=camera.max() + 1)
+        least = PATTERN if self.rigs.get(s) is self.tracker.rig else 1
+        return bool((blobs[labelled == 0] >= least).any())
 
 
 def _why(snapshots: Sequence[SnapshotIdentity]) -> str:

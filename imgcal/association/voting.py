@@ -97,24 +97,38 @@ def _vote(predicted, ideal, number, width, gate, windows, count, shift):
 
 @njit(cache=True)
 def _vote_one(predicted, ideal, number, width, gate, windows, count, shift):
+    """Find the fullest window of each camera, the first of equals row by row; `windows` are zero before and after."""
+    fiducials = predicted.shape[1]
     for c in range(len(predicted)):
-        windows[:] = 0
-        for n in range(predicted.shape[1]):
+        most, best_i, best_j = 0, 0, 0
+        for n in range(fiducials):
             for m in range(number[c]):
                 u, v = ideal[c, m, 0] - predicted[c, n, 0] + gate, ideal[c, m, 1] - predicted[c, n, 1] + gate
                 if u >= 0 and v >= 0 and u < 2 * gate and v < 2 * gate:
                     i, j = int(u / width), int(v / width)
-                    windows[i, j] += 1
-                    windows[i + 1, j] += 1
-                    windows[i, j + 1] += 1
-                    windows[i + 1, j + 1] += 1
-        most, best_i, best_j = 0, 0, 0
-        for i in range(windows.shape[0]):
-            for j in range(windows.shape[1]):
-                if windows[i, j] > most:
-                    most, best_i, best_j = windows[i, j], i, j
-        count[c] = min(most, predicted.shape[1])
+                    for a in range(i, i + 2):
+                        for b in range(j, j + 2):
+                            votes = windows[a, b] + 1
+                            windows[a, b] = votes
+                            if votes > most or (votes == most and (a < best_i or (a == best_i and b < best_j))):
+                                most, best_i, best_j = votes, a, b
+        count[c] = min(most, fiducials)
         shift[c, 0], shift[c, 1] = best_i * width - gate, best_j * width - gate
+        _clear(windows, predicted[c], ideal[c], number[c], width, gate)
+
+
+@njit(cache=True)
+def _clear(windows, predicted, ideal, number, width, gate):
+    """Set windows to zero: all of them, or only those with votes where these are few."""
+    if 4 * len(predicted) * number > windows.size:
+        windows[:] = 0
+        return
+    for n in range(len(predicted)):
+        for m in range(number):
+            u, v = ideal[m, 0] - predicted[n, 0] + gate, ideal[m, 1] - predicted[n, 1] + gate
+            if u >= 0 and v >= 0 and u < 2 * gate and v < 2 * gate:
+                i, j = int(u / width), int(v / width)
+                windows[i, j] = windows[i + 1, j] = windows[i, j + 1] = windows[i + 1, j + 1] = 0
 
 
 def match(
