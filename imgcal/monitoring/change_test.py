@@ -1,13 +1,13 @@
-"""Has a camera changed? What later snapshots say is compared with what was known before, kind of change by kind.
+"""Test whether a camera has changed, by comparing later snapshots with earlier knowledge, for each kind of change.
 
-Let P be the covariance of what was known, A the information that the later snapshots brought and g their pull at what
-was known before. If nothing changed, the pull that is left once both have been put together, r = g - A S^-1 g with
-S = P^-1 + A, has the covariance G = A - A S^-1 A. A jump d of a camera's parameters adds G d. The score test of each
-kind of change of each camera asks whether that is there (a generalized likelihood ratio with the jump estimated), and
-the same r and G tell how probable any jump is of which only the spread is known.
+Let P be the covariance of the earlier knowledge, A the information in the later snapshots and g the gradient of
+their log likelihood at the earlier estimate. If nothing changed, the gradient left over after both have been combined,
+r = g - A S^-1 g with S = P^-1 + A, has the covariance G = A - A S^-1 A. A jump d of a camera's parameters adds G d to
+it. The score test looks for each kind of change of each camera (a generalized likelihood ratio with the jump
+estimated). The same r and G give the probability of any jump with a known spread.
 
 A camera model is never exact, and an object that hardly moves shows the same error in every snapshot. A jump that
-moves the image by less than `MODEL_ERROR` is therefore taken to be there always.
+moves the image by less than `MODEL_ERROR` is therefore always assumed.
 
 Source: Willsky and Jones, "A Generalized Likelihood Ratio Approach to the Detection and Estimation of Jumps in Linear
 Systems", 1976; Hausman, "Specification Tests in Econometrics", 1978.
@@ -32,29 +32,29 @@ CHANGES: Mapping[str, slice] = {
     "focal_length": slice(6, 8),
     "principal_point": slice(8, 10),
 }
-"""Kinds of change, and where they stand among a camera's parameters."""
+"""Kinds of change, and the camera parameters that each one covers."""
 JUMPS = (0.6, 6.0, 60.0, 600.0)
-"""Pixels, standard deviations of a change, before anything is known of it, each as probable as the others: by how much
-it moves the image, whatever its kind, so that no kind is preferred."""
+"""Pixels: prior standard deviations of a change, all equally probable. They are image shifts, whatever the kind of
+change, so that no kind is preferred."""
 LARGE = 60.0
-"""Pixels, the same of a camera that has moved, as far as that is learnt from what it still labels ..."""
+"""Pixels: the same for a camera that has moved, if its remaining labels can show that ..."""
 LENS = 60.0
-"""... and the most of focal length, principal point and distortion, which no push changes by more."""
+"""... and the upper limit for focal length, principal point and distortion: no push changes them by more."""
 DISTORTED = 2e-4
-"""Standard deviation of the distortion for each such pixel, where the kind of change is not known."""
+"""Standard deviation of the distortion for each such pixel if the kind of change is unknown."""
 LEAST_LEARNT = 1e-6
-"""Directions of which less was learnt than this share of the most of their kind do not take part."""
+"""Least share of the best-known direction's information; directions below it are left out."""
 LEAST_VARIANCE = 1e-3
-"""Share of a variance that is left where one is taken away: rounding."""
+"""Least share of a variance that remains after a subtraction: guards against rounding."""
 MODEL_ERROR = 0.02
-"""Pixels, one standard deviation of each axis: by how much a camera's image may be off in a way that changes slowly."""
+"""Pixels, one standard deviation per axis: slowly varying error of a camera's image."""
 SLOPE = 0.25
-"""Tangent of the angle to the optical axis at which a change of the focal length counts as what it moves there."""
-USUAL_DISTANCE = 1000.0  # mm, of a rig that has no working distance
+"""Tangent of the angle to the optical axis at which a change of focal length is converted to pixels."""
+USUAL_DISTANCE = 1000.0  # mm, for a rig without a working distance
 
 
 def pixel_changes(rig: CameraRig) -> Tensor:
-    """Change of each parameter that moves the image by about a pixel: (C, K)."""
+    """Change of each parameter that moves the image by about one pixel: (C, K)."""
     focal = rig.focal_length.mean(-1, keepdim=True)
     change = torch.ones(rig.num_cameras, rig.num_parameters, dtype=torch.float64)
     change[:, :3] /= focal
@@ -67,10 +67,10 @@ def pixel_changes(rig: CameraRig) -> Tensor:
 
 
 def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = LARGE) -> Tensor:
-    """Standard deviations (C, K) of changes of some kinds by camera, None = of all; zero where nothing changes.
+    """Standard deviations (C, K) of changes, by camera and kind (None = all kinds); zero where nothing changes.
 
     Args:
-        changes: kinds by camera.
+        changes: kind of change of each camera that changed.
         pixels: (C, K) see `pixel_changes`.
         jump: pixels.
     """
@@ -83,7 +83,7 @@ def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = 
 
 
 def camera_change_errors(rig: CameraRig, unit: Tensor) -> Tensor:
-    """Error in units by a change of a camera's own parameters: (C, K, K); a turn about its centre shifts nothing."""
+    """Derivative of errors in units by a camera's own parameters: (C, K, K); a turn about its centre shifts nothing."""
     return torch.linalg.inv(step_by_error(rig)) / unit[:, :, None]
 
 
