@@ -43,9 +43,9 @@ LENS = 60.0
 DISTORTED = 2e-4
 """Standard deviation of the distortion for each such pixel if the kind of change is unknown."""
 LEAST_LEARNT = 1e-6
-"""Least share of the best-known direction's information; directions below it are left out."""
+"""Minimum share of the best-known direction's information; directions below it are left out."""
 LEAST_VARIANCE = 1e-3
-"""Least share of a variance that remains after a subtraction: guards against rounding."""
+"""Minimum share of a variance that remains after a subtraction: guards against rounding."""
 MODEL_ERROR = 0.02
 """Pixels, one standard deviation per axis: slowly varying error of a camera's image."""
 SLOPE = 0.25

@@ -52,7 +52,7 @@ class Horizon:
 
     @property
     def most(self) -> int:
-        """Most snapshots to keep; several are forgotten together because forgetting is slow."""
+        """Maximum number of snapshots to keep; several are forgotten together because forgetting is slow."""
         return 1 if self.snapshots == 1 else self.snapshots + 1 + self.snapshots // 4
 
     def free(self, prior: RigBelief, cameras: Collection[int]) -> None:

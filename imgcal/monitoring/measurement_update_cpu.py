@@ -41,12 +41,11 @@ SLACK = 1e-6
 """Relative increase of the cost that a step may have, by rounding."""
 DAMPED, STALLED = 1e-3, 10.0
 """Greatest damping at which a step below the tolerance proves the minimum; the second value applies after lightly
-damped
-steps have failed: far from the belief their direction is only approximate."""
+damped steps have failed: far from the belief their direction is only approximate."""
 
 LOOSEN_AFTER, LOOSER = 12, 1.5
-"""After this many iterations the tolerance grows by this factor in each: steps shrink slowly if snapshots contradict a
-belief."""
+"""After this many iterations the tolerance grows by this factor in each: steps shrink slowly if snapshots contradict
+a belief."""
 
 
 @dataclass(frozen=True)

@@ -43,13 +43,13 @@ LARGEST = 10.0
 LEAST_LASTING = 0.05
 """Pixels: least size of persistent errors, as measured on ten well calibrated infrared cameras."""
 LEAST_SHIFT = 6.0
-"""Least image shift of a change, relative to the usual size of persistent errors."""
+"""Minimum image shift of a change, relative to the usual size of persistent errors."""
 TAIL, TAIL_SIGMAS = 0.99, 3.03
 """Quantile of the shifts that is compared, and its distance from the mean in standard deviations for normal shifts."""
 SETTLING_SNAPSHOTS = 64
 """Snapshots to leave out after a camera has changed: their errors come from how little is known about it."""
 LEAST_POINTS = 2
-"""Least number of labels of a camera for the shift of its image to count."""
+"""Minimum number of labels of a camera for the shift of its image to count."""
 
 
 @dataclass
@@ -114,7 +114,7 @@ class NoiseCorrelation:
 
     @property
     def least_shifts(self) -> list[float]:
-        """Least image shift (px) of each camera that counts as a change: less may be a persistent error."""
+        """Minimum image shift (px) of each camera that counts as a change: less may be a persistent error."""
         return torch.where(self.time > 1, LEAST_SHIFT * self.model_error, 0.0).tolist()
 
     def weigh(self, observations: Observations) -> Observations:

@@ -28,11 +28,11 @@ SCALE = 0.1
 
 # Which changes of an object are tested, and how significant they must be.
 ASKED_FIDUCIALS = 8
-"""Most fiducials to test: if there are more, those with the largest residuals."""
+"""Maximum number of fiducials to test: if there are more, those with the largest residuals."""
 PRINT_FIDUCIALS = 64
 """Objects with more fiducials than this are prints, in which no fiducial moves alone."""
 LEAST_SIGMAS = 3.0
-"""Least significance of a change, in standard deviations."""
+"""Minimum significance of a change, in standard deviations."""
 MISFIT_LEAD = 30.0
 """Log odds against the next best explanation at which a change of the object is believed without a suspected camera:
 a bad fit has many causes."""
@@ -40,7 +40,7 @@ a bad fit has many causes."""
 # When the object is tested: snapshots fit worse than usual, or the first ones have never fitted.
 SNAPSHOTS_PER_FALSE_ALARM = 1e9
 MOST_STEP = 4.0
-"""Most standard deviations that one snapshot counts for: a single bad one is no misfit."""
+"""Maximum number of standard deviations that one snapshot counts for: a single bad one is no misfit."""
 LEAST_USUAL = 30
 """Number of snapshots after which their usual fit is known."""
 FIRST_ASKED, FIRST_SIGMAS = (8, 16, 32, 64), 2.0
