@@ -23,7 +23,7 @@ SCREEN_CHI2 = 20.0
 """Score of the quick test (`screen`) that triggers the exact one. The quick score may be a third of the exact one when
 half of the information is new."""
 REMAINING_CHI2 = 20.0
-"""Minimum score without the episode that supports the change most: a wrong label or a passing error has nothing left."""
+"""Minimum score without the episode that supports the change most; wrong labels or passing errors leave nothing."""
 
 # Numbers of snapshots.
 SLOW_TESTS = {16: 16, 64: 32}
