@@ -98,8 +98,7 @@ EXPLANATIONS: tuple[Explanation, ...] = (
     PassingError(),
     Warmed(),
 )
-"""All explanations that are weighed. To add one: a subclass as above, in its own module if it is long, and a line here.
-"""
+"""All explanations that are weighed. To add one: a subclass as above, in its own module if long, and a line here."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a running rig is like, in Prometheus' format, read when somebody asks: the loop does nothing for it."""
+"""Metrics of a running rig in Prometheus' format, computed on request: the loop does nothing for them."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ if TYPE_CHECKING:
 Application = Callable[[dict[str, Any], Callable[..., Any]], Iterable[bytes]]
 """Of WSGI."""
 BUCKETS = (0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 5.0)
-"""Seconds of an update."""
+"""Upper bounds (s) of the buckets of update times."""
 
 
 STAMPS = 100
-"""Time stamps of which the mean is formed."""
+"""Number of time stamps in the running mean."""
 
 
 class Tally:
-    """What the loop counts; one thread writes, others may read."""
+    """Counters of the loop; one thread writes them, others may read them."""
 
     def __init__(self) -> None:
         self.snapshots = self.refused = self.unusable = self.paused = 0
-        """Snapshots worked on, those of them that taught nothing or could not be used; those that came while paused."""
+        """Snapshots processed; those that taught nothing; those that were unusable; those that came while paused."""
         self.events: Counter[str] = Counter()
         self.problems: Counter[str] = Counter()
-        """Failures to write, by what was to be written."""
+        """Write failures, by output."""
         self.latest: RigState | None = None
         self.stamps: dict[str, float] = {}
-        """By camera: how far its time stamps are after those of its snapshots, in the mean of the latest; seconds."""
+        """By camera: mean delay of its latest time stamps after those of their snapshots; seconds."""
         self.seconds = 0.0
-        """Spent on updates, all together."""
+        """Total time of updates."""
         self.took = [0] * (len(BUCKETS) + 1)
-        """Updates that took up to each of `BUCKETS`, and longer."""
+        """Numbers of updates that took up to each of `BUCKETS`, and longer."""
 
     @property
     def learnt(self) -> int:
-        """Snapshots that taught something."""
+        """Number of snapshots that taught something."""
         return self.snapshots - self.refused - self.unusable
 
     def count_time_stamp(self, camera: str, offset: float) -> None:
@@ -56,23 +56,23 @@ class Tally:
         self.stamps[camera] = before + (offset - before) / STAMPS
 
     def update_took(self, seconds: float) -> None:
-        """Count the time of an update."""
+        """Count an update's time."""
         self.seconds += seconds
         self.took[bisect.bisect_left(BUCKETS, seconds)] += 1
 
 
 class Metrics:
-    """Serves them by HTTP. A context manager: leaving it ends the server."""
+    """Serves the metrics by HTTP. A context manager: leaving it stops the server."""
 
     def __init__(self, tally: Tally, intake: SourceReader, hook: Hook | None, address: tuple[str, int]) -> None:
-        """Say what to serve, and where: 127.0.0.1 unless others are to read it."""
+        """Prepare to serve; the address should be 127.0.0.1 unless other machines are to read the metrics."""
         self._tally, self._intake, self._hook, self._address = tally, intake, hook, address
 
     def __enter__(self) -> Metrics:
-        """Begin to serve.
+        """Start the server.
 
         Raises:
-            InputError: the address is taken, or none of this machine's.
+            InputError: the address is in use, or not one of this machine's.
         """
         from prometheus_client import CollectorRegistry, make_wsgi_app, start_http_server  # not in the core
 
@@ -90,18 +90,18 @@ class Metrics:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the server."""
+        """Stop the server."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
 
     @property
     def port(self) -> int:
-        """Where it listens; of 0, which was chosen."""
+        """The port; of port 0, the one that was chosen."""
         return int(self._server.server_port)
 
     def collect(self) -> Iterator[Metric]:
-        """Give the metrics as they are now."""
+        """Return the current metrics."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 
         tally, intake = self._tally, self._intake
@@ -150,7 +150,7 @@ class Metrics:
 
 
 def _camera_values(state: RigState) -> Iterator[Metric]:
-    """What is known of each camera."""
+    """Values of each camera."""
     from prometheus_client.core import GaugeMetricFamily
 
     names = state.factory.camera_names
@@ -178,7 +178,7 @@ def _camera_values(state: RigState) -> Iterator[Metric]:
 
 
 def _guard(serve: Application, gate: Gate) -> Application:
-    """Serve only who asks for this machine by its own name: another site's may be pointed here (DNS rebinding)."""
+    """Serve only requests that use this machine's own name; other names may be pointed here (DNS rebinding)."""
 
     def answer(environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
         if gate.knows(environ.get("HTTP_HOST", "")):
