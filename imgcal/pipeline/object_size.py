@@ -114,7 +114,7 @@ def require_one_size(fit: Estimate, names: tuple[str, ...]) -> None:
 
 
 def _differences(fit: Estimate) -> Tensor:
-    """Derivatives (S, C, N, 2, 7) of the images by the object's rotation (rad), translation (mm) and relative growth."""
+    """Derivatives (S, C, N, 2, 7) of the images by rotation (rad), translation (mm) and growth of the object."""
     points = fit.points_object - fit.points_object.mean(0)
     arms = points @ fit.rig_from_object.rotation.mT  # (S, N, 3), from the centroid, in the rig frame
     places = fit.rig_from_object.apply(fit.points_object)
