@@ -207,7 +207,7 @@ class DriftLearning:
 
 
 def _log_evidence(information: Tensor, pull: Tensor, variance: Tensor) -> Tensor:
-    """Log probability of measurements (*B, k, k) and (*B, k) of values with given variances (*B, V, k)."""
+    """Log probability (*B, V) of measurements (*B, k, k) and (*B, k) of values with given variances (*B, V, k)."""
     std = variance.sqrt()
     covariance = (
         torch.eye(pull.shape[-1], dtype=pull.dtype) + std[..., None] * information[..., None, :, :] * std[..., None, :]

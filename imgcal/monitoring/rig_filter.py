@@ -40,7 +40,7 @@ class RigFilter:
         >>> for s in range(5):
         ...     there = Observations(truth.uv[[s]], torch.full(seen.shape, 0.05), seen)
         ...     result = follows.update(there, truth.rig_from_object[[s]], seconds=1 / 60)
-        >>> follows.belief.std()[0, 6] < 0.1 * 0.02 * factory.focal_length[0, 0]  # 2 % from the factory
+        >>> follows.belief.std()[0, 6] < 0.1 * 0.02 * factory.focal_length[0, 0]  # the factory knew it to 2 %
         tensor(True)
     """
 

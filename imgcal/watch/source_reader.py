@@ -57,7 +57,7 @@ class Known:
 
 
 class SourceReader:
-    """Yields snapshots of a source as they become complete. A context manager: leaving it stops the thread.
+    """Snapshots of a source, in order of completion. A context manager: leaving it stops the thread.
 
     Unreadable data are counted and skipped; an error that ends the source is raised by `next`.
     """
