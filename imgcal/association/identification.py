@@ -148,7 +148,7 @@ def relocalize(
     if obj.pose_rank == 5:
         sticks = fit_sticks(scene, options.seed)
         if sticks is None:
-            return _refuse(scene, "no markers at the object's distances from each other, on which cameras agree")
+            return _refuse(scene, "cameras agree on no markers with the distances of the object")
         return replace(_decide(scene, sticks, options, known_pose=False), hypotheses=1)
     cameras = np.flatnonzero(scene.blobs.count >= 4)
     if len(cameras) == 0:
@@ -235,7 +235,7 @@ def _too_little(name: str, fitted: float, certain_share: float, least: float) ->
     if fitted >= least:
         return (
             f"the best fit explains {100 * fitted:.0f} % of the visible markers, but labels are certain of only "
-            f"{100 * certain_share:.0f} %, expected {100 * least:.0f} %: too few blobs, or too many that are no "
+            f"{100 * certain_share:.0f} %, expected {100 * least:.0f} %: too few blobs, or too many that are not "
             "fiducials; show more of the object, to more cameras"
         )
     return (
@@ -380,7 +380,7 @@ def _too_many(scene: Scene) -> str:
     name = scene.rig.camera_names[int(scene.blobs.count.argmax())]
     return (
         f"too many blobs: found {scene.blobs.count.max()} in camera {name}, where an object of "
-        f"{scene.obj.num_fiducials} fiducials is expected; raise the detection threshold, or mask what is no marker"
+        f"{scene.obj.num_fiducials} fiducials is expected; raise the detection threshold, or mask what is not a marker"
     )
 
 

@@ -124,7 +124,7 @@ class Case:
             RefusedError: the points are lights.
         """
         if isinstance(self.before.obj, UnknownLights):
-            raise RefusedError("each light goes its own way")
+            raise RefusedError("lights have no fixed shape")
 
     @property
     def too_early(self) -> bool:

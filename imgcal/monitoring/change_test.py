@@ -123,7 +123,7 @@ class ChangeTest:
         wide = pixels.numel()
         factor, failed = torch.linalg.cholesky_ex(information + brought)
         if bool(failed):
-            raise RefusedError("estimation: these observations leave a rig that nothing is known of")
+            raise RefusedError("estimation: these observations do not determine the rig")
         half = torch.linalg.solve_triangular(factor, torch.cat((brought[:, :wide], pull[:, None]), 1), upper=False)
         left = torch.cat((brought[:wide, :wide], pull[:wide, None]), 1) - half[:, :wide].mT @ half
         own = torch.einsum("cij,cik->cjk", change, left.unflatten(0, (cameras, -1)))  # (C, K, K C + 1)

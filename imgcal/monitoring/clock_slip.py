@@ -81,7 +81,7 @@ def _slip(case: Case, start: Start, cameras: Sequence[int]) -> Variant:
     way = [*(pose for _, pose in case.snapshots[:-count]), there.rig_from_object]
     motion = ObjectMotion.of(RigidTransform.cat(way), seconds)
     if not bool(motion.known[-count:].all()):
-        raise RefusedError("it is not known how the object moves")
+        raise RefusedError("the object's motion is unknown")
     cases = _Late(start.before, given, there, motion, seconds[-count:], case.options)
     late = dict.fromkeys(cameras, 0.0) if uncertain else {camera: cases.rough_slip(camera) for camera in cameras}
     sigma = dict.fromkeys(cameras, math.nan)

@@ -77,7 +77,7 @@ class PassingError(Explanation):
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
         """Shift the images of the cameras in each snapshot."""
         if case.lasting is None:
-            raise RefusedError("errors of this rig do not last")
+            raise RefusedError("this rig has no persistent errors")
         cameras = case.camera_sets[-1]
         start, size = Start(case.before, case.latest), max(float(case.lasting[camera]) for camera in cameras)
         return [partial(self._pass, start, cameras, factor * size) for factor in PASSING]
@@ -200,7 +200,7 @@ class Diagnosis:
         if why is None and 0 < self.waited <= patience and patient:
             why = f"no explanation leads by {LEAD:g}"
         if why is not None:
-            raise RefusedError(f"diagnosis: {best.name} cannot be told from the rest yet: {why}")
+            raise RefusedError(f"diagnosis: {best.name} is not certain yet: {why}")
         self.waited = 0
         return verdict
 

@@ -49,7 +49,7 @@ def absorb(
     """
     if rig_from_object.translation.shape[0] != observations.seen.shape[0]:
         counts = f"{rig_from_object.translation.shape[0]} poses of {observations.seen.shape[0]} snapshots"
-        raise ValueError(f"rig_from_object: found {counts}, expected one of each")
+        raise ValueError(f"rig_from_object: found {counts}, expected one pose per snapshot")
     constants, unit, shake = belief.constants, belief.unit, observations.shake
     given, shown = rig_from_object, None
     if isinstance(belief.obj, UnknownLights):

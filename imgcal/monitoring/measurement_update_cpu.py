@@ -33,8 +33,8 @@ FOUND, NO_POSE, NOTHING_KNOWN, NO_MINIMUM = 0, 1, 2, 3
 
 WHY_NOT = {
     NO_POSE: "the observations do not determine the object's pose in every snapshot",
-    NOTHING_KNOWN: "these observations leave a rig that nothing is known of: labels may be wrong",
-    NO_MINIMUM: "found no minimum for these observations, expected one: labels may be wrong",
+    NOTHING_KNOWN: "these observations do not determine the rig: labels may be wrong",
+    NO_MINIMUM: "no minimum was found for these observations: labels may be wrong",
 }
 MOST_DAMPING = 1e8
 SLACK = 1e-6

@@ -119,8 +119,8 @@ class Quarantine:
         snapshots = [*total[:-count], *zip(window, [pose for _, pose in total[-count:]], strict=True)]
         before, pauses = recent.belief_before(count), recent.pauses(len(recent))
         excluded = {
-            Shaking.name: "what shakes is not so far off",
-            ObjectChanged.name: "the other cameras see the object as it was",
+            Shaking.name: "the error is too large for shaking",
+            ObjectChanged.name: "the other cameras see an unchanged object",
         }
         cameras = tuple(sorted(self.cameras))
         return Case(

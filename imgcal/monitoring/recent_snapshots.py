@@ -366,5 +366,5 @@ def _all_but(values: Tensor, width: int) -> Tensor:
 def _cholesky(matrix: Tensor) -> Tensor:
     factor, failed = torch.linalg.cholesky_ex(matrix)
     if bool(failed):
-        raise RefusedError("estimation: these observations leave a rig that nothing is known of")
+        raise RefusedError("estimation: these observations do not determine the rig")
     return factor

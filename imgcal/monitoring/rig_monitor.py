@@ -284,7 +284,7 @@ class RigMonitor:
             before, seconds = self._recent.belief_before(age), self._recent.seconds(age)
         excluded = {Steady.name: "a test of every camera has excluded it"}
         if pending is not None and free:
-            excluded[ObjectChanged.name] = "a change of a camera is open"
+            excluded[ObjectChanged.name] = "a change of a camera is pending"
         free, evidence = changed_cameras(self._recent.test(age), free, self.noise.least_shifts)
         self.undecided |= dict.fromkeys(free, UNDECIDED_SNAPSHOTS)
         if self._is_new(age):

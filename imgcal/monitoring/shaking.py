@@ -67,7 +67,7 @@ def shake_cameras(start: Start, cameras: Sequence[int], size: float) -> Variant:
 
     def find(result: MeasurementUpdate) -> Finding:
         if _smooth(shared_shifts(observations, result.residual)[0][:, shake[0].numpy() > 0]):
-            raise RefusedError("the shifts follow each other smoothly, as those of a late clock do")
+            raise RefusedError("the shifts are smooth, like those of a late clock")
         return Finding(shake=shake[0])
 
     return Variant(start.before, snapshots, start.log_prior, find=find)

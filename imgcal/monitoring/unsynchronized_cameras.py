@@ -39,7 +39,7 @@ class Unsynchronized(Explanation):
         """Let the cameras see the object in their own poses."""
         case.require_body()
         if case.count < LEAST_SNAPSHOTS:
-            raise RefusedError("a single snapshot is explained by a move as well")
+            raise RefusedError("a move explains a single snapshot equally well")
         return [partial(_unsynchronize, case, start, cameras) for start in case.starts for cameras in case.camera_sets]
 
 

@@ -111,11 +111,11 @@ class CameraVisibility:
         first, times = self.astray.get(camera, (look.time, 0))
         if times >= ASTRAY:
             return min(first, self.missing.get(camera, (first, 0))[0]), (
-                "sees what may be the object, but not where it should be: it has moved far; move the object through "
-                "the middle of its image, and it will be found again"
+                "sees what may be the object, but in the wrong place: the camera has moved far; move the object "
+                "through the middle of its image, and the camera will be found again"
             )
         if camera in self.silent and look.time - self.silent[camera] >= self._patience(camera):
-            return self.silent[camera], "sends nothing at the moments of the other cameras"
+            return self.silent[camera], "sends nothing when the other cameras do"
         first, times = self.missing.get(camera, (look.time, 0))
         if times >= ABSENT_SNAPSHOTS and look.time - first >= ABSENT_SECONDS:
             return first, "does not see the object, which should be in view: it is covered, or has turned away"

@@ -220,7 +220,7 @@ def unsynchronized_event(camera: str, since: float, time: float, snapshot: int) 
         time: s since the epoch, now.
         snapshot: number of the update.
     """
-    message = f"{camera} sees the object at other moments than the other cameras, by how much is not known yet"
+    message = f"{camera} is not synchronized with the other cameras; its time offset is not known yet"
     return Event(time, snapshot, "clock_slip", camera, since, message=message)
 
 

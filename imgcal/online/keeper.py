@@ -86,7 +86,7 @@ class RigKeeper:
         if horizon is not None and horizon < 1:
             raise InputError(f"horizon: found {horizon}, expected at least 1 snapshot")
         if horizon is not None and isinstance(obj, UnknownLights):
-            raise InputError("horizon: a rig known by unknown lights learns from all snapshots; leave the horizon out")
+            raise InputError("horizon: with unknown lights, the rig needs all snapshots; leave the horizon out")
         self.options = _for_keeping(options)
         self._memory = KeeperMemory.from_factory(rig, obj, drift, self.options, horizon)
         usual = () if isinstance(obj, UnknownLights) else default_tests(rig.num_cameras)  # all need a rigid object
@@ -290,7 +290,7 @@ class RigKeeper:
         health = camera_health(memory)
         sentence = describe_health(health, memory.monitor.filter.count)
         if memory.lights is not None and memory.monitor.filter.count:
-            sentence += f"; their scale is known to +- {100 * memory.belief.scale_std():.2g} %, by no light"
+            sentence += f"; the scale is known to +- {100 * memory.belief.scale_std():.2g} % (lights cannot improve it)"
         lights = None if labelled is None else labelled.checked.lights
         return replace(state, cameras=health, events=tuple(events), sentence=sentence, lights=lights)
 

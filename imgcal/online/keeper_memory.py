@@ -121,7 +121,7 @@ class KeeperMemory:
         self.noise.restart()
         self.usual.clear()
         self.times.clear()
-        message = "no camera is where it was: learning begins again with the factory calibration"
+        message = "all cameras have moved: learning starts again from the factory calibration"
         self.pending.append(Event(self.time, self.count - 1, "restart", message=message))
 
     @property

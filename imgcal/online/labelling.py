@@ -98,7 +98,7 @@ class Labelling:
         for camera in self.rig.camera_names:
             frame = given.get(camera)
             if isinstance(frame, Sequence):
-                raise InputError(f"camera {camera}: found {len(frame)} frames, expected one of this moment, or None")
+                raise InputError(f"camera {camera}: found {len(frame)} frames, expected a single frame or None")
             frames[camera] = frame
         blobs = detect_snapshot(frames, self.detection, pool=self._pool, board=self.obj.board)
         return to_detections([blobs], self.rig.camera_names, (name,))

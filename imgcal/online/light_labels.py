@@ -65,7 +65,7 @@ def label_lights(memory: KeeperMemory, tracks: LightTracks, blobs: Detections) -
     if not len(found):
         tracks.mark_still(blobs.camera, blobs.uv, np.zeros(len(blobs), dtype=bool), time)
         some = len(np.unique(blobs.camera[rows]))
-        seen = "no blob that moves is seen" if not some else f"{some} cameras see blobs that move"
+        seen = "no moving blob is seen" if not some else f"{some} cameras see moving blobs"
         raise RefusedError(f"identity: found no light on which three cameras agree: {seen}")
     numbers = tracks.number_lights(found.point, time)
     scene = _Scene(rig, blobs, found, rows)

@@ -102,12 +102,12 @@ def object_event(change: ObjectChange, since: float, time: float, snapshot: int)
     """
     if change.fiducial is None:
         how = "larger" if change.size > 0 else "smaller"
-        message = f"the object is {100 * abs(change.size):.3g} % {how} than its file says: another one"
+        message = f"the object is {100 * abs(change.size):.3g} % {how} than its file says: it is a different object"
         values = (100 * change.size, 100 * change.sigma)
         return Event(time, snapshot, "object_exchanged", None, since, None, *values, None, change.odds, message)
     if change.fiducial == SHAPE:
-        off = f"its fiducials are {change.size:.3g} mm (RMS) from there"
-        message = f"the object is not as its file says: {off}; made less exactly, or another one"
+        off = f"its fiducials are off by {change.size:.3g} mm (RMS)"
+        message = f"the object differs from its file: {off}; it was made less accurately, or is a different object"
         size = (change.size, change.sigma)
         return Event(time, snapshot, "object_exchanged", None, since, None, *size, "mm", change.odds, message)
     message = f"fiducial {change.fiducial} of the object is {change.size:.3g} +- {change.sigma:.1g} mm from its place"

@@ -54,7 +54,7 @@ class Relearning:
         evidence = change.evidence if math.isfinite(change.evidence) else None
         message = f"{name} {how}"
         if len(self.names) == 2:
-            message += f", or {self.names[1 - change.camera]}: of two cameras nobody can tell which"
+            message += f", or {self.names[1 - change.camera]}: with two cameras it is impossible to tell which"
         event = Event(time, number, "moved", name, since, kind, size, sigma, unit, evidence, message)
         self.events[change.camera] = event
         if change.camera not in self.before:

@@ -78,8 +78,8 @@ def label_snapshot(
         if memory.in_vain >= PATIENCE:
             memory.reset()
         raise RefusedError(
-            f"estimation: labels are {checked.usual:.1f} px off in most cameras: labels are wrong, or the whole "
-            "rig is another"
+            f"estimation: labels are {checked.usual:.1f} px off in most cameras: labels are wrong, or this is "
+            "a different rig"
         )
     return _search(memory, checked)
 

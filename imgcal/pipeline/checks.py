@@ -28,7 +28,7 @@ def require_cameras(seen: NDArray[np.bool_], rig: CameraRig, options: PipelineOp
     blind = [rig.camera_names[i] for i in np.flatnonzero(~seen.any(axis=(0, 2)))]
     if blind and (not options.blind_cameras or len(blind) == rig.num_cameras):
         raise RefusedError(
-            f"camera {', '.join(blind)}: found no fiducial in any snapshot, expected some; nothing can be said of it",
+            f"camera {', '.join(blind)}: found no fiducial in any snapshot, expected some; it cannot be calibrated",
             python="rig.select leaves a camera out, PipelineOptions(blind_cameras=True) keeps its factory values",
             command="--without leaves a camera out, --blind-cameras keeps its factory values",
         )
@@ -52,10 +52,10 @@ def require_views(counts: LabelCounts, rig: CameraRig, least_share: float = LEAS
         raise RefusedError(
             f"camera {which}: the other cameras put {expected[camera]} fiducials into the image of "
             f"{rig.camera_names[camera]}, found {kept[camera]} there, and {unexplained[camera]} blobs that belong to "
-            "nothing: the image may be mirrored or turned, the frames of another camera or moment, place or lens not "
-            "those of the rig file",
-            python="put that right, or leave the camera out of the rig (rig.select) and of the detections",
-            command=f"put that right, or leave out what is wrong: --without {which.replace(',', '')}",
+            "nothing: the image may be mirrored or turned, its frames may be of another camera or moment, or its pose "
+            "or lens may differ from the rig file",
+            python="correct this, or leave the camera out of the rig (rig.select) and of the detections",
+            command=f"correct this, or leave out what is wrong: --without {which.replace(',', '')}",
         )
 
 
@@ -63,11 +63,11 @@ def require_fit(additive_noise: float, outlier_share: float, rms: float, options
     """Refuse if residuals (px) or the share of left-out labels are larger than noise explains."""
     if additive_noise > options.largest_additive_noise:
         raise RefusedError(
-            f"estimation: the best rig misses the blobs by {rms:.2f} px (RMS), of which {additive_noise:.2f} px do not "
-            f"fit their noise, expected at most {options.largest_additive_noise:g}: the object is not as its file "
-            "says, labels are wrong, or the lenses are of another kind",
-            python="measure the object anew; where all is right, raise PipelineOptions.largest_additive_noise",
-            command="measure the object anew, and look at labels given in the input",
+            f"estimation: the best rig misses the blobs by {rms:.2f} px (RMS), of which {additive_noise:.2f} px are "
+            f"not noise of the blobs, expected at most {options.largest_additive_noise:g}: the object differs from its "
+            "file, labels are wrong, or the lenses are of another kind",
+            python="measure the object again; if all is right, raise PipelineOptions.largest_additive_noise",
+            command="measure the object again, and check labels given in the input",
         )
     if outlier_share > options.most_outliers:
         raise RefusedError(
@@ -111,7 +111,7 @@ def require_near_prior(
         found = (
             f"camera {rig.camera_names[camera]}: {name.replace('_', ' ')} would differ from its factory value by "
             f"{_format_value(change[camera, parameter], name)}, with a tolerance (prior) of "
-            f"{_format_value(std[camera, parameter], name)} and {options.largest_drift:g} times as much accepted"
+            f"{_format_value(std[camera, parameter], name)} and up to {options.largest_drift:g} times as much accepted"
         )
     elif kind and prior_scale[kind] > options.widest_prior:
         found = (
@@ -122,9 +122,9 @@ def require_near_prior(
     else:
         return
     raise RefusedError(
-        f"estimation: {found}: cameras may be exchanged, labels wrong, or the rig file that of another rig",
-        python="where the rig has really changed so much, give it a wider prior: replace(rig, prior=RigPrior(...))",
-        command="where the rig has really changed so much, write larger values under `prior` in the rig file",
+        f"estimation: {found}: cameras may be swapped, labels may be wrong, or the rig file belongs to another rig",
+        python="if the rig has really changed that much, give it a wider prior: replace(rig, prior=RigPrior(...))",
+        command="if the rig has really changed that much, write larger values under `prior` in the rig file",
     )
 
 
@@ -138,8 +138,8 @@ def require_most_labels(labels: NDArray[np.bool_], kept: NDArray[np.bool_], rig:
             f"estimation: camera {', '.join(which)}: {before[bad[0]] - after[bad[0]]} of {before[bad[0]]} labels in "
             f"{which[0]} do not fit what the other cameras see: its frames may be of another moment, or its labels of "
             "other fiducials",
-            python="put that right, or leave the camera out of the rig (rig.select) and of the detections",
-            command=f"put that right, or leave it out: --without {' '.join(which)}",
+            python="correct this, or leave the camera out of the rig (rig.select) and of the detections",
+            command=f"correct this, or leave it out: --without {' '.join(which)}",
         )
     before, after = labels.sum((0, 1)), kept.sum((0, 1))
     bad = np.flatnonzero((before >= 6) & (after < 0.5 * before)).tolist()
@@ -148,8 +148,8 @@ def require_most_labels(labels: NDArray[np.bool_], kept: NDArray[np.bool_], rig:
             f"estimation: fiducial {', '.join(map(str, bad))} (row of the object file): "
             f"{before[bad[0]] - after[bad[0]]} of {before[bad[0]]} labels of fiducial {bad[0]} do not fit: it "
             "has moved on the object, or labels are swapped",
-            python="measure it anew, or leave it out of the object",
-            command="measure it anew, or take its row out of the object file",
+            python="measure it again, or leave it out of the object",
+            command="measure it again, or take its row out of the object file",
         )
 
 

@@ -233,8 +233,8 @@ def _first_rig(labelled: Detections, cameras: CameraRig, obj: CalibrationObject)
     """Place the cameras by the labels."""
     if not (labelled.fiducial >= 0).any():
         raise RefusedError(
-            f"identity: in none of {len(labelled.snapshot_names)} snapshots does one camera alone say which blob is "
-            "which fiducial: show the whole object, and few other bright things; and is the field of view right?"
+            f"identity: in none of {len(labelled.snapshot_names)} snapshots can a single camera tell which blob is "
+            "which fiducial: show the whole object and few other bright things, and check the field of view"
         )
     first = cold_start(to_observations(labelled, cameras, obj), cameras, obj)
     if first.spread > LARGEST_SPREAD:
@@ -276,8 +276,8 @@ def require_central(fit: Calibration, cameras: CameraRig) -> None:
         raise RefusedError(
             f"start without a factory calibration: the principal point of camera {cameras.camera_names[camera]} would "
             f"be {float(off[camera]):.0f} px from where it was expected, {float(off[camera]) / usual:.1f} times as far "
-            "as lenses are: the object's coordinates are not exact, or the size of the image is wrong; measure the "
-            "object anew"
+            "as usual: the object's coordinates are not exact, or the size of the image is wrong; measure the "
+            "object again"
         )
 
 
@@ -299,5 +299,5 @@ def require_determined(fit: Calibration) -> None:
         which = list_names(rig.camera_names[c] for c in bad[kind].nonzero().flatten().tolist())
         raise RefusedError(
             f"start without a factory calibration: the data say too little about the {what} of camera {which}: carry "
-            "the object through more of what it sees, nearer and farther, turned in all directions"
+            "the object through more of its view, nearer and farther, turned in all directions"
         )

@@ -223,7 +223,7 @@ def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject
 NO_MARKER = "no moving blobs of three cameras agree on a place"
 """Why a moment has no marker."""
 NOTHING = (
-    "unknown markers: no blobs of three cameras agree on places: the rig is farther off than its prior says, or the "
+    "unknown markers: no blobs of three cameras agree on places: the rig is farther off than its prior allows, or the "
     "markers are too many or too few"
 )
 
@@ -237,8 +237,8 @@ def split_moments(detections: Detections) -> tuple[Detections, Detections]:
     held = np.arange(len(detections.snapshot_names)) % HELD_OUT == HELD_OUT - 1
     if held.sum() < 2:
         raise RefusedError(
-            f"unknown markers: found {len(held)} snapshots, expected at least {2 * HELD_OUT}: some must take no part, "
-            "to prove the others right"
+            f"unknown markers: found {len(held)} snapshots, expected at least {2 * HELD_OUT}: some are held out "
+            "to verify the result"
         )
     return detections.select(~held[detections.snapshot]), detections.select(held[detections.snapshot])
 
@@ -259,7 +259,7 @@ def _why(agreement: Agreement | None, rig: CameraRig) -> str:
     unjudged = [rig.camera_names[c] for c in np.flatnonzero(~agreement.judged)]
     if unjudged and not (agreement.judged & ~agreement.agrees).any():
         return (
-            f"unknown markers: camera {list_names(unjudged)}: in the snapshots that took no part, the other "
+            f"unknown markers: camera {list_names(unjudged)}: in the held-out snapshots, the other "
             "cameras find "
             f"too few markers in its view to judge it by (expected {LEAST_PREDICTED}): capture more, or leave it out"
         )
@@ -267,10 +267,10 @@ def _why(agreement: Agreement | None, rig: CameraRig) -> str:
     worst = int(bad[np.argmin(agreement.found[bad])])
     return (
         f"unknown markers: camera {list_names([rig.camera_names[c] for c in bad])}: of {agreement.predicted[worst]} "
-        f"markers that the other cameras find in view of {rig.camera_names[worst]}, in snapshots that took no part, "
+        f"markers that the other cameras find in view of {rig.camera_names[worst]}, in held-out snapshots, "
         f"{100 * max(agreement.found[worst], 0):.0f} % have a blob in their place and "
         f"{100 * max(agreement.near_misses[worst], 0):.0f} % one beside it: which blobs belong together cannot be "
-        "decided; show fewer markers at once, or give a rig that is nearer"
+        "decided; show fewer markers at once, or give a more accurate rig"
     )
 
 

@@ -179,5 +179,5 @@ def _require_determined(fit: Calibration, reference: int) -> None:
     what = ("focal length", "direction", "position")[kind]
     raise RefusedError(
         f"start without a factory calibration: the data say too little about the {what} of camera "
-        f"{rig.camera_names[camera]}: carry the light through more of what it sees, nearer and farther"
+        f"{rig.camera_names[camera]}: carry the light through more of its view, nearer and farther"
     )

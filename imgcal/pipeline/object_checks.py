@@ -42,16 +42,16 @@ def object_offsets(
         RefusedError: the object differs from its file, and the data cannot tell how.
     """
     measure = {
-        "python": "measure it anew, or take more snapshots; where fiducials may be off, say so: "
+        "python": "measure it again, or take more snapshots; if fiducials may be off, say so: "
         "replace(obj, tolerance=...)",
-        "command": "measure it anew, or take more snapshots; where fiducials may be off, say so: "
+        "command": "measure it again, or take more snapshots; if fiducials may be off, say so: "
         "--object-tolerance MM, or a column `tolerance`",
     }
     # With few snapshots, the lenses might be the cause instead: then these would disagree.
     few = fit.problem.uv.shape[1] < SNAPSHOTS_TO_BEND
     if few and shape is not None and shape.bent_sigma() >= 2 * BENT:
         raise RefusedError(
-            "estimation: the object is not as its file says, and other places of its fiducials do not explain the "
+            "estimation: the object differs from its file, and other positions of its fiducials do not explain the "
             "images either",
             **measure,
         )

@@ -240,7 +240,7 @@ def require_same_moments(
         raise RefusedError(
             str(slipped),
             python="give the frames of each moment, or leave the camera out (rig.select)",
-            command=f"export its frames anew, or leave it out: --without {slipped.camera}",
+            command=f"export its frames again, or leave it out: --without {slipped.camera}",
         ) from error
 
 

@@ -49,7 +49,7 @@ class Unsynchronized:
             "the cameras are not synchronized: whole images are shifted against the other cameras, by "
             f"{self.slow:.2g} px (RMS) where the object moves slowly and {self.fast:.2g} px where it moves fast "
             f"({self.speed:.2g} px from snapshot to snapshot), as if exposures were about {self.share:.2g} snapshots "
-            "apart; the error that is left is time, not noise of the images: trigger the cameras together, or hold the "
+            "apart; the remaining error is timing, not image noise: trigger the cameras together, or hold the "
             "object still for each snapshot"
         )
 

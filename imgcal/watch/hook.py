@@ -77,7 +77,7 @@ class Hook:
         self._thread.join(self._timeout + 1)
         with self._changed:
             while self._events:
-                self._drop("the command was not done with them in time")
+                self._drop("the command did not finish in time")
 
     def _work(self) -> None:
         while True:

@@ -105,7 +105,7 @@ class Progress:
                 raise ValueError("the length is no number")
             return cls(time, name, logged, source, None if rate is None else float(rate))
         except (ValueError, TypeError, KeyError, OverflowError) as error:
-            raise InputError(f"{path}: found something else than imgcal watch writes there") from error
+            raise InputError(f"{path}: found something that imgcal watch did not write") from error
 
 
 class Watch:

@@ -97,7 +97,7 @@ class MarkerFile:
         """Add a frame at its time, after an empty frame for each missed one."""
         steps = max(round((moment - self._latest) * self._rate), 1)
         if steps > LONGEST_GAP:
-            raise OSError(f"a gap of {steps:,} frames: begin a new file")
+            raise OSError(f"a gap of {steps:,} frames: start a new file")
         self._waiting += [self._nothing()] * (steps - 1)
         self._waiting.append(frame)
         self._latest = moment

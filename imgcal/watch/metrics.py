@@ -84,7 +84,7 @@ class Metrics:
             self._server.set_app(_guard(make_wsgi_app(registry), Gate(Address(host, port), "")))
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
-            raise InputError(f"--metrics: {host}:{port} cannot be listened on: {reason}") from error
+            raise InputError(f"--metrics: {host}:{port} cannot be used: {reason}") from error
         return self
 
     def __exit__(
@@ -105,19 +105,19 @@ class Metrics:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 
         tally, intake = self._tally, self._intake
-        yield _counter("snapshots", "Snapshots worked on", tally.snapshots)
+        yield _counter("snapshots", "Snapshots processed", tally.snapshots)
         yield _counter("snapshots_refused", "Snapshots that taught nothing", tally.refused)
-        yield _counter("snapshots_unusable", "Snapshots that were no input", tally.unusable)
-        yield _counter("snapshots_dropped", "Snapshots that came faster than they were worked on", intake.dropped)
+        yield _counter("snapshots_unusable", "Unusable snapshots", tally.unusable)
+        yield _counter("snapshots_dropped", "Snapshots dropped because processing was too slow", intake.dropped)
         yield _counter("snapshots_paused", "Snapshots that came while paused", tally.paused)
-        yield _gauge("snapshots_waiting", "Snapshots that wait to be worked on", intake.waiting)
-        yield _counter("clock_leaps", "Leaps of all cameras' clocks together", intake.synchronizer.leaps)
+        yield _gauge("snapshots_waiting", "Snapshots waiting to be processed", intake.waiting)
+        yield _counter("clock_leaps", "Joint jumps of all cameras' clocks", intake.synchronizer.leaps)
         for kind, counts in intake.synchronizer.counts.items():
             family = CounterMetricFamily(f"imgcal_exposures_{kind}", f"Exposures {kind}", labels=["camera"])
             for camera, count in list(counts.items()):
                 family.add_metric([camera], count)
             yield family
-        unreadable = CounterMetricFamily("imgcal_exposures_unreadable", "What could not be read", labels=["camera"])
+        unreadable = CounterMetricFamily("imgcal_exposures_unreadable", "Unreadable exposures", labels=["camera"])
         for camera, count in list(intake.unreadable.items()):
             unreadable.add_metric([camera], count)
         yield unreadable
@@ -125,12 +125,12 @@ class Metrics:
         for kind in EVENT_KINDS:
             events.add_metric([kind], tally.events[kind])
         yield events
-        problems = CounterMetricFamily("imgcal_write_failures", "Failures to write", labels=["output"])
+        problems = CounterMetricFamily("imgcal_write_failures", "Write failures", labels=["output"])
         for output, count in list(tally.problems.items()):
             problems.add_metric([output], count)
         yield problems
         if self._hook is not None:
-            yield _counter("hook_dropped", "Events that the hook command never got", self._hook.dropped)
+            yield _counter("hook_dropped", "Events dropped before the hook command got them", self._hook.dropped)
             yield _counter("hook_failed", "Runs of the hook command that failed", self._hook.failed)
         took = HistogramMetricFamily("imgcal_update_seconds", "Time of an update")
         total, buckets = 0, []
@@ -161,11 +161,11 @@ def _camera_values(state: RigState) -> Iterator[Metric]:
     yield health
     columns: tuple[tuple[str, str, Any], ...] = (
         ("residual_pixels", "RMS residual of the latest snapshot", state.residual),
-        ("clock_offset_seconds", "How much later each camera exposes than most, by the motion", state.clock_offset),
-        ("clock_offset_sigma_seconds", "One standard deviation of it", state.clock_offset_sigma),
-        ("noise_pixels", "Noise of each camera's blobs beyond what they say of themselves", state.noise),
-        ("shake_pixels", "By how much each camera trembles, one standard deviation", state.shake),
-        ("rotation_radians", "Turn of each camera since the factory calibration", state.moved[:, :3].norm(dim=1)),
+        ("clock_offset_seconds", "Delay of each camera relative to most, from the motion", state.clock_offset),
+        ("clock_offset_sigma_seconds", "One standard deviation of the delay", state.clock_offset_sigma),
+        ("noise_pixels", "Noise of each camera's blobs beyond their own sigmas", state.noise),
+        ("shake_pixels", "Shake of each camera, one standard deviation", state.shake),
+        ("rotation_radians", "Rotation of each camera since the factory calibration", state.moved[:, :3].norm(dim=1)),
         ("position_millimetres", "Shift of each camera", state.moved[:, 3:6].norm(dim=1)),
         ("focal_length_pixels", "Change of the focal length", state.moved[:, 6:8].abs().amax(1)),
     )

@@ -151,7 +151,7 @@ class Poses:
             if len(self._waiting) > self._most:
                 self._waiting.popleft()
                 self.dropped += 1
-                self._fail(f"poses are dropped: more than {self._most} wait")
+                self._fail(f"poses were dropped: more than {self._most} were waiting")
             self._changed.notify()
 
     def __enter__(self) -> Poses:
@@ -170,7 +170,7 @@ class Poses:
             with self._changed:
                 self.dropped += len(self._waiting)
                 self._waiting.clear()
-                self._fail("poses are dropped: they could not be written in time")
+                self._fail("poses were dropped: they could not be written in time")
 
     def _work(self) -> None:
         while True:

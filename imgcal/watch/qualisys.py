@@ -297,7 +297,7 @@ def _connect(host: str, port: int, timeout: float) -> Generator[None, None, sock
             if select.select([], [connection], [], TICK)[1]:
                 failed = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
             elif time.monotonic() > ends:
-                raise _Lost("nobody answers")
+                raise _Lost("no answer")
         if failed:
             raise _Lost(f"cannot be connected to: {errno.errorcode.get(failed, failed)}")
         connection.setblocking(True)

@@ -138,7 +138,7 @@ def put_aside(folder: Path) -> bool:
             os.replace(rig, _history_path(folder, rig.stat().st_mtime))
     except OSError as error:
         problem = error.strerror or error
-        raise InputError(f"{folder}: what an earlier run left there cannot be put aside: {problem}") from error
+        raise InputError(f"{folder}: the state of an earlier run cannot be moved out of the way: {problem}") from error
     return found
 
 

@@ -43,7 +43,7 @@ class Known:
             if snapshot.time > self.time:
                 return False
             raise InputError(
-                f"found a recording that is not the one before, and begins at {snapshot.time:.9g} s, expected one "
+                f"found a different recording that begins at {snapshot.time:.9g} s, expected one "
                 f"after {self.time:.9g} s; --fresh begins anew"
             )
         return self._is_named(snapshot) or snapshot.time <= self.time
