@@ -89,7 +89,7 @@ def join(parts: Sequence[Fits]) -> Fits:
     """Concatenate fitted labellings of one snapshot."""
     if len(parts) == 1:
         return parts[0]
-    states, found = [part.state for part in parts], [_fits(part) for part in parts]
+    states, found = [part.state for part in parts], [_require_innovations(part) for part in parts]
     columns = ("offset", "rotation", "centre")
     state = State(*(torch.cat([getattr(state, name) for state in states]) for name in columns))
     innovations = Innovations(
@@ -141,7 +141,7 @@ def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
     """
     # Estimate the density of false blobs once: a dropped label must not count as a false blob against the others.
     surroundings = _detection_odds(scene, fits) - np.log(_clutter(scene, fits))
-    log_odds = _log_density(_fits(fits)) + surroundings
+    log_odds = _log_density(_require_innovations(fits)) + surroundings
     usual = np.median(log_odds[np.isfinite(log_odds)]) if np.isfinite(log_odds).any() else 0.0
     demanded = np.clip(usual - np.log(100), np.log(least_odds), np.log(odds))
     # Two or three labels of one camera can support each other in the wrong place: most of its view must fit.
@@ -150,7 +150,7 @@ def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
     whole, stick = np.minimum(scene.blobs.count, scene.obj.num_fiducials), scene.obj.pose_rank == 5
     enough = np.maximum(2 if stick else 3, most * whole)
     for _ in range(4):
-        found = _fits(fits)
+        found = _require_innovations(fits)
         log_odds = _log_density(found) + surroundings
         good = (found.own < GATE) & (log_odds > demanded) & ~find_contested(fits.labels, found, UNDECIDED)
         # A stick shows little of itself; if the rig predicts the place without it, one label is enough.
@@ -166,7 +166,7 @@ def evidence(scene: Scene, fits: Fits) -> NDArray[np.float64]:
     """Log odds of each labelling against "all blobs are clutter" (Laplace's approximation): (K,)."""
     labelled = fits.labels >= 0
     noise = _blob_noise(scene, fits) + fits.sigma[:, None, None] ** 2
-    found = _fits(fits)
+    found = _require_innovations(fits)
     gain = -np.log(2 * np.pi * noise) - np.log(_clutter(scene, fits)) + _detection_odds(scene, fits)
     sizes = _size_misfit(scene, fits)
     return np.where(labelled, gain, 0).sum((1, 2)) - fits.cost - 0.5 * (found.complexity + sizes)
@@ -174,7 +174,7 @@ def evidence(scene: Scene, fits: Fits) -> NDArray[np.float64]:
 
 def predictions(fits: Fits) -> NDArray[np.float64]:
     """Predicted pixels of all fiducials under the first labelling: (C, N, 2)."""
-    return _fits(fits).uv[0]
+    return _require_innovations(fits).uv[0]
 
 
 def rig_and_pose(scene: Scene, fits: Fits, row: int) -> tuple[CameraRig, RigidTransform]:
@@ -189,14 +189,14 @@ def select_pose(scene: Scene, fits: Fits, row: int) -> RigidTransform:
     return pose_at(scene.problem, fits.state)[row, 0]
 
 
-def _fits(fits: Fits) -> Innovations:
+def _require_innovations(fits: Fits) -> Innovations:
     if fits.innovations is None:
         raise RuntimeError("labellings were not fitted")
     return fits.innovations
 
 
 def _assign(fits: Fits) -> NDArray[np.int64]:
-    return assign(_fits(fits).squared, GATE)
+    return assign(_require_innovations(fits).squared, GATE)
 
 
 def _blob_noise(scene: Scene, fits: Fits) -> NDArray[np.float64]:
@@ -254,7 +254,7 @@ def _stack_solutions(solutions: Sequence[Solution]) -> Solution:
 
 def _residual_sigma(scene: Scene, fits: Fits) -> NDArray[np.float64]:
     """Error of blob centres beyond their own sigmas, from the residuals: (K,) px."""
-    found = _fits(fits)
+    found = _require_innovations(fits)
     inlier = (fits.labels >= 0) & (found.own < GATE)
     freedom = np.where(inlier, found.freedom, 0).sum((1, 2))
     variance = np.where(inlier, found.residual, 0).sum((1, 2)) / np.maximum(freedom, 1e-3)
@@ -278,7 +278,7 @@ def _size_misfit(scene: Scene, fits: Fits) -> NDArray[np.float64]:
 
 def _clutter(scene: Scene, fits: Fits) -> NDArray[np.float64]:
     """False blobs per square pixel, near the object's image or overall, whichever is larger: (K, 1, 1)."""
-    uv = _fits(fits).uv
+    uv = _require_innovations(fits).uv
     low, high = uv.min(2), uv.max(2)
     middle, half = (low + high) / 2, 0.75 * (high - low) + 10
     inside = (np.abs(scene.blobs.uv[None] - middle[:, :, None]) < half[:, :, None]).all(-1).sum((1, 2))
@@ -290,7 +290,7 @@ def _clutter(scene: Scene, fits: Fits) -> NDArray[np.float64]:
 
 def _detection_odds(scene: Scene, fits: Fits) -> NDArray[np.float64]:
     """Log odds that a visible fiducial is detected: (K, 1, 1)."""
-    uv = _fits(fits).uv
+    uv = _require_innovations(fits).uv
     in_view = ((uv > 0) & (uv < scene.rig.image_size.numpy()[:, None])).all(-1).sum((1, 2))
     share = np.clip(((fits.labels >= 0).sum((1, 2)) + 1) / (in_view + 2), 0.05, 0.95)
     return np.log(share / (1 - share))[:, None, None]

@@ -114,10 +114,10 @@ class DriftPaces:
         test = stretch.test(walk * self.of_parameters(walk.shape[1]))
         for kept in (self.information, self.pull):
             kept[1:] = kept[:-1].clone()
-        self.information[0], self.pull[0] = self._of(test, walk, stretch.seconds)
+        self.information[0], self.pull[0] = self._measure_drift(test, walk, stretch.seconds)
         model = self._model(test, walk)
         leader = int(self._ratios(model).amax((0, 2, 3)).argmax())
-        rest = self._of(
+        rest = self._measure_drift(
             test.condition_on({leader: None}), walk, stretch.seconds
         )  # a camera that creeps affects all others
         others = torch.arange(len(self.squared)) != leader
@@ -135,7 +135,7 @@ class DriftPaces:
             variance[:, part] = lacking[:, number, None] * walk[:, part].square() * (stretch.seconds / 3600)
         return variance
 
-    def _of(self, test: ChangeTest, walk: Tensor, seconds: float) -> tuple[Tensor, Tensor]:
+    def _measure_drift(self, test: ChangeTest, walk: Tensor, seconds: float) -> tuple[Tensor, Tensor]:
         """Information (C, kinds, 3, 3) and gradient (C, kinds, 3) of each value's drift, in random walk steps."""
         information, pull = torch.zeros_like(self.information[0]), torch.zeros_like(self.pull[0])
         for number, (kind, part) in enumerate(CHANGES.items()):

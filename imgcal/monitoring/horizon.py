@@ -73,7 +73,7 @@ class Horizon:
         away = {camera: last for camera, last in self.away.items() if camera not in present}
         for camera in (forgotten & ~kept).nonzero().flatten().tolist():
             away[camera] = self._last_sighting(belief, camera, tuple(sorted(present)))
-        return Remainder(self._with_object(self._with_away(away), first), away)
+        return Remainder(self._add_object(self._add_absent_cameras(away), first), away)
 
     def _last_sighting(self, belief: RigBelief, camera: int, others: tuple[int, ...]) -> LastSighting:
         relative, wide = self._relative(camera, others), self.prior.unit.numel()
@@ -91,7 +91,7 @@ class Horizon:
             relative[:EXTRINSICS, other, :EXTRINSICS] = -unit[other, :EXTRINSICS].diag() / len(others)
         return relative.flatten(1)
 
-    def _with_away(self, away: dict[int, LastSighting]) -> RigBelief:
+    def _add_absent_cameras(self, away: dict[int, LastSighting]) -> RigBelief:
         """The prior, with absent cameras as they were last seen."""
         prior, width = self.prior, self.prior.unit.shape[1]
         if not away:
@@ -109,7 +109,7 @@ class Horizon:
         error = torch.cholesky_solve(weighted[:, None], factor)[:wide, 0].view(prior.unit.shape)
         return replace(prior, rig=displace(prior.rig, error * prior.unit), factor=factor)
 
-    def _with_object(self, cameras: RigBelief, first: RigBelief) -> RigBelief:
+    def _add_object(self, cameras: RigBelief, first: RigBelief) -> RigBelief:
         """Combine the cameras of one belief with the object of another."""
         wide = self.prior.unit.numel()
         if len(first.factor) == wide:

@@ -173,10 +173,10 @@ class RigFilter:
         """
         horizon, start = self.horizon, None
         if horizon is not None:
-            start, gone = self.belief, self._early[: -horizon.snapshots]
+            start, forgotten = self.belief, self._early[: -horizon.snapshots]
             if len(self._early) > horizon.most:
                 self._early = self._early[-horizon.snapshots :]
-                left = horizon.without(self.belief, shown(gone), shown(self._early), self._first)
+                left = horizon.without(self.belief, shown(forgotten), shown(self._early), self._first)
                 self._first, horizon.away = left.first, left.away
         result = absorb(self._first, *stack_snapshots(self._early), self.options, start)
         self.belief, self._waited = age_belief(result.belief, self._span, self.walk), 0.0

@@ -184,9 +184,9 @@ class ClockOffsets:
         with np.errstate(invalid="ignore"):
             other = known & (np.linalg.norm(middle, axis=1) > np.maximum(STEP, 6 * usual / np.sqrt(count)))
         self._other = np.where(other, self._other + 1, np.where(known, 0, self._other))
-        anew = self._other >= STEPS
-        self._begin(anew)
-        return other & ~anew
+        restarted = self._other >= STEPS
+        self._begin(restarted)
+        return other & ~restarted
 
     def _event(
         self, state: RigState, camera: int, offset: float, sigma: float, evidence: float, since: float | None = None

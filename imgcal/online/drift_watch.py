@@ -59,17 +59,17 @@ class DriftWatch:
             self._begin(range(len(self.names)), belief, std, time)
             return []
         change = Gauge.from_majority(belief.rig, self.reference).difference(belief.rig, self.reference)
-        events, anew = [], set(unsettled)
+        events, restarted = [], set(unsettled)
         for camera in range(len(self.names)):
             if camera in unsettled:
                 continue
             found = self._largest(change[camera], torch.maximum(self.std, std)[camera])
             if found is not None:
                 events.append(self._event(camera, *found, std[camera], time, number))
-                anew.add(camera)
+                restarted.add(camera)
             elif bool((std[camera, :10] < 0.5 * self.std[camera, :10]).any()):
-                anew.add(camera)  # earlier changes may be learning, not drift
-        self._begin(anew, belief, std, time)
+                restarted.add(camera)  # earlier changes may be learning, not drift
+        self._begin(restarted, belief, std, time)
         return events
 
     def _largest(self, change: Tensor, std: Tensor) -> tuple[ChangeKind, float] | None:

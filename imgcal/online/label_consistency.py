@@ -75,11 +75,11 @@ def check_labels(
     rest, moved = np.full(there.shape, np.nan), np.full(len(there), np.nan)
     _compare(uv, fit.residual, there, options.identity_error, rest, moved)
     usual_rest = float(np.median(rest[there])) if there.any() else 0.0
-    told = np.isfinite(moved)
-    usual = float(np.median(moved[told])) if told.any() else 0.0
+    measured = np.isfinite(moved)
+    usual = float(np.median(moved[measured])) if measured.any() else 0.0
     least = options.identity_error + MOST_APART * usual_rest
     stray = there & (rest > least + DEPTH * np.nan_to_num(moved)[:, None])
-    off = told & (np.nan_to_num(moved) > options.identity_error + MOST_APART * usual)
+    off = measured & (np.nan_to_num(moved) > options.identity_error + MOST_APART * usual)
     given, left = there.sum(1), (there & ~stray).sum(1)
     nonsense = off & ((left < LEAST_AGREEING * given) | (left < LEAST_LABELS))
     stray |= there & nonsense[:, None]
@@ -87,7 +87,7 @@ def check_labels(
     # Too few labels to agree with each other: compare them with the rig.
     distance = np.linalg.norm(fit.residual, axis=-1)
     limit = options.identity_error + MOST_APART * float(np.median(distance[there])) if there.any() else 0.0
-    stray |= there & ~told[:, None] & (distance > limit)
+    stray |= there & ~measured[:, None] & (distance > limit)
     image = rig.expand(1).project_values(fit.rig_from_object.apply(obj.points), obj.radius)
     stray |= find_merged(named, there & ~stray, image.uv[0].numpy(), image.visible[0].numpy())
     rows = named.fiducial >= 0

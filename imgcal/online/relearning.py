@@ -76,7 +76,7 @@ class Relearning:
         waiting = [camera for camera in self.events if camera not in still_open]
         if not waiting or number % EVERY:
             return []
-        std, told = relative_std(belief), []
+        std, events = relative_std(belief), []
         for camera in waiting:
             part = slice(0, EXTRINSICS_AND_PINHOLE)
             known = std[camera, part] <= RELEARNT * self.before[camera][part]
@@ -85,7 +85,7 @@ class Relearning:
                 del self.before[camera]
                 sigma = change_sigma(std[camera], event.change)
                 how_well = "" if sigma is None else f" to +- {sigma:.2g} {event.unit}"
-                told.append(
+                events.append(
                     replace(
                         event,
                         time=time,
@@ -95,7 +95,7 @@ class Relearning:
                         message=f"{event.message}; known again{how_well}",
                     )
                 )
-        return told
+        return events
 
 
 def relative_std(belief: RigBelief) -> Tensor:

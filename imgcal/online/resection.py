@@ -178,12 +178,12 @@ def _fit(
     observations = Observations(
         given, torch.full_like(given[..., 0], 1.0), torch.ones_like(given[..., 0], dtype=torch.bool)
     )
-    held = torch.zeros(1, camera.num_parameters, dtype=points_rig.dtype)
+    fixed = torch.zeros(1, camera.num_parameters, dtype=points_rig.dtype)
     fit = estimate(
         observations,
         camera,
         CalibrationObject(cloud, torch.ones_like(cloud)),
-        prior_std=held,
+        prior_std=fixed,
         options=EstimationOptions(loss="cauchy"),
     )
     return replace(camera, cam_from_rig=camera.cam_from_rig @ fit.rig_from_object[0].reshape(1))

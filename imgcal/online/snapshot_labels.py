@@ -117,9 +117,9 @@ def _check(memory: KeeperMemory, named: Detections, pose: RigidTransform) -> Che
     every = check_labels(named, *given)
     if not memory.monitor.quarantine.cameras:
         return every
-    held = np.isin(named.camera, list(memory.monitor.quarantine.cameras))
-    others = check_labels(replace(named, fiducial=np.where(held, -1, named.fiducial)), *given)
-    fiducial = np.where(held, every.blobs.fiducial, others.blobs.fiducial)
+    quarantined = np.isin(named.camera, list(memory.monitor.quarantine.cameras))
+    others = check_labels(replace(named, fiducial=np.where(quarantined, -1, named.fiducial)), *given)
+    fiducial = np.where(quarantined, every.blobs.fiducial, others.blobs.fiducial)
     blobs, labels = replace(others.blobs, fiducial=fiducial), int((fiducial >= 0).sum())
     off = others.off | every.off & np.isin(np.arange(len(every.off)), list(memory.monitor.quarantine.cameras))
     return replace(others, blobs=blobs, given=every.given, off=off, labels=labels)

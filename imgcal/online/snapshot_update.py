@@ -92,11 +92,11 @@ def test_clocks(memory: KeeperMemory) -> bool:
     """Test whether unsynchronized cameras are why labels fit nowhere, and quarantine those."""
     doubted = memory.doubts.refused
     snapshots = [(memory.observed(one.blobs), one.rig_from_object) for one in doubted]
-    held = memory.monitor.quarantine_doubtful(snapshots, [one.seconds for one in doubted])
-    if held:
-        memory.off |= dict.fromkeys(held, doubted[0].time)
+    quarantined = memory.monitor.quarantine_doubtful(snapshots, [one.seconds for one in doubted])
+    if quarantined:
+        memory.off |= dict.fromkeys(quarantined, doubted[0].time)
         memory.doubts = ObjectChecks(memory.obj.num_fiducials)
-    return bool(held)
+    return bool(quarantined)
 
 
 def _relearn(memory: KeeperMemory, found: MonitorUpdate) -> MonitorUpdate:

@@ -60,19 +60,19 @@ def replace_lenses(rig: CameraRig) -> CameraRig:
 
 
 def _warm_up(rig: CameraRig) -> None:
-    obj, generator = load_object(OBJECT), _seeded()
+    obj, generator = load_object(OBJECT), _make_generator()
     truth = simulate_truth(rig, obj, SNAPSHOTS, generator, DRIFT, POSES)
     for depth in (8, 16):
         _compile_detection(truth, rig, obj, SensorModel(bit_depth=depth), generator)
     exact = true_detections(truth)
-    with _whatever_comes():
+    with _ignore_refusals():
         calibrate(exact, rig, obj)
         score(exact, rig, obj)
-    with _whatever_comes():
+    with _ignore_refusals():
         calibrate(true_detections(simulate_truth(rig, obj, MANY, generator, DRIFT, POSES)), rig, obj)
     _compile_planar(rig, generator)
     _compile_bloom()
-    _of_unknown_markers(rig, generator)
+    _compile_unknown_markers(rig, generator)
     _compile_folding(truth, rig, obj)
     seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
     for uv in (truth.uv, truth.uv.float()):  # for `imgcal render` and for the networks
@@ -83,15 +83,15 @@ def _warm_up(rig: CameraRig) -> None:
 def warm_up_fits() -> None:
     """Compile the last steps of a calibration: its fits, and the networks' inputs before them."""
     rig, obj = load_rig(RIG).resized(torch.tensor(SIZE)), load_object(OBJECT)
-    truth = simulate_truth(rig, obj, SNAPSHOTS, _seeded(), DRIFT, POSES)
-    with _whatever_comes():
+    truth = simulate_truth(rig, obj, SNAPSHOTS, _make_generator(), DRIFT, POSES)
+    with _ignore_refusals():
         calibrate(true_detections(truth), rig, obj)
     seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
     render_views(truth.uv.float(), seen, rig.image_size, obj, ImageOptions(32, 1.5))
     rig.to(torch.float32).expand(1).project_values(obj.points.float()[None])
 
 
-def _seeded() -> torch.Generator:
+def _make_generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
@@ -102,11 +102,11 @@ def _compile_detection(
     shots = list(simulate_frames(truth, obj, FrameModel(sensor), generator))
     stacks = {name: [shot[name] for shot in shots] for name in rig.camera_names}
     for detector in ("classical", "matched"):
-        with _whatever_comes():
+        with _ignore_refusals():
             calibrate(stacks, rig, obj, detector=detector)
     with RigKeeper(rig, obj) as keeper:
         for number, shot in enumerate((shots[0], *shots)):
-            with _whatever_comes():
+            with _ignore_refusals():
                 keeper.update(shot, float(number))
 
 
@@ -116,7 +116,7 @@ def _compile_planar(rig: CameraRig, generator: torch.Generator) -> None:
     plane = CalibrationObject(points, palette(len(points)).double())
     truth = simulate_truth(rig, plane, 2, generator, None)
     unlabelled = true_detections(truth)
-    with _whatever_comes():
+    with _ignore_refusals():
         calibrate(unlabelled, rig, plane)
 
 
@@ -126,25 +126,25 @@ def _compile_folding(truth: Truth, rig: CameraRig, obj: CalibrationObject) -> No
     there = Observations(truth.uv[:1], torch.full(seen.shape, 0.1, dtype=torch.float64), seen)
     follows = RigFilter(rig, obj)
     recent = RecentSnapshots(follows.belief, follows.walk)
-    with _whatever_comes():
+    with _ignore_refusals():
         for _ in range(A_SECOND):
             recent.append(follows.follow(there, truth.rig_from_object[:1]), there, 0.0)
 
 
-def _of_unknown_markers(rig: CameraRig, generator: torch.Generator) -> None:
+def _compile_unknown_markers(rig: CameraRig, generator: torch.Generator) -> None:
     """Compile the search for markers of unknown arrangement, by rays, in a capture and in a running rig."""
     markers = load_object("lights")
     labelled = true_detections(simulate_truth(rig, load_object(OBJECT), MANY, generator, DRIFT, POSES))
     seen = replace(labelled, fiducial=np.full(len(labelled), -1))
-    with _whatever_comes():
+    with _ignore_refusals():
         calibrate(seen, rig, markers)
-    with _whatever_comes():
+    with _ignore_refusals():
         score(seen, rig, markers)
     found = associate_lights(seen, rig, np.ones(rig.num_cameras))
     align_camera(seen, rig, RigPrior().std(rig), rig, 0, found)  # a capture in which one camera sees few of them
     with RigKeeper(rig, markers) as keeper:
         for number in range(MANY):
-            with _whatever_comes():
+            with _ignore_refusals():
                 keeper.update(seen.of_snapshots(number, number + 1), number / 60)
 
 
@@ -156,7 +156,7 @@ def _compile_bloom() -> None:
 
 
 @contextlib.contextmanager
-def _whatever_comes() -> Iterator[None]:
+def _ignore_refusals() -> Iterator[None]:
     """Ignore refusals and warnings about such a small rig."""
     with contextlib.suppress(RefusedError):
         yield

@@ -159,7 +159,7 @@ def _fit_once(
     prior = (rig.prior or RigPrior()).std(rig) if known.prior_std is None else known.prior_std
     problem = make_problem(observations, rig, _adopt_tolerances(obj, latest), prior)
     guess = None if known.initializer is None else known.initializer.guess(observations, rig, obj)
-    guess_used = guess is not None and _nearer(guess, Prediction(rig, arranged.poses), observations, obj)
+    guess_used = guess is not None and _is_nearer(guess, Prediction(rig, arranged.poses), observations, obj)
     first = Start(initial_state(problem, arranged.poses, None), options.identity_error)
     if known.fits:
         first = replace(first, solution=known.fits[0], nearer=known.fits[-1].state)
@@ -220,7 +220,7 @@ def _require_any_view(arranged: LabelledCapture, rig: CameraRig, obj: Calibratio
     require_views(count_labels(arranged.labelled, labels, arranged.poses, rig, obj), rig, least_share=0.0)
 
 
-def _nearer(guess: Initialization, factory: Prediction, observations: Observations, obj: CalibrationObject) -> bool:
+def _is_nearer(guess: Initialization, factory: Prediction, observations: Observations, obj: CalibrationObject) -> bool:
     """Tell whether a guess, as the mean rig, fits the images better than the factory calibration."""
     start = Prediction(guess.rig, guess.rig_from_object)
     return bool(

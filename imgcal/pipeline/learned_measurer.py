@@ -74,14 +74,14 @@ class LearnedMeasurer:
         """
         if not len(blobs.uv):
             return blobs
-        said = self.measure(frames, blobs, options)
-        moved = np.linalg.norm(said.uv - blobs.uv, axis=1)
-        taken = (said.kind.argmax(1) == BlobKind.PARTIAL) & (moved < FARTHEST * said.radius)
+        output = self.measure(frames, blobs, options)
+        moved = np.linalg.norm(output.uv - blobs.uv, axis=1)
+        taken = (output.kind.argmax(1) == BlobKind.PARTIAL) & (moved < FARTHEST * output.radius)
         flags = blobs.flags.copy()
-        flags[said.kind[:, BlobKind.MERGED] > SURE] |= np.uint8(BlobFlag.MERGED)
-        flags[said.kind[:, BlobKind.FALSE] > SURE] |= np.uint8(BlobFlag.REFLECTION)
-        uv = np.where(taken[:, None], said.uv, blobs.uv)
-        sigma = np.where(taken, said.sigma, blobs.sigma)
+        flags[output.kind[:, BlobKind.MERGED] > SURE] |= np.uint8(BlobFlag.MERGED)
+        flags[output.kind[:, BlobKind.FALSE] > SURE] |= np.uint8(BlobFlag.REFLECTION)
+        uv = np.where(taken[:, None], output.uv, blobs.uv)
+        sigma = np.where(taken, output.sigma, blobs.sigma)
         return replace(blobs, uv=uv, sigma=sigma, flags=flags)
 
     def of_snapshots(
@@ -137,11 +137,11 @@ class LearnedMeasurer:
         )
         rows, columns = torch.from_numpy(group), torch.from_numpy(place)
         reduced = torch.from_numpy(radius / scale).float()
-        said = self.network(normalize_crops(patches[rows, columns]), reduced)
+        output = self.network(normalize_crops(patches[rows, columns]), reduced)
         corner, by = placement.corner[rows, columns], placement.scale[rows, columns]
-        sigma = (said.log_sigma.double().exp().square() + LEAST_SIGMA**2).sqrt() * by
-        uv = corner + by[:, None] * (said.offset.double() + placement.size / 2)
-        return Remeasured(uv.numpy(), sigma.numpy(), said.kind.softmax(-1).double().numpy(), radius)
+        sigma = (output.log_sigma.double().exp().square() + LEAST_SIGMA**2).sqrt() * by
+        uv = corner + by[:, None] * (output.offset.double() + placement.size / 2)
+        return Remeasured(uv.numpy(), sigma.numpy(), output.kind.softmax(-1).double().numpy(), radius)
 
 
 def _usual(radius: NDArray[np.float64], whole: NDArray[np.bool_], camera: NDArray[np.int64]) -> NDArray[np.float64]:

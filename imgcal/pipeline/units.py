@@ -167,10 +167,10 @@ def _doubt_by_poses(detections: Detections, rig: CameraRig, obj: CalibrationObje
         for second in range(first):
             both = known[:, first] & known[:, second]
             if both.any():
-                said = rig.cam_from_rig[second] @ rig.cam_from_rig[first].inverse()
+                in_rig = rig.cam_from_rig[second] @ rig.cam_from_rig[first].inverse()
                 found = placed[both, second] @ placed[both, first].inverse()
-                turns.append(vector_from_rotation(found.rotation @ said.rotation.mT).norm(dim=-1))
-                lengths.append(found.translation.norm(dim=-1) / said.translation.norm().clamp_min(1e-12))
+                turns.append(vector_from_rotation(found.rotation @ in_rig.rotation.mT).norm(dim=-1))
+                lengths.append(found.translation.norm(dim=-1) / in_rig.translation.norm().clamp_min(1e-12))
     if not lengths:
         return ""
     turn, ratio = float(torch.cat(turns).median()), float(torch.cat(lengths).median())

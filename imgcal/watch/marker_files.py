@@ -98,7 +98,7 @@ class MarkerFile:
         steps = max(round((moment - self._latest) * self._rate), 1)
         if steps > LONGEST_GAP:
             raise OSError(f"a gap of {steps:,} frames: start a new file")
-        self._waiting += [self._nothing()] * (steps - 1)
+        self._waiting += [self._empty_frame()] * (steps - 1)
         self._waiting.append(frame)
         self._latest = moment
 
@@ -109,7 +109,7 @@ class MarkerFile:
             if len(self._labels) > self._width:
                 self._file.widen(self._labels)
                 self._width = len(self._labels)
-            wide = [self._widened(frame) for frame in waiting]
+            wide = [self._widen(frame) for frame in waiting]
             points, error, cameras = (np.stack(part) for part in zip(*wide, strict=True))
             self._file.append(points, error, cameras)
 
@@ -117,7 +117,7 @@ class MarkerFile:
         """The markers that were seen."""
         if record.lights is not None:
             return self._lights(record.time, record.lights)
-        points, error, cameras = self._nothing()
+        points, error, cameras = self._empty_frame()
         if record.pose is None or record.pose.seen is None:
             return points, error, cameras
         found, std = (values.numpy() for values in record.pose.points_rig())
@@ -133,18 +133,18 @@ class MarkerFile:
             column = self._tracks.number_lights(lights.point, moment)
             count = max(len(self._labels), int(column.max(initial=-1)) + 1)
             self._labels = tuple(f"L{number}" for number in range(1, count + 1))
-        points, error, cameras = self._nothing()
+        points, error, cameras = self._empty_frame()
         rows = np.flatnonzero(column >= 0)
         column = column[rows]
         points[column], error[column] = lights.point[rows], lights.error[rows]
         cameras[column] = _camera_bits(lights.seen)[rows]
         return points, error, cameras
 
-    def _nothing(self) -> Frame:
+    def _empty_frame(self) -> Frame:
         count = len(self._labels)
         return np.full((count, 3), np.nan), np.zeros(count), np.zeros(count, dtype=np.int64)
 
-    def _widened(self, frame: Frame) -> Frame:
+    def _widen(self, frame: Frame) -> Frame:
         """Extend a frame to all present columns."""
         missing = self._width - len(frame[0])
         filled = np.pad(frame[0], ((0, missing), (0, 0)), constant_values=np.nan)

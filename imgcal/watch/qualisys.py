@@ -107,18 +107,18 @@ class Qualisys:
             InputError: the address is invalid.
         """
         host, port = _host_and_port(self.address)
-        clock, said = _Clock(self.clock), ""
+        clock, reported = _Clock(self.clock), ""
         while True:
             clock.fresh = True
             try:
                 with (yield from _connect(host, port, self.silence)) as connection:
                     for item in self._session(connection, clock):
-                        said = "" if isinstance(item, Exposure) else said
+                        reported = "" if isinstance(item, Exposure) else reported
                         yield item
             except (_Lost, OSError) as error:
                 reason = one_line(f"{self.address}: {error}")
-                if reason != said:  # once, however many retries follow
-                    said = reason
+                if reason != reported:  # once, however many retries follow
+                    reported = reason
                     yield Unreadable(reason)
             ends = time.monotonic() + self.pause
             while time.monotonic() < ends:

@@ -169,14 +169,14 @@ class Synchronizer:
         self.counts["astray"][exposure.camera] += 1
         self._astray[exposure.camera] = exposure
         self._astray_in_a_row += 1
-        believed = [held for held in self._astray.values() if abs(held.time - exposure.time) <= LEAP]
-        if 2 * len(believed) <= len(self._there()) and self._astray_in_a_row < LONGEST_ASTRAY:
+        believed = [waiting for waiting in self._astray.values() if abs(waiting.time - exposure.time) <= LEAP]
+        if 2 * len(believed) <= len(self._active_cameras()) and self._astray_in_a_row < LONGEST_ASTRAY:
             return self.release_due(now)
         done = self.flush()
         self._reset()
-        for held in sorted(believed, key=lambda held: held.time):
-            self.counts["astray"][held.camera] -= 1
-            self._add(held, now)
+        for waiting in sorted(believed, key=lambda waiting: waiting.time):
+            self.counts["astray"][waiting.camera] -= 1
+            self._add(waiting, now)
         return done + self.release_due(now)
 
     def release_due(self, now: float) -> tuple[TimedSnapshot, ...]:
@@ -236,7 +236,7 @@ class Synchronizer:
 
     def _may_go(self, pending: _Pending, now: float) -> bool:
         if len(self._pending) > MOST_PENDING or all(
-            name in pending.exposures or not self._is_due(name, pending) for name in self._there()
+            name in pending.exposures or not self._is_due(name, pending) for name in self._active_cameras()
         ):
             return True
         if pending.name is not None:
@@ -283,7 +283,7 @@ class Synchronizer:
             self._nearest(other, pending) < NEIGHBOUR * self._rest(name) for other in self.camera_names if other != name
         )
 
-    def _there(self) -> list[str]:
+    def _active_cameras(self) -> list[str]:
         """The cameras to wait for, including one that has just started: its rate is still unknown."""
         latest = max(self._newest.values(), default=0.0)
         return [name for name in self.camera_names if self._absent[name] < OUT_AFTER or self._begins(name, latest)]
@@ -294,7 +294,7 @@ class Synchronizer:
 
     def _clock(self, now: float) -> float:
         """Current time by the cameras' clocks: the median, of two the earlier one."""
-        offsets = sorted(self._offset[name] for name in self._there() if name in self._offset)
+        offsets = sorted(self._offset[name] for name in self._active_cameras() if name in self._offset)
         return now + offsets[(len(offsets) - 1) // 2] if offsets else math.nan
 
     def _has_leapt(self, exposure: Exposure, now: float) -> bool:

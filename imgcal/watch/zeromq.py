@@ -45,9 +45,9 @@ class ZeroMQ:
                 # ZeroMQ does not reconnect by itself after an oversized message.
                 with context.socket(zmq.SUB) as socket:
                     self._connect(socket)
-                    yield from self._received(socket)
+                    yield from self._receive(socket)
 
-    def _received(self, socket: zmq.Socket[bytes]) -> Iterator[Item]:
+    def _receive(self, socket: zmq.Socket[bytes]) -> Iterator[Item]:
         """Receive until nothing has come for a while; time in which the caller is busy does not count."""
         heard = time.monotonic()
         while True:
