@@ -59,7 +59,7 @@ class Finding:
     """What follows from an explanation besides the belief about the rig."""
 
     slips: tuple[ClockSlip, ...] = ()
-    unsynchronized: tuple[int, ...] = ()  # cameras that teach nothing for now
+    unsynchronized: tuple[int, ...] = ()  # cameras excluded from learning for now
     shake: Tensor | None = None  # (C,) px, how much each camera shakes
     object_change: ObjectChange | None = None
 
@@ -84,7 +84,7 @@ class Case:
     options: EstimationOptions = EstimationOptions()
     cameras: tuple[int, ...] = ()  # suspects, the most likely first; empty = no particular camera
     uncertain: bool = False  # the poses of these cameras are hardly known
-    quarantined: bool = False  # these cameras have not been learnt since
+    quarantined: bool = False  # these cameras are excluded from learning since then
     lasting: Tensor | None = None  # (C,) px, standard deviation of persistent image shifts; None = there are none
     beginning: RigBelief | None = None  # the belief before all snapshots, if it is the factory's
     excluded: Mapping[str, str] = field(default_factory=dict)  # explanations not to weigh, and why

@@ -85,7 +85,7 @@ def absorb(
         _make_rig(found.from_rig, belief.rig), torch.from_numpy(found.from_own), unit,
         *(torch.from_numpy(part) for part in (found.camera, found.border, carried, found.pull)),
     )  # fmt: skip
-    # Set what the properties would compute; it is at hand.
+    # Set the cached properties: their values are at hand.
     half_log_determinant = float(np.log(found.factor.diagonal()).sum())
     information = torch.from_numpy(found.information)
     vars(now).update(information=information, arrays=found.rig, constants=constants)

@@ -1,4 +1,4 @@
-"""Cameras that see the object in the wrong place: they are not learnt until the reason is known."""
+"""Cameras that see the object in the wrong place: they are excluded from learning until the reason is known."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SETTLE_SECONDS, SETTLE_SNAPSHOTS = 2.0, 20
 
 @dataclass
 class Quarantine:
-    """Cameras that are not learnt, and what they have seen in the meantime."""
+    """Cameras excluded from learning, and what they have seen in the meantime."""
 
     cameras: set[int] = field(default_factory=set)
     seen: deque[Observations] = field(default_factory=lambda: deque(maxlen=CASE_SNAPSHOTS_UNCERTAIN))  # (1, C, N)
