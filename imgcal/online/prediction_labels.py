@@ -15,7 +15,7 @@ from imgcal.types import CalibrationObject, CameraRig, Detections
 TOO_NEAR = 0.6
 """Distance (px) below which two predictions are too close to tell their blobs apart."""
 MARGIN = 0.03
-"""Margin beyond the image border, as a share of the image size; fiducials predicted there may be out of view."""
+"""Margin at the image border, as a share of the image size, in which predicted fiducials may be out of view."""
 LEAST_EXPLAINED = 1 / 3
 """Share of the object's visible fiducials that must be labelled."""
 LEAST_SIGHT = 0.6
