@@ -1,4 +1,4 @@
-"""Where the object is, by a rig that is taken as it stands: six numbers, in one compiled call."""
+"""The object's pose with a fixed rig: six parameters, in one compiled call."""
 
 # Compiled functions take their types from their arguments.
 # ruff: noqa: ANN001, ANN202
@@ -29,7 +29,7 @@ TOLERANCE = 1e-4
 
 @dataclass(frozen=True)
 class FixedRigFit:
-    """The most probable pose of an object, the rig being known."""
+    """The most probable pose of an object, given the rig."""
 
     rig_from_object: RigidTransform  # (1,)
     residual: NDArray[np.float64]  # (C, N, 2) pixels, predicted minus observed; zero where not seen
@@ -43,13 +43,13 @@ def fit_pose(
     rig_from_object: RigidTransform,
     options: EstimationOptions = EstimationOptions(loss="cauchy"),
 ) -> FixedRigFit:
-    """Find the object's pose.
+    """Estimate the object's pose.
 
     Args:
         observations: (1, C, N), on the CPU.
-        rig: without batch axes; held.
+        rig: without batch axes; stays fixed.
         points: (N, 3) mm, the fiducials.
-        radius: (N,) mm of spherical ones.
+        radius: (N,) mm of spherical fiducials.
         rig_from_object: (1,) first guess.
         options: loss and threshold.
 
@@ -112,7 +112,7 @@ def fit_pose(
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _fit_pose(given, offset, poses, blocks, loss, threshold):
-    """Levenberg-Marquardt on a pose; the row of the best, -1 where the pose is not determined."""
+    """Run Levenberg-Marquardt on a pose. Returns the row of the best state, or -1 where the pose is not determined."""
     rotation, centre = poses
     camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual = blocks
     own, steady = np.empty(0), np.empty((0, 0))
