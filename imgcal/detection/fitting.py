@@ -123,7 +123,7 @@ def _draw(rows, pixels, parameters):
         gx, gy = xx * dx + xy * dy, xy * dx + yy * dy
         along = dx * gx + dy * gy
         away = np.sqrt(one + along)
-        # The model's edge is softer along the longer axis; make it as sharp as along the shorter one.
+        # The model's edge is softer along the longer axis; this makes it equally soft all around.
         steep = np.sqrt((one + mean * along) / (one + gx * gx + gy * gy))
         t = min(max(steep * (edge - away), -end), end)
         q = t * t

@@ -47,7 +47,7 @@ SURE = 4.0
 OWN = 0.5
 """Weight of a camera's own scatter; the remainder is the weight of the average over all cameras."""
 OVERLAP = 2 / 3
-"""Effective number of heavily overlapping blocks, relative to that of disjoint ones."""
+"""Variance of the average over heavily overlapping blocks, relative to that over disjoint ones."""
 WORTH = 2.0
 """The same threshold for the first-order test, which needs no inverse per block and decides whether to measure."""
 LEAST_SAID = 1e-6

@@ -68,7 +68,7 @@ class TimmEncoder(nn.Module):
 
 
 def _make_strided(name: str, pretrained: bool, options: Mapping[str, Any]) -> tuple[Any, list[int]]:
-    """Create a timm model that returns its maps, and the indices of those from stride 4 on; None if it has only one."""
+    """Create a timm model that returns its maps, and the indices of those from stride 4 on; None without several."""
     try:
         model: Any = timm.create_model(name, pretrained=pretrained, features_only=True, **options)
         strides = model.feature_info.reduction()
