@@ -275,13 +275,13 @@ def make_problem(
     ):
         raise InputError(
             f"observations: found uv {tuple(observations.uv.shape)} and seen {tuple(observations.seen.shape)}, "
-            f"expected (..., snapshots, {rig.num_cameras} cameras, {obj.num_fiducials} fiducials) and the same with "
-            "coordinates"
+            f"expected uv (..., snapshots, {rig.num_cameras} cameras, {obj.num_fiducials} fiducials, 2) and seen "
+            "without the last axis"
         )
     if observations.shake is not None:
         raise InputError(
-            "observations: found `shake`, which only a running rig (`RigKeeper`) takes into account: estimate from "
-            "observations without it"
+            "observations: found `shake`, which only a running rig (`RigKeeper`) supports; expected observations "
+            "without it"
         )
     batch = observations.seen.shape[:-3]
     count = batch.numel()

@@ -14,8 +14,8 @@ from imgcal.geometry import pose_rank
 LEAST_BREADTH = 0.05
 """Breadth of the visible part, relative to the whole object's: below, a rotation about a line is undetermined."""
 
-ON_A_LINE = "the labels that are left lie on one line, about which the object could be turned"
-TOO_FEW = "fewer than {} have labels in two cameras"
+ON_A_LINE = "the remaining labels lie on one line, which leaves the rotation about it undetermined"
+TOO_FEW = "two cameras share labels of fewer than {}"
 
 
 class UndeterminedPosesError(RefusedError):

@@ -80,8 +80,8 @@ def cold_start_from_points(
     """
     if cameras.num_cameras < 3:
         raise RefusedError(
-            f"start without a factory calibration: found {cameras.num_cameras} cameras, expected at least 3: what two "
-            "see of points decides too little"
+            f"start without a factory calibration: found {cameras.num_cameras} cameras, expected at least 3: "
+            "points in two cameras do not determine a rig"
         )
     uv, seen = observations.uv[:, :, 0].double().numpy(), observations.seen[:, :, 0].numpy()
     best: PointStart | None = None
@@ -100,8 +100,8 @@ def cold_start_from_points(
         common = [int((seen[:, [c]] & np.delete(seen, c, 1)).any(1).sum()) for c in range(cameras.num_cameras)]
         require_connected([c for c, count in enumerate(common) if count < LEAST_COMMON], cameras)
         raise RefusedError(
-            "start without a factory calibration: no cameras see enough points together from different sides: carry "
-            "the light through all of what neighbouring cameras see"
+            "start without a factory calibration: no two cameras see enough common points from different directions: "
+            "carry the light through all that neighbouring cameras see"
         )
     return best
 

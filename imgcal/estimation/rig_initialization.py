@@ -150,8 +150,8 @@ def require_connected(alone: Sequence[int], cameras: CameraRig) -> None:
     if alone:
         raise RefusedError(
             f"start without a factory calibration: camera {list_names(cameras.camera_names[c] for c in alone)} "
-            "cannot be "
-            "placed beside the others: carry the whole object through what it sees together with other cameras"
+            "cannot be placed relative to the others: carry the whole object through the view that it shares with "
+            "other cameras"
         )
 
 

@@ -205,7 +205,7 @@ def _best_motion(motion: Tensor, weighted: Tensor) -> Tensor:
     scale = normal.diagonal().clamp_min(torch.finfo(normal.dtype).tiny).rsqrt()
     factor, failed = torch.linalg.cholesky_ex(scale[:, None] * normal * scale)
     if bool(failed):
-        raise RefusedError("predicted error: too little of the working volume is seen by the cameras to compare rigs")
+        raise RefusedError("predicted error: the cameras see too little of the working volume")
     return scale[:, None] * torch.cholesky_solve(scale[:, None] * weighted.mT, factor)
 
 

@@ -80,9 +80,9 @@ class VarianceComponents:
 class ObjectQuestion(Enum):
     """What to test about the object."""
 
-    NONE = "it is taken as it is"
-    SHAPE = "is it what its file says? fiducials that are not in their places are freed"
-    SHAPE_OF_TURNS = "the same, but snapshots may have labels of different turns: nobody can say which are not"
+    NONE = "nothing"
+    SHAPE = "its shape; misplaced fiducials are freed"
+    SHAPE_OF_TURNS = "its shape, but labels may differ by a symmetry: misplaced fiducials cannot be identified"
 
 
 @dataclass(frozen=True)
@@ -213,10 +213,10 @@ def estimate_variance_components(
         prior_scale |= {kind: prior_scale.get(kind, 1.0) * factor for kind, factor in too_narrow.items()}
         problem, state = _widen(problem, state, too_narrow)
     raise RefusedError(
-        f"estimation: noise, outliers and prior have not come to rest after {ROUNDS} fits: the rig has changed far "
+        f"estimation: noise, outliers and prior do not converge in {ROUNDS} fits: the rig has changed far "
         "more than its prior allows, or many labels are wrong",
-        python="give the rig a wider prior where it may have changed so much: replace(rig, prior=RigPrior(...))",
-        command="write larger values under `prior` in the rig file where the rig may have changed so much",
+        python="if the rig may have changed that much, give it a wider prior: replace(rig, prior=RigPrior(...))",
+        command="if the rig may have changed that much, write larger values under `prior` in the rig file",
     )
 
 
@@ -244,10 +244,10 @@ def _examine(
     bent = shape.bent_sigma() >= BENT
     if bent and question is ObjectQuestion.SHAPE_OF_TURNS:
         raise RefusedError(
-            "object: its fiducials are not where its file says, and because it can be turned into itself, nobody can "
-            "say which: each snapshot may have the labels of another turn",
-            python="measure it anew, give labels (Detections.fiducial), or use an object without symmetry",
-            command="measure it anew, give labels (a column `fiducial`), or use an object without symmetry",
+            "object: some fiducials are not where its file says, but the object is symmetric: snapshots may be "
+            "labelled in different orientations, so the displaced fiducials cannot be identified",
+            python="measure it again, give labels (Detections.fiducial), or use an object without symmetry",
+            command="measure it again, give labels (a column `fiducial`), or use an object without symmetry",
         )
     free = None
     if bent and isinstance(shape, ShapeEvidence):
@@ -299,9 +299,9 @@ def _require_scale(shape: ShapeEvidence | ScaleEvidence, fit: _Fit, least: float
         raise RefusedError(
             f"object: all cameras have moved together, as if it were {100 * abs(error):.2g} +- {100 * deviation:.1g} % "
             f"{size} than its file says",
-            python=f"measure it anew, look at its unit, or grant its scale a tolerance (now {granted:g}): "
+            python=f"measure it again, check its unit, or give its scale a tolerance (now {granted:g}): "
             "replace(obj, scale_tolerance=...)",
-            command=f"measure it anew, look at its unit, or grant its scale a tolerance (now {granted:g}): "
+            command=f"measure it again, check its unit, or give its scale a tolerance (now {granted:g}): "
             "--object-scale-tolerance",
         )
 
