@@ -324,15 +324,15 @@ def explain_missing(frames: Iterable[Frame], board: Board) -> str:
         last = board.first_id + count - 1
         if ids.max() > last or ids.min() < board.first_id:
             return (
-                f"markers {ids.min()} to {ids.max()} of {board.dictionary} are seen, expected {board.first_id} to "
-                f"{last}: the board has other numbers of columns and rows, or another first_id"
+                f"markers {ids.min()} to {ids.max()} of {board.dictionary} are visible, expected {board.first_id} to "
+                f"{last}: the board has another number of columns or rows, or another first_id"
             )
-        seen = f"{len(ids)} markers of {board.dictionary} are seen, but they do not lie as on this board"
+        seen = f"{len(ids)} markers of {board.dictionary} are visible, but not in the layout of this board"
         if board.kind == "charuco":
-            return f"{seen}: are columns and rows exchanged, or is it a legacy pattern?"
-        return f"{seen}: look at columns, rows, tag, gap and numbered_from"
+            return f"{seen}: check whether columns and rows are swapped, or the pattern is a legacy one"
+        return f"{seen}: check columns, rows, tag, gap and numbered_from"
     if sum(len(_markers(grey, board)[1]) for grey in negative) >= 2:
-        return f"it is printed the other way round: expected inverted: {'false' if board.inverted else 'true'}"
+        return f"black and white are swapped: expected inverted: {'false' if board.inverted else 'true'}"
     return _other_dictionary(looked, board)
 
 
@@ -344,10 +344,10 @@ def _other_dictionary(looked: list[NDArray[np.uint8]], board: Board) -> str:
         counts[name] = sum(0 if found is None else len(found) for found in ids)
     best = max(counts.values())
     if best < 3:
-        return "no marker of any dictionary is seen"
+        return "no marker of any dictionary is visible"
     # The small dictionaries of a family are prefixes of the large ones.
     names = [name for name in counts if counts[name] == best]
-    return f"its markers are of {' or '.join(names[:4])}, expected {board.dictionary} as its file says"
+    return f"its markers are from {' or '.join(names[:4])}, expected {board.dictionary} as in its file"
 
 
 def _other_grid(looked: list[NDArray[np.uint8]], board: Board) -> str:
@@ -361,11 +361,11 @@ def _other_grid(looked: list[NDArray[np.uint8]], board: Board) -> str:
         for columns, rows in sizes:
             other = Board(board.kind, columns, rows, board.pitch, asymmetric=board.asymmetric)
             if _FINDERS[board.kind](grey, other) is not None:
-                return f"a board of {columns}x{rows} {part} is seen, expected {board.columns}x{board.rows}"
+                return f"a board of {columns}x{rows} {part} is visible, expected {board.columns}x{board.rows}"
     return ""
 
 
 def _turned_over(negative: list[NDArray[np.uint8]], board: Board) -> str:
     if any(_FINDERS[board.kind](grey, board) is not None for grey in negative):
-        return f"it is printed the other way round: expected inverted: {'false' if board.inverted else 'true'}"
+        return f"black and white are swapped: expected inverted: {'false' if board.inverted else 'true'}"
     return "the whole board must be in the image, with a white margin" if not board.inverted else ""

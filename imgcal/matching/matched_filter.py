@@ -53,7 +53,7 @@ class MatchedFilter:
         found = view.search_known(snapshot)
         if found is None:
             if not _searchable(scene.obj):
-                return Proposal.decline(snapshot, "its fiducials are too many and too close to search for it anywhere")
+                return Proposal.decline(snapshot, "its fiducials are too dense for a search without a known pose")
             found = view.search_anywhere()
         return view.proposal(found, snapshot)
 

@@ -54,18 +54,18 @@ def make_backbone(name: str, pretrained: bool, options: Mapping[str, Any]) -> nn
         raise
     except TypeError as error:
         raise InputError(
-            f"backbone {name}: found options {quote(repr(dict(options)))} that it does not take: {quote(str(error))}"
+            f"backbone {name}: found unsupported options {quote(repr(dict(options)))}: {quote(str(error))}"
         ) from error
     except (OSError, RuntimeError) as error:
         if not pretrained:
-            raise InputError(f"backbone {name}: cannot be made: {_first_line(error)}") from error
+            raise InputError(f"backbone {name}: cannot be built: {_first_line(error)}") from error
         raise InputError(
             f"backbone {name}: its pretrained weights cannot be loaded ({_first_line(error)}); go online, "
             "put them into timm's cache (HF_HOME), or set pretrained: false"
         ) from error
     except Exception as error:  # invalid options raise many kinds of errors within timm
         found = f"{type(error).__name__} {_first_line(error)}".strip()
-        raise InputError(f"backbone {name}: cannot be made of {quote(repr(dict(options)))}: {found}") from error
+        raise InputError(f"backbone {name}: cannot be built with {quote(repr(dict(options)))}: {found}") from error
 
 
 def input_size(model: Any, otherwise: int = USUAL_SIZE) -> tuple[int, int]:

@@ -44,7 +44,7 @@ def check_options(options: Mapping[str, Any]) -> None:
     for name, value in options.items():
         if name not in ALLOWED:
             hint = nearest(name, ALLOWED) or f", expected some of {list_names(sorted(ALLOWED))}"
-            raise ValueError(f"options: found `{shorten(name)}`, which is not among those of a network's shape{hint}")
+            raise ValueError(f"options: found `{shorten(name)}`, which is not an allowed option{hint}")
         expected = _describe_expected(name, value)
         if expected:
             raise ValueError(f"options: {name}: found {shorten(repr(value))}, expected {expected}")

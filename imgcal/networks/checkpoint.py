@@ -175,7 +175,7 @@ def _take_over(path: str | Path, network: nn.Module) -> tuple[str, ...]:
     if spec is not None and is_position_training(spec):
         fitting = [name for name in fitting if name.startswith("positions.")]  # the rest is untrained
     if not fitting:
-        raise InputError(f"{path}: found no parameter that fits the network by name and shape, expected some")
+        raise InputError(f"{path}: found no parameter that matches the network by name and shape")
     with torch.no_grad():
         for name in fitting:
             own[name].copy_(tensors[name])
@@ -202,8 +202,8 @@ def _check_code(path: str | Path, spec: NetworkSpec, trusted: Collection[str]) -
 def _fill(path: str | Path, network: nn.Module, tensors: dict[str, Tensor]) -> None:
     if "belief.weight" in tensors:
         raise InputError(
-            f"{path}: found an image network that reads positions by hue, of an earlier version of imgcal; "
-            "expected one whose encoder finds them: train it anew"
+            f"{path}: found an image network that reads positions by hue, from an earlier version of imgcal; "
+            "expected one whose encoder locates them: train it again"
         )
     own = network.state_dict()
     wrong = sorted(own.keys() ^ tensors.keys()) or sorted(n for n in own if own[n].shape != tensors[n].shape)

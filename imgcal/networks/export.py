@@ -157,7 +157,7 @@ def _query(network: InfraredNetwork, count: int, fiducials: int) -> Program:
 
 def _points(path: Path, network: Network, count: int) -> Program:
     if network.image_options is not None:
-        kind = "found a network of images, whose positions are found by compiled code of ours"
+        kind = "found an image network, which locates fiducials with compiled code that cannot be exported"
         raise InputError(f"{path}: {kind}; expected a point network, a query network or a measurer")
     generator, rig, obj = torch.Generator().manual_seed(0), network.factory, network.obj
     cameras, fiducials = rig.num_cameras, obj.num_fiducials

@@ -78,7 +78,7 @@ def _count_weights(name: str, make: Callable[[], nn.Module]) -> nn.Module:
     except InputError:
         raise
     except Exception as error:  # a custom class may raise anything for invalid options
-        raise InputError(f"backbone {shorten(name)}: cannot be made of its options: {_first_line(error)}") from error
+        raise InputError(f"backbone {shorten(name)}: cannot be built with its options: {_first_line(error)}") from error
 
 
 @torch.no_grad()
@@ -100,7 +100,7 @@ def _check_width(encoder: nn.Module, name: str, size: int) -> int:
     if not isinstance(features, Tensor) or features.ndim != 4 or features.shape[2:] != (cells, cells):
         found = list(features.shape) if isinstance(features, Tensor) else type(features).__name__
         raise InputError(
-            f"backbone {shorten(name)}: of an image of {size} x {size} pixels found {found}, "
+            f"backbone {shorten(name)}: found {found} for an image of {size} x {size} pixels, "
             f"expected features of shape (1, F, {cells}, {cells}): a stride of {STRIDE}"
         )
     return int(features.shape[1])

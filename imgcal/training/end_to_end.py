@@ -38,7 +38,7 @@ def end_to_end_loss(
         return 0.0
     if prediction.log_sigma is None or batch.views.uv is None:
         raise InputError(
-            "loss: refined: found a network that weighs no points, expected a point variant with "
+            "loss: refined: found a network that does not weight points, expected a point variant with "
             "`change: {trunk: {trust: true}}`"
         )
     with torch.autocast(batch.views.uv.device.type, enabled=False):

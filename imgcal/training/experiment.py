@@ -82,7 +82,7 @@ class TrainingConfig(StrictModel):
         if self.steps is None and self.minutes is None:
             raise ValueError("found neither `steps` nor `minutes`, expected one of them")
         if self.patience is not None and not self.validation_rigs:
-            raise ValueError(f"found patience {self.patience} and validation_rigs 0, expected some to go by")
+            raise ValueError(f"found patience {self.patience} and validation_rigs 0, expected at least 1 rig")
         return self
 
     @property

@@ -113,7 +113,7 @@ class InfraredTask(Task[CropBatch, Evidence]):
         assert self.own is not None
         found, expected = self.own.crops.shape[-1], self.network.config.crop
         if found != expected:
-            raise InputError(f"{folder}: found crops of {found} pixels, expected {expected} as the network takes them")
+            raise InputError(f"{folder}: found crops of {found} pixels, expected {expected} for this network")
 
     def batch(self, count: int, generator: torch.Generator) -> CropBatch:
         """Make crops of random rigs and objects; all objects of a batch have the same number of fiducials."""

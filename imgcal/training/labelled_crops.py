@@ -102,7 +102,7 @@ def fit_poses(
     fixed = torch.zeros(*rig.distortion.shape[:-1], rig.num_parameters, dtype=rig.distortion.dtype)
     fit = estimate(observations, rig, obj.taken_as_exact(), poses, prior_std=fixed, options=options.estimation)
     if not bool(fit.converged):
-        raise RefusedError("harvest: in some snapshot no pose of the object fits; check the rig and the object")
+        raise RefusedError("harvest: no pose of the object fits in at least one snapshot; check the rig and the object")
     return observations, fit.rig_from_object
 
 
@@ -173,7 +173,7 @@ def split(crops: FrameDataset, snapshots: int, cameras: int) -> tuple[FrameDatas
         train = ~held_out
     if not bool(train.any() and held_out.any()):
         raise RefusedError(
-            f"harvest: found {int(train.sum())} crops to learn from and {int(held_out.sum())} to hold out in "
+            f"harvest: found {int(train.sum())} training crops and {int(held_out.sum())} held-out crops in "
             f"{snapshots} snapshots of {cameras} cameras, expected some of both: capture more snapshots"
         )
     return crops.select(train), crops.select(held_out)

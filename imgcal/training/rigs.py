@@ -160,4 +160,4 @@ def _check_difficulty(experiment: RigExperiment, network: Network) -> None:
     if experiment.levels and network.image_options is None:
         raise InputError(f"levels: found {experiment.levels}, but the network {experiment.network.preset} takes points")
     if experiment.levels and not experiment.corruption.nothing:
-        raise InputError("levels: found them beside `corruption`, expected one of the two: levels corrupt points, too")
+        raise InputError("levels: found together with `corruption`, expected one of them: levels corrupt points, too")
