@@ -234,7 +234,7 @@ def _checkerboard(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
         return None
     grid = np.asarray(corners, dtype=np.float64).reshape(down, across, 2)
     grid = _flip_mirrored(grid)
-    if _goes_on(grey, grid):
+    if _continues(grey, grid):
         return None
     # The first square, at the top left, is black; so is the first square enclosed by four inner corners.
     if _colour(grey, grid, 0, 0) > _colour(grey, grid, 0, 1):
@@ -284,7 +284,7 @@ def _grey_at(grey: NDArray[np.uint8], uv: Floats) -> Floats:
     return np.where(inside, value, np.nan)
 
 
-def _goes_on(grey: NDArray[np.uint8], grid: Floats) -> bool:
+def _continues(grey: NDArray[np.uint8], grid: Floats) -> bool:
     """Check whether the squares continue beyond a side of the grid: then the board is larger than expected."""
     for side in (grid, grid[::-1], grid.transpose(1, 0, 2), grid[:, ::-1].transpose(1, 0, 2)):
         # Centres of the squares beyond the side and one row farther in: white paper, or squares of two colours.
@@ -316,7 +316,7 @@ def explain_missing(frames: Iterable[Frame], board: Board) -> str:
     looked = [_eight_bits(frame, board) for _, frame in zip(range(MOST_LOOKED), frames, strict=False)]
     negative = [255 - grey for grey in looked]
     if not board.is_coded:
-        return _other_grid(looked, board) or _turned_over(negative, board)
+        return _explain_other_grid(looked, board) or _explain_inverted(negative, board)
     found = [_markers(grey, board) for grey in looked]
     ids = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(number for _, number in found)]))
     if len(ids) >= 2:
@@ -333,10 +333,10 @@ def explain_missing(frames: Iterable[Frame], board: Board) -> str:
         return f"{seen}: check columns, rows, tag, gap and numbered_from"
     if sum(len(_markers(grey, board)[1]) for grey in negative) >= 2:
         return f"black and white are swapped: expected inverted: {'false' if board.inverted else 'true'}"
-    return _other_dictionary(looked, board)
+    return _explain_other_dictionary(looked, board)
 
 
-def _other_dictionary(looked: list[NDArray[np.uint8]], board: Board) -> str:
+def _explain_other_dictionary(looked: list[NDArray[np.uint8]], board: Board) -> str:
     counts = {}
     for name in dictionaries():
         detector = cv2.aruco.ArucoDetector(_dictionary(name), _parameters(board))
@@ -350,7 +350,7 @@ def _other_dictionary(looked: list[NDArray[np.uint8]], board: Board) -> str:
     return f"its markers are from {' or '.join(names[:4])}, expected {board.dictionary} as in its file"
 
 
-def _other_grid(looked: list[NDArray[np.uint8]], board: Board) -> str:
+def _explain_other_grid(looked: list[NDArray[np.uint8]], board: Board) -> str:
     part = "squares" if board.kind == "checkerboard" else "circles"
     least = 3 if board.kind == "checkerboard" else 2
     steps = range(-OTHER_SIZES, OTHER_SIZES + 1)
@@ -365,7 +365,7 @@ def _other_grid(looked: list[NDArray[np.uint8]], board: Board) -> str:
     return ""
 
 
-def _turned_over(negative: list[NDArray[np.uint8]], board: Board) -> str:
+def _explain_inverted(negative: list[NDArray[np.uint8]], board: Board) -> str:
     if any(_FINDERS[board.kind](grey, board) is not None for grey in negative):
         return f"black and white are swapped: expected inverted: {'false' if board.inverted else 'true'}"
     return "the whole board must be in the image, with a white margin" if not board.inverted else ""

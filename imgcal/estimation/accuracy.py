@@ -158,17 +158,17 @@ class PredictedError:
         """Plain values for `result.json`; unknown values are None."""
         worst = self.worst_camera
         return {
-            "median_px": _is_known(self.median_px),
-            "p95_px": _is_known(self.p95_px),
-            "median_mm": _is_known(self.median_mm),
-            "p95_mm": _is_known(self.p95_mm),
+            "median_px": _none_if_nan(self.median_px),
+            "p95_px": _none_if_nan(self.p95_px),
+            "median_mm": _none_if_nan(self.median_mm),
+            "p95_mm": _none_if_nan(self.p95_mm),
             "noise_px": self.noise,
-            "median_mm_with_noise": _is_known(self.median_mm_with_noise),
+            "median_mm_with_noise": _none_if_nan(self.median_mm_with_noise),
             "worst_camera": self.camera_names[worst],
-            "worst_camera_px": _is_known(self.camera_px[worst]),
+            "worst_camera_px": _none_if_nan(self.camera_px[worst]),
             "exceptions": [self.camera_names[i] for i in self.exceptions],
-            "median_mm_without_exceptions": _is_known(_quantile(self.mm_without_exceptions, 0.5)),
-            "per_camera_px": {n: _is_known(px) for n, px in zip(self.camera_names, self.camera_px, strict=True)},
+            "median_mm_without_exceptions": _none_if_nan(_quantile(self.mm_without_exceptions, 0.5)),
+            "per_camera_px": {n: _none_if_nan(px) for n, px in zip(self.camera_names, self.camera_px, strict=True)},
             "volume_mm": {"low": self.volume.low.tolist(), "high": self.volume.high.tolist()},
             "seen_by_two_cameras": self.seen_share,
         }
@@ -303,5 +303,5 @@ def _quantile(values: Tensor, share: float) -> float:
     return float(known.quantile(share)) if len(known) else float("nan")
 
 
-def _is_known(value: float) -> float | None:
+def _none_if_nan(value: float) -> float | None:
     return value if value == value else None

@@ -151,9 +151,9 @@ def _scatter(information: Tensor, pull: Tensor, joined: int, shape: torch.Size) 
     change: list[Tensor] = []
     expected: list[Tensor] = []
     for first, last in zip(summed, summed[joined:], strict=False):
-        without = torch.cholesky_inverse(torch.linalg.cholesky(total - (last - first)))[:wide]
-        change.append(without @ pull[len(change) : len(change) + joined].sum(0))
-        expected.append(without[:, :wide] - covariance)
+        remaining = torch.cholesky_inverse(torch.linalg.cholesky(total - (last - first)))[:wide]
+        change.append(remaining @ pull[len(change) : len(change) + joined].sum(0))
+        expected.append(remaining[:, :wide] - covariance)
     variance = torch.stack([block.diagonal() for block in expected]).sum(0)
     known = variance > LEAST_SAID
     if not bool(known.any()):
@@ -183,24 +183,24 @@ def _evidence(problem: Problem, state: State, size: int, loss: NamedLoss, first:
     count = (problem.uv.shape[1] - first) // size
     rows = slice(first, first + count * size)
 
-    def repeated(tensor: Tensor) -> Tensor:
+    def repeat(tensor: Tensor) -> Tensor:
         return tensor.expand(count, *tensor.shape[1:])
 
-    def parted(tensor: Tensor) -> Tensor:
+    def divide(tensor: Tensor) -> Tensor:
         return tensor[0, rows].unflatten(0, (count, size))
 
     own_std, own_offset = problem.object_prior_std, state.object_offset
     blocks = replace(
         problem,
-        uv=parted(problem.uv),
-        root_weight=parted(problem.root_weight),
-        factory=problem.factory.map_tensors(lambda tensor, _: repeated(tensor)),
-        prior_std=repeated(problem.prior_std),
-        object_prior_std=None if own_std is None else repeated(own_std),
+        uv=divide(problem.uv),
+        root_weight=divide(problem.root_weight),
+        factory=problem.factory.map_tensors(lambda tensor, _: repeat(tensor)),
+        prior_std=repeat(problem.prior_std),
+        object_prior_std=None if own_std is None else repeat(own_std),
     )
     there = State(
-        repeated(state.offset), parted(state.rotation), parted(state.centre),
-        None if own_offset is None else repeated(own_offset),
+        repeat(state.offset), divide(state.rotation), divide(state.centre),
+        None if own_offset is None else repeat(own_offset),
     )  # fmt: skip
     equations = equations_at(blocks, there, loss)
     own, coupling = equations.object, equations.coupling.permute(0, 1, 4, 2, 3).flatten(3)  # (B, S, 6, K C)

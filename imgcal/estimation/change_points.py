@@ -172,7 +172,7 @@ def _places(seen: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 def _screen(blocks: Blocks, places: Mapping[int, NDArray[np.int64]]) -> dict[int, float]:
     """Screen all cameras at once: the largest statistic of each over a few candidates. Nearby steps show there, too."""
-    few = {camera: rows[_prior_std(len(rows))] for camera, rows in places.items()}
+    few = {camera: rows[_sparse_indices(len(rows))] for camera, rows in places.items()}
     if not few:
         return {}
     rows = np.unique(np.concatenate(list(few.values())))
@@ -185,7 +185,7 @@ def _screen(blocks: Blocks, places: Mapping[int, NDArray[np.int64]]) -> dict[int
     return largest
 
 
-def _prior_std(count: int) -> NDArray[np.int64]:
+def _sparse_indices(count: int) -> NDArray[np.int64]:
     """Indices of a few of `count` candidates, denser towards either end, where the position matters more."""
     steps = LEAST_SNAPSHOTS * GROWTH ** np.arange(np.log(max(count, 2)) / np.log(GROWTH))
     near = np.unique(np.ceil(steps).astype(np.int64) - LEAST_SNAPSHOTS)

@@ -95,8 +95,8 @@ def whitened_covariance(solution: Solution) -> Tensor:
         return torch.cholesky_inverse(reduced.kept)[:, :size, :size]
     inverse = torch.cholesky_inverse(reduced.eliminated)
     half = torch.linalg.solve_triangular(reduced.eliminated.mT, reduced.whitened, upper=True).flatten(1, 2)
-    prior_std = torch.linalg.solve_triangular(reduced.kept, half.mT, upper=False)
-    covariance = prior_std.mT @ prior_std
+    half_inverse = torch.linalg.solve_triangular(reduced.kept, half.mT, upper=False)
+    covariance = half_inverse.mT @ half_inverse
     blocks = covariance.unflatten(1, (cameras, -1)).unflatten(-1, (cameras, -1))
     blocks.diagonal(dim1=1, dim2=3).add_(inverse.permute(0, 2, 3, 1))
     return covariance

@@ -74,10 +74,10 @@ def fit_pose(
     weight = np.where(seen, 1 / np.where(seen, observations.sigma.numpy(), 1.0), 0.0).astype(np.float64)
     points = points.double()
     centroid = points.mean(0)
-    held = rig.focal_length.new_zeros(rig.num_cameras, 10 + rig.distortion.shape[-1]).double()
+    fixed_std = rig.focal_length.new_zeros(rig.num_cameras, 10 + rig.distortion.shape[-1]).double()
     problem = Problem(
         torch.from_numpy(uv)[None], torch.from_numpy(weight)[None], points - centroid, centroid,
-        None if radius is None else radius.double().square(), rig, held,
+        None if radius is None else radius.double().square(), rig, fixed_std,
     )  # fmt: skip
     rotation = rig_from_object.rotation.detach().double().reshape(1, 3, 3).numpy()
     centre = rig_from_object.translation.detach().double().reshape(1, 3).numpy() + rotation @ centroid.numpy()
@@ -91,11 +91,11 @@ def fit_pose(
         turned,
         position,
         *values,
-        held.numpy(),
+        fixed_std.numpy(),
         np.empty(0),
     )
     poses = (np.stack((rotation, rotation)), np.stack((centre, centre)))
-    (_, cameras, _, fiducials), free = uv.shape, held.shape[1]
+    (_, cameras, _, fiducials), free = uv.shape, fixed_std.shape[1]
     blocks = (
         np.empty((2, cameras, free, free)), np.empty((2, 1, 6, free * cameras)), np.empty((2, 1, 6, 6)),
         np.empty((2, 0, free * cameras)), np.empty((2, cameras, free)), np.empty((2, 1, 6)), np.empty((2, 0)),

@@ -41,9 +41,9 @@ def align(rig: CameraRig, reference: CameraRig, points_reference: Tensor, camera
     observations = Observations(there.uv[None], torch.full_like(there.uv[None, ..., 0], FINE), seen[None])
     cloud = CalibrationObject(points_reference, torch.ones_like(points_reference))
     start = RigidTransform.identity(1, dtype=points_reference.dtype)
-    held = torch.zeros(len(chosen), rig.num_parameters, dtype=points_reference.dtype)
+    fixed_std = torch.zeros(len(chosen), rig.num_parameters, dtype=points_reference.dtype)
     fit = estimate(
-        observations, rig.select(chosen), cloud, start, prior_std=held, options=EstimationOptions(loss="cauchy")
+        observations, rig.select(chosen), cloud, start, prior_std=fixed_std, options=EstimationOptions(loss="cauchy")
     )
     rig_from_reference = fit.rig_from_object[0]
     cam_from_rig = rig.cam_from_rig

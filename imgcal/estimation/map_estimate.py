@@ -224,7 +224,7 @@ def equations_by_snapshot(problem: Problem, state: State, loss: NamedLoss) -> No
     """
     count = problem.uv.shape[1]
 
-    def repeated(tensor: Tensor) -> Tensor:
+    def repeat(tensor: Tensor) -> Tensor:
         return tensor.expand(count, *tensor.shape[1:])
 
     alone = replace(
@@ -232,11 +232,11 @@ def equations_by_snapshot(problem: Problem, state: State, loss: NamedLoss) -> No
         uv=problem.uv[0].unsqueeze(1),
         root_weight=problem.root_weight[0].unsqueeze(1),
         points=points_at(problem, state)[0],
-        factory=problem.factory.map_tensors(lambda tensor, _: repeated(tensor)),
-        prior_std=repeated(problem.prior_std),
+        factory=problem.factory.map_tensors(lambda tensor, _: repeat(tensor)),
+        prior_std=repeat(problem.prior_std),
         object_prior_std=None,
     )
-    there = State(repeated(state.offset), state.rotation[0].unsqueeze(1), state.centre[0].unsqueeze(1))
+    there = State(repeat(state.offset), state.rotation[0].unsqueeze(1), state.centre[0].unsqueeze(1))
     return equations_at(alone, there, loss)
 
 

@@ -129,7 +129,7 @@ class Places:
         labels = [(self.problem.root_weight[0][:, place] > 0).sum() for place in self.camera_places(camera)]
         return float(sum(part.clamp_max(CLIP**2).sum() for part in own) - 2 * sum(labels))
 
-    def without(self, place: int, rows: NDArray[np.int64]) -> Places:
+    def drop_labels(self, place: int, rows: NDArray[np.int64]) -> Places:
         """Drop the labels of one place in some snapshots; the estimate stays."""
         root_weight = self.problem.root_weight.clone()
         root_weight[:, rows, place] = 0
@@ -205,7 +205,7 @@ class Change:
 
     @property
     def is_certain(self) -> bool:
-        """Check that its size is significant; lens errors, modelled as many small steps, are not."""
+        """Check that its size is significant, unlike that of the small steps that lens errors cause."""
         _, size, sigma = self.size()
         return size >= LEAST_SIGMAS * sigma
 
@@ -308,7 +308,7 @@ def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: fl
         if len(rows) <= length:
             return False
         first = int(np.convolve(gain[rows], np.ones(length), "valid").argmax())
-        rest = places.without(camera, rows[first : first + length])
+        rest = places.drop_labels(camera, rows[first : first + length])
         if rest.blocks.statistics([camera], np.array([row]))[0, 0] < least:
             return False
     return True

@@ -91,7 +91,7 @@ def cold_start_from_points(
         if placed is None:
             continue
         rig = replace(cameras, focal_length=factor * cameras.focal_length, cam_from_rig=placed)
-        found = _joint(observations, move_to_pair_frame(rig, pair), cameras)
+        found = _fit_jointly(observations, move_to_pair_frame(rig, pair), cameras)
         if found is not None and (best is None or found.spread < best.spread):
             best = found
         if best is not None and best.spread < FINE:
@@ -227,7 +227,7 @@ def _triangulate(
     return points, known
 
 
-def _joint(
+def _fit_jointly(
     observations: Observations, start: tuple[CameraRig, tuple[int, int]], cameras: CameraRig
 ) -> PointStart | None:
     """Fit all cameras and points together, focal lengths first and then everything."""
@@ -239,10 +239,10 @@ def _joint(
     prior = cameras.prior or RigPrior()
     given = replace(rig, focal_length=cameras.focal_length)  # the centre of the prior
     std = prior_of_pair(given, pair, prior, WIDE_ROTATION, position)
-    held = std.clone()
-    held[:, 8:] = 0.0
+    lens_fixed = std.clone()
+    lens_fixed[:, 8:] = 0.0
     poses = None
-    for noise, spread in ((ROUGH, held), (ROUGH, std), (FINE, std)):
+    for noise, spread in ((ROUGH, lens_fixed), (ROUGH, std), (FINE, std)):
         part = replace(some, sigma=torch.full_like(some.sigma, noise))
         options = EstimationOptions(loss="cauchy", max_iterations=60)
         fit = estimate(part, given, light, poses, prior_std=spread, initial_rig=rig, options=options)

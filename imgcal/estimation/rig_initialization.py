@@ -83,8 +83,8 @@ def cold_start(observations: Observations, cameras: CameraRig, obj: CalibrationO
     rig = replace(cameras, cam_from_rig=as_transforms(chained))
     rows = np.flatnonzero(known.any(1))
     some = Observations(observations.uv[rows], observations.sigma[rows], observations.seen[rows])
-    some, turned = _alike(some, rig, cam_from_object[rows], known[rows], obj)
-    fit, kept = _joint(some, rig, turned, known[rows], obj)
+    some, turned = _unify_labels(some, rig, cam_from_object[rows], known[rows], obj)
+    fit, kept = _fit_jointly(some, rig, turned, known[rows], obj)
     count = len(observations.seen)
     posed, all_kept = np.zeros(count, dtype=bool), np.zeros(observations.seen.shape, dtype=bool)
     posed[rows], all_kept[rows] = True, kept
@@ -100,7 +100,7 @@ def single_camera_poses(
 ) -> tuple[RigidTransform, NDArray[np.bool_]]:
     """Estimate the object's pose in each image separately: cam_from_object (S, C), and (S, C) bool where known."""
     snapshots, count = observations.seen.shape[:2]
-    known = _posable(observations.seen.numpy(), obj)
+    known = _find_posable(observations.seen.numpy(), obj)
     poses = _identities(snapshots, count)
     for camera in range(count):
         rows = torch.from_numpy(np.flatnonzero(known[:, camera]))
@@ -114,7 +114,7 @@ def single_camera_poses(
     return poses, known
 
 
-def _alike(
+def _unify_labels(
     observations: Observations,
     rig: CameraRig,
     cam_from_object: RigidTransform,
@@ -155,7 +155,7 @@ def require_connected(alone: Sequence[int], cameras: CameraRig) -> None:
         )
 
 
-def _posable(seen: NDArray[np.bool_], obj: CalibrationObject) -> NDArray[np.bool_]:
+def _find_posable(seen: NDArray[np.bool_], obj: CalibrationObject) -> NDArray[np.bool_]:
     """Find images (S, C) with enough labels for a pose: four fiducials that are not collinear."""
     points = obj.points.double().numpy()
     parts, which = np.unique(seen.reshape(-1, seen.shape[-1]), axis=0, return_inverse=True)
@@ -167,7 +167,7 @@ def _breadth(points: NDArray[np.float64]) -> float:
     return float(np.linalg.svd(points - points.mean(0), compute_uv=False)[1])
 
 
-def _joint(
+def _fit_jointly(
     observations: Observations,
     rig: CameraRig,
     cam_from_object: RigidTransform,
@@ -183,13 +183,13 @@ def _joint(
         cam_from_object.translation.norm(dim=-1).max()
     )
     std[:, 0:3], std[:, 3:6] = 1.0, apart
-    held = int(rig.cam_from_rig.translation.norm(dim=-1).argmin())
-    std[held, :6] = 0.0
+    fixed_camera = int(rig.cam_from_rig.translation.norm(dim=-1).argmin())
+    std[fixed_camera, :6] = 0.0
     std = ordinary_lens(std)
-    lens_held = std.clone()
-    lens_held[:, 8:] = 0.0
+    lens_fixed = std.clone()
+    lens_fixed[:, 8:] = 0.0
     seen, start, fit = observations.seen, rig, None
-    for noise, spread in ((ROUGH, lens_held), (ROUGH, std), (FINE, std)):
+    for noise, spread in ((ROUGH, lens_fixed), (ROUGH, std), (FINE, std)):
         poses = best_poses(observations, seen, start, cam_from_object, known, obj, fit)
         part = Observations(observations.uv, torch.full_like(observations.sigma, noise), seen)
         options = EstimationOptions(loss="cauchy", max_iterations=60)

@@ -126,20 +126,20 @@ def uncertainty_over(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigU
     px_moved, mm_moved = px_rows @ by_motion, mm_rows @ motion
     mm_spread = mm_rows @ covariance
 
-    def aligned() -> tuple[Tensor, Tensor]:
+    def align() -> tuple[Tensor, Tensor]:
         """Covariance after the alignment in pixels, and the map from errors to the motion of the one in mm."""
         weighted = px_weight.repeat_interleave(2, dim=1)[..., None] * px_moved
         px_best = _best_if_possible(motion, (px_rows.mT @ weighted).flatten(0, 1))
         mm_best = _best_if_possible(motion, mm_rows.mT @ (mm_weight.repeat_interleave(3)[:, None] * mm_moved))
         return _remove_motion(covariance, motion, px_best), mm_best
 
-    px_covariance, mm_best = aligned()
+    px_covariance, mm_best = align()
     for _ in range(ROUNDS - 1):
         # The weights only need the error that remains after the previous alignment.
         px_weight = _weight(_pixel_error(pixels, px_covariance), seen)
         variance = _aligned_variance(mm_rows, mm_spread, mm_moved, mm_best, covariance)
         mm_weight = _weight(_length(variance.unflatten(0, (-1, 3)).sum(-1), seen), shared)
-        px_covariance, mm_best = aligned()
+        px_covariance, mm_best = align()
     mm_covariance = _remove_motion(covariance, motion, mm_best)
     return RigUncertainty(rig, covariance, points, px_weight, mm_weight, px_covariance, mm_covariance)
 

@@ -87,7 +87,7 @@ def _gather(grey, n, half, uv, pixels):
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _take_away(box, m, half, size, amplitude, whitening, profile, uv, values):
+def _subtract_marker(box, m, half, size, amplitude, whitening, profile, uv, values):
     """Subtract marker m from the values in a box, within its reach."""
     left, right, top, bottom = box
     ring = 1 / (RINGS * size)
@@ -210,7 +210,7 @@ def _variance(normal, pulls, variance, axis, row):
 
 
 @njit(cache=True, nogil=True)
-def _improve(size, shape, misfit, last, count, pixels, place, told, work):
+def _improve(size, shape, misfit, last, count, pixels, place, result, work):
     """Move a marker (2,) by one robust step; fill its results (5,), see `fit_markers`."""
     whitening, profile = shape
     values, brightness, residual = pixels[0], pixels[4], pixels[6]
@@ -226,8 +226,8 @@ def _improve(size, shape, misfit, last, count, pixels, place, told, work):
     ground, amplitude = _linear(values, brightness, residual, doubt, count)
     amplitude = max(amplitude, nothing)
     total, squares, core, middle = _sum(pixels, count, size, whitening, ground, amplitude, doubt, normal, right)
-    told[0], told[3], told[4] = amplitude, middle / max(core, 1), spread * spread
-    told[1], told[2] = np.inf, np.inf
+    result[0], result[3], result[4] = amplitude, middle / max(core, 1), spread * spread
+    result[1], result[2] = np.inf, np.inf
     if not kernels.cholesky(normal):
         return
     kernels.cholesky_solve(normal, right)
@@ -236,15 +236,15 @@ def _improve(size, shape, misfit, last, count, pixels, place, told, work):
     if last:
         variance = max(squares / max(total - 4, 1.0), LEAST_NOISE * LEAST_NOISE)
         _pull(pixels, count, size, whitening, ground, amplitude, doubt, pulls)
-        told[2] = 0.5 * (_variance(normal, pulls, variance, 2, row) + _variance(normal, pulls, variance, 3, row))
+        result[2] = 0.5 * (_variance(normal, pulls, variance, 2, row) + _variance(normal, pulls, variance, 3, row))
         row[:] = 0.0
         row[1] = 1.0
         kernels.cholesky_solve(normal, row)
-        told[1] = variance * row[1]
+        result[1] = variance * row[1]
 
 
 @njit(cache=True, nogil=True)
-def fit_markers(grey, inside, half, scale, close, shape, iterations, told, uv, found):
+def fit_markers(grey, inside, half, scale, close, shape, iterations, with_variance, uv, found):
     """Fit markers (N) in the windows around them, one after the other.
 
     A marker that does not match the shape leaves correlated residuals. Whole octants are therefore treated as clusters,
@@ -259,7 +259,7 @@ def fit_markers(grey, inside, half, scale, close, shape, iterations, told, uv, f
         close: (N, N) which other markers may reach into a window.
         shape: whitening (2, 2) and profile (R,).
         iterations: number of iterations; uses the last entries of `MISFIT`.
-        told: whether to compute variances; otherwise they stay infinite.
+        with_variance: whether to compute variances; otherwise they stay infinite.
         uv: (N, 2) initial positions; replaced by the fitted ones.
         found: (N, 5) amplitudes of neighbours from an earlier fit; filled with amplitude, its variance, the variance
             of the position per axis, the mean squared residual within the marker, and the squared noise.
@@ -279,6 +279,6 @@ def fit_markers(grey, inside, half, scale, close, shape, iterations, told, uv, f
                 continue
             for m in range(len(uv)):
                 if close[n, m] and found[m, 0] > 0:
-                    _take_away(box, m, half, scale[m], found[m, 0], whitening, profile, uv, pixels[0])
-            last = told and iteration == len(MISFIT) - 1
+                    _subtract_marker(box, m, half, scale[m], found[m, 0], whitening, profile, uv, pixels[0])
+            last = with_variance and iteration == len(MISFIT) - 1
             _improve(scale[n], shape, MISFIT[iteration], last, count, pixels, uv[n], found[n], work)

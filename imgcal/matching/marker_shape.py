@@ -64,7 +64,7 @@ def _medians(stack, count):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _levels(patch, held):
+def _levels(patch, scratch):
     """Medians of the rim, two pixels wide, and of the centre of a window (P, P)."""
     side = len(patch)
     half = side // 2
@@ -72,19 +72,19 @@ def _levels(patch, held):
     rim, inner, near = 0, 0, int(reach)
     for i in (0, 1, side - 2, side - 1):
         for j in range(side):
-            held[rim] = patch[i, j]
+            scratch[rim] = patch[i, j]
             rim += 1
     for i in range(2, side - 2):
         for j in (0, 1, side - 2, side - 1):
-            held[rim] = patch[i, j]
+            scratch[rim] = patch[i, j]
             rim += 1
-    level = median(held, rim)
+    level = median(scratch, rim)
     for i in range(-near, near + 1):
         for j in range(-near, near + 1):
             if i * i + j * j <= reach * reach:
-                held[inner] = patch[half + i, half + j]
+                scratch[inner] = patch[half + i, half + j]
                 inner += 1
-    return level, median(held, inner)
+    return level, median(scratch, inner)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -95,11 +95,11 @@ def usual_window(patches, mean):
         Whether any window is brighter in the centre.
     """
     count, side = len(patches), patches.shape[1]
-    held, stack = np.empty(side * side, np.float32), np.empty((count, side), np.float32)
+    scratch, stack = np.empty(side * side, np.float32), np.empty((count, side), np.float32)
     level, factor, bright = np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.int64)
     number = 0
     for n in range(count):
-        low, high = _levels(patches[n], held)
+        low, high = _levels(patches[n], scratch)
         if high > low:
             level[number], factor[number], bright[number] = low, 1 / (high - low), n
             number += 1

@@ -75,14 +75,14 @@ def rank_spots(response, covered, size, ranks):
         ranks: (H, W) zeros; filled.
     """
     width, height = size
-    held = np.empty(((height + EVERY - 1) // EVERY) * ((width + EVERY - 1) // EVERY), np.float32)
+    sample = np.empty(((height + EVERY - 1) // EVERY) * ((width + EVERY - 1) // EVERY), np.float32)
     for k in range(len(response)):
         values, number = response[k], 0
         for i in range(0, height, EVERY):
             for j in range(0, width, EVERY):
-                held[number] = abs(values[i, j])
+                sample[number] = abs(values[i, j])
                 number += 1
-        factor = np.float32(1 / max(1.4826 * median(held, number), 1e-3))
+        factor = np.float32(1 / max(1.4826 * median(sample, number), 1e-3))
         for i in range(height):
             for j in range(width):
                 values[i, j] *= factor

@@ -91,14 +91,14 @@ def fit_and_measure(
         uv, sigma = np.stack([m.uv for m in markers]), np.stack([m.sigma for m in markers])
         off = np.linalg.norm(np.nan_to_num(uv) - predicted, axis=-1)
         near = off < np.hypot(gate, OUTLIER * np.minimum(sigma, 3.0))
-        seen = _enough(np.stack([m.seen for m in markers]) & near)
+        seen = _drop_weak_cameras(np.stack([m.seen for m in markers]) & near)
         fit = _fit(scene, pose, uv, np.hypot(sigma, SHAPE_ERROR), seen)
     if fit is None:
         return None
     pose, predicted = fit.rig_from_object[0], predictions(fit.rig, scene, fit.rig_from_object[0])
     radius = np.stack([np.full(len(m.sigma), m.radius) for m in markers])
     off = np.linalg.norm(np.nan_to_num(uv) - predicted, axis=-1)
-    seen = _enough(seen & (off < OUTLIER * np.hypot(sigma, SHAPE_ERROR)))
+    seen = _drop_weak_cameras(seen & (off < OUTLIER * np.hypot(sigma, SHAPE_ERROR)))
     return Fitted(fit.rig, pose, uv, sigma, radius, seen, predicted)
 
 
@@ -115,7 +115,7 @@ def spacing(uv: NDArray[np.float64]) -> float:
     return float(np.median(gaps.min(-1)))
 
 
-def _enough(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _drop_weak_cameras(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Drop cameras in which only a few fiducials (C, N) fit, because that may be chance."""
     return seen & (seen.sum(1, keepdims=True) >= LEAST_IN_CAMERA)
 
@@ -224,11 +224,11 @@ def _measure(
     radius *= np.where((given is None) | (seen > usual), seen / usual, 1.0)[:, None]
     sure = np.ones(radius.shape[1], dtype=bool)
 
-    def measured(camera: int) -> Measured:
+    def measure(camera: int) -> Measured:
         frame = frames[camera]
         if frame is None:
             none = np.zeros(len(sure))
             return Measured(np.full((len(sure), 2), np.nan), none + np.inf, none, none, 1.0, none)
         return measure_markers(frame, expected[camera], radius[camera], dark, sure, iterations)
 
-    return each_camera(measured, range(len(frames)))
+    return each_camera(measure, range(len(frames)))

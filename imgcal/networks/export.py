@@ -1,7 +1,7 @@
 """Export of networks to other runtimes: a tensor-only program (`Program`), as ONNX or as a `torch.export` program.
 
 ONNX is made from the graph of `torch.export` by the TorchScript exporter, which needs no library but `onnx`. Operations
-that it does not support are rewritten first (`_rewritten`). Shapes are fixed in ONNX.
+that it does not support are rewritten first (`_rewrite`). Shapes are fixed in ONNX.
 """
 
 from __future__ import annotations
@@ -220,7 +220,7 @@ def save_onnx(program: Program, path: Path) -> float:
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")  # the exporter's warnings about itself
         torch.onnx.export(
-            _Held(_rewritten(_export(program, fixed=True).module())), program.example,
+            _Unregistered(_rewrite(_export(program, fixed=True).module())), program.example,
             buffer,  # type: ignore[arg-type]  # its stubs only allow paths
             input_names=list(program.inputs), output_names=list(program.outputs), opset_version=OPSET, dynamo=False,
         )  # fmt: skip
@@ -263,7 +263,7 @@ def _export(program: Program, fixed: bool) -> torch.export.ExportedProgram:
         return torch.export.export(program.module, example, dynamic_shapes=shapes)
 
 
-class _Held(nn.Module):
+class _Unregistered(nn.Module):
     """Call a graph without registering it as a submodule: the exporter would call `eval`, which graphs refuse."""
 
     def __init__(self, graph: Callable[..., tuple[Tensor, ...]]) -> None:
@@ -275,7 +275,7 @@ class _Held(nn.Module):
         return found
 
 
-def _rewritten(graph: nn.Module) -> nn.Module:
+def _rewrite(graph: nn.Module) -> nn.Module:
     """Rewrite operations that the exporter does not support (`mT`) or gets wrong (`movedim` from the back)."""
     aten = torch.ops.aten
     parts = [part for part in graph.modules() if isinstance(part, torch.fx.GraphModule)]

@@ -140,8 +140,8 @@ class IterativeRefiner(nn.Module):
                 for parameter in stage.camera_head[-1].parameters():  # (K, width) and (K,)
                     parameter.mT.mul_(ratio) if parameter.ndim == 2 else parameter.mul_(ratio)
         # Offsets are also the last inputs of some layers.
-        told = [] if self.later is None else [self.later.embed[0], self.later.camera_head[0]]
-        for layer in [*told, *([] if self.trust_head is None else [self.trust_head[0]])]:
+        offset_layers = [] if self.later is None else [self.later.embed[0], self.later.camera_head[0]]
+        for layer in [*offset_layers, *([] if self.trust_head is None else [self.trust_head[0]])]:
             next(layer.parameters())[:, -self.parameterization.num_parameters :] /= ratio
 
     def _differences(self, state: RigState, prediction: Prediction, uv: Tensor, weight: Tensor) -> Tensor:

@@ -45,9 +45,9 @@ register(MapSolution)
 class MapEstimate(nn.Module):
     """Estimate the rig and the object's poses that best explain labelled fiducials and the factory calibration.
 
-    Gradients are those of the solution by the implicit function theorem, independent of the iterations: to the pixels
-    and their sigmas, the factory rig and its prior. The module is one opaque operator in a compiled or exported graph,
-    with forward and reverse derivatives, also under `torch.func.vmap`, but no second ones.
+    Gradients follow from the solution by the implicit function theorem, independent of the iterations. They flow to the
+    pixels and their sigmas, the factory rig and its prior. The module is one opaque operator in a compiled or
+    exported graph, with forward and reverse derivatives, also under `torch.func.vmap`, but no second ones.
 
     Args:
         factory: the factory rig, (*B) or without batch axes; its prior says how far cameras may have drifted.

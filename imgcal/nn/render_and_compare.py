@@ -28,10 +28,10 @@ register(RefinedImages)
 class RenderAndCompare(nn.Module):
     """Refine a prediction on the colour-coded images from which it was made: photometric Gauss-Newton, then MAP.
 
-    Gradients are those of the solution by the implicit function theorem, to the images (with their Gauss-Newton
-    curvature: exact where the images are explained), the factory rig and its prior. None flows through the first guess,
-    which only starts the search. The module is one opaque operator in a compiled or exported graph; it computes in
-    float64, images in float32.
+    Gradients follow from the solution by the implicit function theorem. They flow to the images (with their
+    Gauss-Newton curvature: exact where the images are explained), the factory rig and its prior. None flows through the
+    first guess, which only starts the search. The module is one opaque operator in a compiled or
+    exported graph; it computes in float64, images in float32.
 
     Args:
         factory: the factory rig, without batch axes; its prior says how far cameras may have drifted.

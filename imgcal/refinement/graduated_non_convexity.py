@@ -100,7 +100,7 @@ def refine_robustly(
     suspect = (~fits(fit, sigma, options.fits)).nonzero().squeeze(-1)
     result = make_prediction(fit)
     if len(suspect):
-        result = _replace_rigs(result, suspect, _robust(guess[suspect], target[suspect], options))
+        result = _replace_rigs(result, suspect, _refine_with_outliers(guess[suspect], target[suspect], options))
     return result
 
 
@@ -112,7 +112,7 @@ def fits(fit: Estimate, sigma: float, limit: float) -> Tensor:
     return whole & each & fit.converged
 
 
-def _robust(guess: Prediction, target: Target, options: RobustOptions) -> Prediction:
+def _refine_with_outliers(guess: Prediction, target: Target, options: RobustOptions) -> Prediction:
     """Refine rigs that have outliers."""
     near = options.last_threshold
     limits = (*(limit for pixels in options.thresholds if (limit := pixels / target.sigma) > near), near)

@@ -52,16 +52,16 @@ def train(
         RefusedError: at the end, the validation error of the result or its weights are not finite.
     """
     run = prepare(experiment, state)
-    told = callbacks if callbacks is not None and run.accelerator.is_main_process else Callbacks()
-    told.on_start(run)
+    listener = callbacks if callbacks is not None and run.accelerator.is_main_process else Callbacks()
+    listener.on_start(run)
     try:
-        _take_steps(run, told, should_stop)
+        _take_steps(run, listener, should_stop)
     finally:
-        told.on_end(run)
+        listener.on_end(run)
     return run
 
 
-def _take_steps(run: Run, told: Callbacks, should_stop: Callable[[], bool]) -> None:
+def _take_steps(run: Run, listener: Callbacks, should_stop: Callable[[], bool]) -> None:
     """Train until the end, or until a stop is requested."""
     due = run.experiment.training
     seconds, stop = run.seconds, False
@@ -70,19 +70,19 @@ def _take_steps(run: Run, told: Callbacks, should_stop: Callable[[], bool]) -> N
         run.schedule.set_progress(progress(run, seconds))
         train_step(run)
         seconds, stop = _agree(run, should_stop())
-        told.on_step(run, seconds)
+        listener.on_step(run, seconds)
         last = stop or is_finished(run, seconds)
         extra = run.step % due.log_every != 0
         if last or not extra:
-            logged = _log(run, told, logged, seconds, extra)
+            logged = _log(run, listener, logged, seconds, extra)
         extra = run.step % due.validate_every != 0
         if last or not extra:
-            validate(run, told, extra)
+            validate(run, listener, extra)
         last = last or is_finished(run, seconds)
         if last and not stop:
             _check_result(run)
         if last or run.step % due.save_every == 0:
-            save(run, told)
+            save(run, listener)
 
 
 def prepare(experiment: Experiment, state: TrainingState | None = None) -> Run:
@@ -226,11 +226,11 @@ def validation(run: Run, network: nn.Module) -> dict[str, float]:
             learning(network)
 
 
-def validate(run: Run, told: Callbacks, extra: bool) -> None:
+def validate(run: Run, listener: Callbacks, extra: bool) -> None:
     """Report the errors of the current result weights; see `_record`."""
     check_finite(run)
     if run.accelerator.is_main_process and (found := validation(run, run.candidate)):
-        _record(run, told, {"step": run.step, **found}, extra)
+        _record(run, listener, {"step": run.step, **found}, extra)
     if run.experiment.training.patience is not None:
         _keep_best(run, extra)
 
@@ -278,12 +278,12 @@ def _check_result(run: Run) -> None:
         )
 
 
-def save(run: Run, told: Callbacks) -> None:
+def save(run: Run, listener: Callbacks) -> None:
     """Pass on the state and the current result network; all processes must call this together."""
     check_finite(run)
     state = gather_state(run)
     if run.accelerator.is_main_process:
-        told.on_checkpoint(run, state, run.task.result(*run.chosen))
+        listener.on_checkpoint(run, state, run.task.result(*run.chosen))
 
 
 def progress(run: Run, seconds: float) -> float:
@@ -325,16 +325,16 @@ def _agree(run: Run, stop: bool) -> tuple[float, bool]:
     return seconds, bool(stopping)
 
 
-def _record(run: Run, told: Callbacks, row: dict[str, Any], extra: bool) -> None:
+def _record(run: Run, listener: Callbacks, row: dict[str, Any], extra: bool) -> None:
     """Store plain values and pass them on. An `extra` row is only reported because the run ends here, for now."""
     run.latest |= row
     run.told = row if run.told.get("step") != run.step else run.told | row
     if not extra:
         run.metrics |= row
-    told.on_metrics(run, row, not extra)
+    listener.on_metrics(run, row, not extra)
 
 
-def _log(run: Run, told: Callbacks, logged: tuple[int, float], seconds: float, extra: bool) -> tuple[int, float]:
+def _log(run: Run, listener: Callbacks, logged: tuple[int, float], seconds: float, extra: bool) -> tuple[int, float]:
     """Report the means since the last report; return the start of the next interval."""
     names = tuple(run.window[0])
     means = torch.stack([torch.stack([row[name] for row in run.window]).mean() for name in names])
@@ -346,5 +346,5 @@ def _log(run: Run, told: Callbacks, logged: tuple[int, float], seconds: float, e
     row["lr"] = max(group["lr"] for group in run.optimizer.param_groups)
     row[f"{run.task.unit}_per_s"] = steps * run.experiment.training.batch_size / max(duration, 1e-9)
     row["seconds"] = seconds
-    _record(run, told, row, extra)
+    _record(run, listener, row, extra)
     return run.step, seconds

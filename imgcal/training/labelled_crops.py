@@ -226,11 +226,11 @@ def _join(parts: list[FrameDataset]) -> FrameDataset:
     """Concatenate crops, padded to the largest number of fiducials."""
     most = max((part.place.shape[1] for part in parts), default=0)
 
-    def padded(values: Tensor) -> Tensor:
+    def pad(values: Tensor) -> Tensor:
         if values.ndim < 2 or values.dtype == torch.float16:
             return values
         rest = [0, 0] * (values.ndim - 2)
         return functional.pad(values, [*rest, 0, most - values.shape[1]])
 
     names = [field.name for field in fields(FrameDataset)]
-    return FrameDataset(*(torch.cat([padded(getattr(part, name)) for part in parts]) for name in names))
+    return FrameDataset(*(torch.cat([pad(getattr(part, name)) for part in parts]) for name in names))
