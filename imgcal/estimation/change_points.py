@@ -149,7 +149,6 @@ def likeliest_step(blocks: Blocks, seen: NDArray[np.bool_], least: float = 0.0) 
 
     Returns:
         The most likely step, or None where no camera has enough snapshots or no statistic reaches `least`.
-        None where nothing could be seen to step, or no step is so likely.
     """
     places = {camera: rows for camera in range(seen.shape[1]) if len(rows := _places(seen[:, camera]))}
     first = [c for c, most in _screen(blocks, places).items() if most >= NEARBY * least] if least else list(places)

@@ -251,7 +251,6 @@ def learnt_tolerances(shape: ShapeEvidence) -> Array:
 
     Returns:
         (N,) mm, standard deviations; the given tolerances where they are large enough.
-        (N,) mm, standard deviations; those that were granted where they are enough.
 
     Source: MacKay, "Bayesian interpolation" (Neural Computation 1992), one precision per fiducial.
     """
