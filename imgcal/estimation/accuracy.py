@@ -48,7 +48,7 @@ class WorkingVolume:
         return self.low + share * (self.high - self.low)
 
     def contains(self, points: Tensor) -> Tensor:
-        """Tell which points (..., 3) lie inside: (...) bool."""
+        """Check which points (..., 3) lie inside: (...) bool."""
         return ((points >= self.low) & (points <= self.high)).all(-1)
 
 
@@ -91,7 +91,7 @@ class PredictedError:
     noise: float  # px, median standard deviation of the observations, per axis
 
     def __repr__(self) -> str:
-        """Give the medians: `PredictedError(0.003 mm, 0.002 px, 10 cameras)`."""
+        """Show the medians: `PredictedError(0.003 mm, 0.002 px, 10 cameras)`."""
         return f"PredictedError({self.median_mm:.2g} mm, {self.median_px:.2g} px, {len(self.camera_names)} cameras)"
 
     @property

@@ -1,4 +1,4 @@
-"""How much more the snapshots disagree about the rig than their noise allows.
+"""Excess disagreement of the snapshots about the rig, beyond their noise.
 
 Errors of lenses, centroids and the object are correlated in space and time, so many snapshots share the same error. The
 inverse of the information, which assumes independent residuals, is then too small. The snapshots are divided into
