@@ -1,4 +1,4 @@
-"""Exchanged labels in colour-coded images: which colour a dot has that should be another one."""
+"""Exchanged labels in colour-coded images: dots whose colour is that of another fiducial."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from torch import Tensor
 from imgcal.refinement.graduated_non_convexity import mutual_nearest
 from imgcal.refinement.photometric import profile_and_slope
 
-RIDGE = 0.05  # of a dot's own weight: dots in the same place share what is there
-MOST_DIFFERENCE = 0.3  # between a dot's colour and that of a fiducial, as a distance in RGB
+RIDGE = 0.05  # relative to a dot's own weight: dots at the same place share the light there
+MOST_DIFFERENCE = 0.3  # largest RGB distance between the colours of a dot and of a fiducial
 
 
 def colours_at(images: Tensor, uv: Tensor, dot: float) -> Tensor:
-    """Tell what colours dots at given places must have to make an image, by linear least squares.
+    """Solve for the colours of dots at given places that reproduce an image, by linear least squares.
 
     Args:
         images: (M, K, H, W), square.
@@ -21,7 +21,7 @@ def colours_at(images: Tensor, uv: Tensor, dot: float) -> Tensor:
         dot: standard deviation of a dot, pixels.
 
     Returns:
-        (M, N, K), about 0 where there is no dot.
+        (M, N, K), about 0 where the image has no dot.
     """
     size = images.shape[-1]
     value, _ = profile_and_slope(uv.mT, dot, size)  # (M, 2 axes, N, size)
@@ -34,15 +34,15 @@ def colours_at(images: Tensor, uv: Tensor, dot: float) -> Tensor:
 
 
 def find_swapped_labels(found: Tensor, colours: Tensor, fits: Tensor) -> Tensor:
-    """Name the fiducial whose colour is at each fiducial's place.
+    """Find the fiducial whose colour appears at each fiducial's place.
 
     Args:
         found: (*B, N, K) colours at the places.
         colours: (N, K) of the fiducials.
-        fits: (*B, N) bool: places whose own colour is known to be there; no other place can have it.
+        fits: (*B, N) bool: places that are known to have their own colour; that colour is not assigned elsewhere.
 
     Returns:
-        (*B, N) numbers of fiducials, each at most once; -1 where there is none.
+        (*B, N) indices of fiducials, each at most once; -1 where no fiducial matches.
     """
     own = torch.arange(len(colours), device=found.device)
     difference = (found.unsqueeze(-2) - colours.to(found)).norm(dim=-1)  # (*B, N places, N colours)
