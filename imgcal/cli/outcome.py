@@ -258,7 +258,7 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
         print(f"object  {entry['name']} seen in {entry['snapshots_used']} snapshots")
     if result["object"] and not several:
         print(f"object  {out / 'object.csv'}")
-    elif result["board_bend"]:
+    if result["board_bend"]:
         print(f"board   {out / 'board.yaml'}")
     print(f"result  {out / 'result.json'}")
     if report:
