@@ -210,9 +210,10 @@ class Watch:
 
     input: Annotated[str, tyro.conf.Positional]  #: folder, address, file or -
     rig: str  #: factory rig: file, or the name of a shipped one
-    object: str
-    """object: file, or the name of a shipped one; lights = whatever bright markers move through the volume, of which
-    nothing is known: RIG should come from calibrate, and its scale stays as that says"""
+    object: tuple[str, ...]
+    """object: file, or the name of a shipped one; lights = whatever bright markers move through the volume. The markers
+    of a stick, or of several objects, are followed like these, one by one: RIG should come from calibrate, and its
+    scale stays as that says"""
     out: Path  #: folder to write
     fresh: bool = False  #: forget what an earlier run left in OUT, begin from the factory rig
     tolerance: float = Timing.tolerance  #: s that the time stamps of one snapshot may be apart

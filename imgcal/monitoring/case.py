@@ -17,7 +17,7 @@ from imgcal.estimation import EstimationOptions
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
-from imgcal.types import Observations, UnknownLights
+from imgcal.types import Observations
 
 EARLY_SNAPSHOTS, EARLY_SECONDS = 12, 1.0
 """Snapshots before a change, and seconds since the beginning, below both of which a camera that has moved looks like a
@@ -123,7 +123,7 @@ class Case:
         Raises:
             RefusedError: lights are seen.
         """
-        if isinstance(self.before.obj, UnknownLights):
+        if self.before.obj.unknown_markers:
             raise RefusedError("each light goes its own way")
 
     @property

@@ -22,7 +22,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.monitoring.measurement_update_cpu import NOTHING_KNOWN, WHY_NOT
 from imgcal.monitoring.rig_arrays import RigArrays
 from imgcal.monitoring.snapshot_information import SnapshotInformation, add_blocks
-from imgcal.types import CalibrationObject, CameraRig, DriftRate, RigPrior, UnknownLights
+from imgcal.types import CalibrationObject, CameraRig, DriftRate, RigPrior
 
 LEAST_STD = (1e-9,) * 3 + (1e-6,) * 3 + (1e-6,) * 4
 LEAST_COEFFICIENT = 1e-9
@@ -128,11 +128,11 @@ class RigBelief:
     @property
     def pose_freedom(self) -> int:
         """Numbers of the pose in a snapshot that are let free, at most: six, or a place for each light."""
-        return 3 * max(self.obj.num_fiducials, 2) if isinstance(self.obj, UnknownLights) else 6
+        return 3 * max(self.obj.num_fiducials, 2) if self.obj.unknown_markers else 6
 
     def points_at(self, rig_from_object: RigidTransform) -> Tensor:
         """Where the fiducials of an object in poses (S,) are, or lights (S, N): (S, N, 3) mm in the rig's frame."""
-        if isinstance(self.obj, UnknownLights):
+        if self.obj.unknown_markers:
             return rig_from_object.translation
         return rig_from_object.apply(self.points_object)
 
@@ -151,7 +151,7 @@ class MeasurementUpdate:
     """What some snapshots have taught."""
 
     belief: RigBelief
-    rig_from_object: RigidTransform  # (S,) the object's poses; (S, N) of lights, see `UnknownLights`
+    rig_from_object: RigidTransform  # (S,) the object's poses; (S, N) of lights, see `CalibrationObject.unknown`
     residual: Tensor  # (S, C, N, 2) pixels, predicted minus observed; zero where not seen
     chi2: float  # sum of squared whitened residuals (robust), and of the change in standard deviations of the belief
     dof: int  # 2 observations less the freedom of all poses: what chi2 is expected to be

@@ -72,6 +72,13 @@ class Agreement:
     found: NDArray[np.float64]  # (C,) share of these with a blob in their place, chance apart
     near_misses: NDArray[np.float64]  # (C,) share of these with a blob beside their place, chance apart
 
+    def __add__(self, other: Agreement) -> Agreement:
+        """Count both."""
+        predicted = self.predicted + other.predicted
+        share = self.predicted / np.maximum(predicted, 1)
+        found = share * self.found + (1 - share) * other.found
+        return Agreement(predicted, found, share * self.near_misses + (1 - share) * other.near_misses)
+
     @property
     def judged(self) -> NDArray[np.bool_]:
         """Tell which cameras can be judged: (C,)."""
@@ -200,24 +207,44 @@ def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject
     Raises:
         RefusedError: there is none, or another one explains the blobs as well.
     """
-    learnt, tested = split_moments(detections)
     std = (rig.prior or RigPrior()).std(rig)
     generator = torch.Generator().manual_seed(0)
-    factory = measure_agreement(tested, rig)
+    factory = measure_agreement(detections, rig)  # no moment took part in it
     if bool(factory.agrees.all()):
         return rig, factory, 0
     best = factory if factory.judged.any() else None
     for start in range(STARTS):
         random = torch.randn(std.shape, generator=generator, dtype=std.dtype)
-        trial = _refine_start(learnt, rig, rig.retract(SPREAD[start] * random * std), obj, start)
-        if trial is None:
-            continue
-        agreement = measure_agreement(tested, trial)
-        if bool(agreement.agrees.all()):
+        trial, agreement = _try_start(detections, rig, rig.retract(SPREAD[start] * random * std), obj, start)
+        if trial is not None and agreement is not None and bool(agreement.agrees.all()):
             return trial, agreement, start + 1
-        if best is None or agreement.score > best.score:
+        if agreement is not None and (best is None or agreement.score > best.score):
             best = agreement
     raise RefusedError(_why(best, rig))
+
+
+def _try_start(
+    detections: Detections, factory: CameraRig, first: CameraRig, obj: CalibrationObject, seed: int
+) -> tuple[CameraRig | None, Agreement | None]:
+    """Follow one start, and judge it by the moments that took no part.
+
+    Where these show too little of some camera, others are held out in turn, each time from a rig of their own.
+
+    Returns:
+        The first of these rigs, and how well all of them agree with what they did not see; None = there is none.
+    """
+    rig: CameraRig | None = None
+    agreement: Agreement | None = None
+    for turn in range(HELD_OUT):
+        learnt, tested = split_moments(detections, turn)
+        trial = _refine_start(learnt, factory, first, obj, seed)
+        if trial is None:
+            return None, agreement
+        part = measure_agreement(tested, trial)
+        rig, agreement = rig or trial, part if agreement is None else agreement + part
+        if agreement.judged.all() or (agreement.judged & ~agreement.agrees).any():
+            break
+    return rig, agreement
 
 
 NO_MARKER = "no moving blobs of three cameras agree on a place"
@@ -228,13 +255,13 @@ NOTHING = (
 )
 
 
-def split_moments(detections: Detections) -> tuple[Detections, Detections]:
-    """Part blobs by moments: those from which a rig is made, and those that take no part.
+def split_moments(detections: Detections, turn: int = 0) -> tuple[Detections, Detections]:
+    """Part blobs by moments: those from which a rig is made, and those that take no part, other ones in each turn.
 
     Raises:
         RefusedError: there are too few moments.
     """
-    held = np.arange(len(detections.snapshot_names)) % HELD_OUT == HELD_OUT - 1
+    held = (np.arange(len(detections.snapshot_names)) + turn) % HELD_OUT == HELD_OUT - 1
     if held.sum() < 2:
         raise RefusedError(
             f"unknown markers: found {len(held)} snapshots, expected at least {2 * HELD_OUT}: some must take no part, "

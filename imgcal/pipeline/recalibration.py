@@ -91,6 +91,7 @@ def calibrate(
     blobs = settle_turns(find_blobs(source, rig, obj, detection, measurer), rig, obj)
     detections, repeats = drop_repeats(blobs)
     found = time.perf_counter()
+    obj = without_pattern(obj, detections)
     if obj.unknown_markers and detector != "classical":
         raise InputError(f"detector {detector}: found unknown markers, expected an object with a pattern to look for")
     sight = make_sight(detector, source, detection, measurer)
@@ -150,6 +151,12 @@ def _calibrate_lights(
         "estimation": time.perf_counter() - identified,
     }
     return replace(fit, lights=lights, seconds=seconds, repeats=repeats)
+
+
+def without_pattern(obj: CalibrationObject, detections: Detections) -> CalibrationObject:
+    """Take an object of one marker for an unknown marker, unless labels say which blobs are it."""
+    is_one = obj.pose_rank == 3 and not obj.parts and not (detections.fiducial >= 0).any()
+    return replace(obj.about_centroid(obj.name), unknown_markers=True) if is_one else obj
 
 
 def as_one(obj: CalibrationObject | Sequence[CalibrationObject]) -> CalibrationObject:

@@ -206,9 +206,7 @@ def stream() -> dict[str, Any]:
     labelled = reference.calibration.labelled_detections
     cases: dict[str, tuple[Detections, CalibrationObject]] = {}
     for marker in range(given.obj.num_fiducials):
-        cases[f"marker {marker} as an unknown one"] = only(labelled, [marker]), LIGHTS
-    for marker in range(given.obj.num_fiducials):
-        cases[f"marker {marker} as a light"] = only(labelled, [marker]), part_of(given.obj, [marker])
+        cases[f"marker {marker}"] = only(labelled, [marker]), part_of(given.obj, [marker])
     for first, second in PAIRS:
         cases[f"markers {first} and {second}"] = only(labelled, [first, second]), part_of(given.obj, [first, second])
     for line in LINES:

@@ -11,6 +11,7 @@ from imgcal import InputError, RefusedError
 from imgcal.association import associate
 from imgcal.pipeline.motion_check import _prepend_earlier
 from scripts.benchmarks.lights import LIGHTS, Scene, simulate, triangulation_error
+from tests.imgcal.association.stick_scenes import capture
 
 
 @pytest.fixture(scope="module")
@@ -118,3 +119,22 @@ def test_few_snapshots_are_refused(scene: Scene) -> None:
 def test_a_pattern_to_look_for_is_asked_for(scene: Scene) -> None:
     with pytest.raises(InputError, match="unknown markers"):
         imgcal.calibrate(scene.detections, scene.factory, LIGHTS, detector="matched")
+
+
+def test_an_object_of_one_marker_is_an_unknown_marker() -> None:
+    rig, obj, blobs, true = capture([(30.0, 0.0, 0.0)], 40)
+    found = imgcal.calibrate(blobs, rig, obj)
+    kept = found.labelled_detections.fiducial >= 0
+    assert (true[kept] >= 0).mean() > 0.99 and kept.sum() > 0.9 * (true >= 0).sum()
+    assert torch.equal(found.rig.focal_length, imgcal.calibrate(blobs, rig, LIGHTS).rig.focal_length)
+    moment, pose = next(iter(found.poses_by_object["object0"].items()))
+    row = [snapshot.name for snapshot in found.labelled.snapshots].index(moment)
+    there = pose.apply(torch.tensor([[30.0, 0.0, 0.0]]).double())
+    assert torch.allclose(there, found.rig_from_object.translation[found.labelled.used.index(row)])
+
+
+def test_labels_say_which_blobs_are_the_one_marker() -> None:
+    rig, obj, blobs, true = capture([(0.0, 0.0, 0.0)], 24)
+    found = imgcal.calibrate(replace(blobs, fiducial=true), rig, obj)
+    assert found.lights is None and found.identity == "coded"
+    assert (found.labelled_detections.fiducial == true).all()
