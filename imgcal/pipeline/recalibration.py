@@ -106,8 +106,10 @@ def calibrate(
             identified = time.perf_counter()
             given = detections if sight is None else _given_labels(labelled)
             fit = fit_with_timing(labelled, given, rig, obj, options, initializer)
-            if any(part.pose_rank == 5 for part in obj.each):
-                fit = _labelled_again(fit, given, rig, obj, options)
+            has_stick = any(part.pose_rank == 5 for part in obj.each)
+            if has_stick and (again := label_again(fit, given, obj, options)) is not None:
+                with contextlib.suppress(RefusedError):
+                    fit = fit_with_timing(again, given, rig, obj, options)
     except RefusedError as error:
         if sight is not None and labelled is not None and sight.where_blobs_fail and _used_blobs(labelled):
             # They told the pose, and failed all the same.
@@ -164,20 +166,20 @@ def as_one(obj: CalibrationObject | Sequence[CalibrationObject]) -> CalibrationO
     return obj if isinstance(obj, CalibrationObject) else CalibrationObject.of_several(obj)
 
 
-def _labelled_again(
-    fit: Calibration, given: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
-) -> Calibration:
-    """Label once more with the rig that was found, and estimate that anew from the factory calibration.
+def label_again(
+    fit: Calibration, given: Detections, obj: CalibrationObject, options: PipelineOptions
+) -> Associations | None:
+    """Label once more with the rig that was found; None = that gives no more labels.
 
     A camera shows little of a stick: a marker whose neighbour is hidden has a label only where the rig is known.
     """
     if fit.labelled.identity == "coded" or fit.moved or fit.unsynchronized is not None:
-        return fit
+        return None
     with contextlib.suppress(RefusedError):
         again = associate(given, replace(fit.estimate.rig, prior=FOUND), obj, options)
         if int((again.detections.fiducial >= 0).sum()) > int((fit.labelled.detections.fiducial >= 0).sum()):
-            return fit_with_timing(again, given, rig, obj, options)
-    return fit
+            return again
+    return None
 
 
 def fit_with_timing(
