@@ -7,6 +7,7 @@ of the camera are, far oftener than by chance, and near misses must be few.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -60,6 +61,8 @@ LEAST_NEAR = 0.8
 """Of the blobs beside predicted markers, chance apart: those that are in their place."""
 SAME_RIG = 1.0
 """px: median distance of images up to which two rigs are one."""
+LEAST_MARGIN = 5.0
+"""Log odds of a marker beside known objects against the best other one that takes one of its blobs."""
 MOST_TESTED = 40
 """Held-out moments that are looked at camera by camera."""
 
@@ -165,10 +168,10 @@ def find_lights(
     if not len(found):
         raise RefusedError(NOTHING)
     blob = np.flatnonzero(~background)[found.row[found.row >= 0]]
-    return FoundLights(rows_of_lights(found, moving, verified), detections, blob, background, agreement, starts)
+    return FoundLights(rows_of_lights(found, moving), detections, blob, background, agreement, starts)
 
 
-def rows_of_lights(lights: Lights, detections: Detections, rig: CameraRig) -> Associations:
+def rows_of_lights(lights: Lights, detections: Detections) -> Associations:
     """Make a row of each marker at each moment; it has the name of the moment, and only the marker's blobs.
 
     A moment without any marker is a row that was refused.
@@ -183,17 +186,55 @@ def rows_of_lights(lights: Lights, detections: Detections, rig: CameraRig) -> As
     names = tuple(detections.snapshot_names[moment] for moment in moments[order])
     labels = np.zeros(len(marker), dtype=np.int64)
     blobs = replace(blobs, snapshot=number[marker], fiducial=labels, snapshot_names=names)
-    places, cameras = torch.from_numpy(lights.point).to(rig.focal_length), lights.cameras.tolist()
-    still = torch.eye(3, dtype=places.dtype)
     snapshots = tuple(
-        SnapshotIdentity(
-            name, "unique", f"{cameras[k]} cameras agree", 1, RigidTransform(still, places[k]), moment=moment
-        )
-        if k < len(places)
+        _row_of_light(lights, k, detections.snapshot_names)
+        if k < len(lights)
         else SnapshotIdentity(name, "refused", NO_MARKER, 0, None, moment=moment)
         for name, k, moment in zip(names, order.tolist(), moments[order].tolist(), strict=True)
     )
     return Associations(blobs, snapshots)
+
+
+def add_lights(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> Associations | None:
+    """Add a row for each unknown marker beside known objects, by the rig that these have calibrated.
+
+    Args:
+        labelled: rows of the known objects.
+        rig: as they have it; no unknown marker took part in it.
+        obj: several objects, the last of them unknown markers.
+
+    Returns:
+        All rows; None where no marker is found, or some camera does not agree with the others on them.
+    """
+    blobs = labelled.by_moment()
+    free = np.flatnonzero(blobs.usable & (blobs.fiducial < 0))
+    free = free[~background_rows(blobs.select(free))]
+    left = blobs.select(free)
+    agreement = measure_agreement(left, rig)
+    lights = associate_lights(left, rig, even_error(rig))
+    lights = lights.select(lights.margin >= LEAST_MARGIN)
+    if not len(lights) or bool((agreement.judged & ~agreement.agrees).any()):
+        return None
+    moments, part = labelled.moments, len(obj.parts) - 1
+    order = np.argsort(np.concatenate((moments, lights.moment)), kind="stable")  # known objects first
+    number = np.argsort(order)
+    fiducial, row = blobs.fiducial.copy(), number[labelled.detections.snapshot]
+    light, camera = np.nonzero(lights.row >= 0)
+    own = free[lights.row[light, camera]]
+    row[own], fiducial[own] = number[len(moments) + light], obj.num_fiducials - 1
+    snapshots = [*labelled.snapshots]
+    snapshots += [_row_of_light(lights, k, blobs.snapshot_names, part) for k in range(len(lights))]
+    names = tuple(snapshots[at].name for at in order)
+    table = replace(blobs, snapshot=row, fiducial=fiducial, snapshot_names=names)
+    return Associations(table, tuple(snapshots[at] for at in order))
+
+
+def _row_of_light(lights: Lights, number: int, names: Sequence[str], part: int = 0) -> SnapshotIdentity:
+    """What is known of a marker at its moment."""
+    moment, point = int(lights.moment[number]), torch.from_numpy(lights.point[number]).double()
+    place = RigidTransform(torch.eye(3, dtype=torch.float64), point)
+    reason = f"{lights.cameras[number]} cameras agree"
+    return SnapshotIdentity(names[moment], "unique", reason, 1, place, moment=moment, part=part)
 
 
 def even_error(rig: CameraRig, pixels: float = FINEST) -> NDArray[np.float64]:

@@ -114,7 +114,7 @@ def calibrate_lights_from_scratch(
     first = _scale(placed_cameras.rig, known.length / 1000.0)
     found = associate_lights(moving, first, even_error(first))
     lights = FoundLights(
-        rows_of_lights(found, moving, first),
+        rows_of_lights(found, moving),
         detections,
         np.flatnonzero(~background)[found.row[found.row >= 0]],
         background,

@@ -26,7 +26,7 @@ from imgcal.pipeline.initialization import Initializer
 from imgcal.pipeline.label_counts import LabelCounts, count_labels
 from imgcal.pipeline.labelled_capture import arrange_labels
 from imgcal.pipeline.learned_measurer import LearnedMeasurer
-from imgcal.pipeline.lights import find_lights
+from imgcal.pipeline.lights import add_lights, find_lights
 from imgcal.pipeline.repeats import Repeats, drop_repeats, name_repeats
 from imgcal.pipeline.sources import Detector, Frames, check_frames, find_blobs, make_sight
 from imgcal.pipeline.synchronization import NOTICEABLE, find_unsynchronized
@@ -110,6 +110,10 @@ def calibrate(
             if has_stick and (again := label_again(fit, given, obj, options)) is not None:
                 with contextlib.suppress(RefusedError):
                     fit = fit_with_timing(again, given, rig, obj, options)
+            is_steady = not fit.moved and fit.unsynchronized is None
+            if obj.has_lights and is_steady and (lit := add_lights(fit.labelled, fit.estimate.rig, obj)) is not None:
+                with contextlib.suppress(RefusedError):
+                    fit = fit_steady(lit, given, rig, obj, options)
     except RefusedError as error:
         if sight is not None and labelled is not None and sight.where_blobs_fail and _used_blobs(labelled):
             # They told the pose, and failed all the same.

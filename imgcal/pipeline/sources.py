@@ -170,6 +170,9 @@ def check_detections(detections: Detections, rig: CameraRig, obj: CalibrationObj
             raise InputError(f"detections: {name}: found {found}, expected a NumPy array of shape {expected}")
     if obj.unknown_markers:
         detections = replace(detections, fiducial=np.full(count, -1))
+    elif obj.has_lights:
+        nameless = detections.fiducial == obj.num_fiducials - 1
+        detections = replace(detections, fiducial=np.where(nameless, -1, detections.fiducial))
     for name, end in (("camera", len(detections.camera_names)), ("snapshot", len(detections.snapshot_names))):
         _require(
             detections, name, (getattr(detections, name) >= 0) & (getattr(detections, name) < end), f"0 to {end - 1}"

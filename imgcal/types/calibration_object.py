@@ -146,14 +146,16 @@ class CalibrationObject:
         each object, and a row sees only the columns of its own object.
 
         Args:
-            objects: at least one; two of the same name get a number. A single one is returned as it is.
+            objects: at least one; two of the same name get a number. A single one is returned as it is. One of several
+                may be unknown markers, or a single one, which is the same: of them any number may be in view.
 
         Returns:
-            All fiducials in the order of the objects, those of each about its own centroid; `parts` holds the objects
-            with these coordinates.
+            All fiducials in the order of the objects, unknown markers last, those of each about its own centroid;
+            `parts` holds the objects with these coordinates.
 
         Raises:
-            InputError: a printed board, unknown markers, or an object whose scale has a tolerance, among several.
+            InputError: a printed board, or an object whose scale has a tolerance, among several; or only markers of
+                which nothing is known.
 
         Examples:
             >>> import imgcal
@@ -169,11 +171,14 @@ class CalibrationObject:
         for obj in objects:
             found = (
                 "a printed board" if obj.board is not None else
-                "a scale tolerance" if obj.scale_tolerance else
-                "unknown markers" if obj.unknown_markers else ""
+                "a scale tolerance" if obj.scale_tolerance else ""
             )  # fmt: skip
             if found:
                 raise InputError(f"object {obj.name}: found {found}, expected none among several objects")
+        lights = [replace(obj, unknown_markers=True) for obj in objects if obj.pose_rank == 3]
+        objects = [obj for obj in objects if obj.pose_rank > 3] + lights
+        if len(lights) > 1:
+            raise InputError("objects: found single or unknown markers twice, expected once: there may be any number")
         names: list[str] = []
         for obj in objects:
             number = sum(other.name == obj.name for other in objects[: len(names)]) + 1
@@ -206,6 +211,11 @@ class CalibrationObject:
     def part_of(self) -> NDArray[np.int64]:
         """Number of the object to which each fiducial belongs: (N,); zero of a single object."""
         return np.repeat(np.arange(len(self.each)), [len(part.points) for part in self.each])
+
+    @property
+    def has_lights(self) -> bool:
+        """Tell whether the last of several objects is unknown markers."""
+        return bool(self.parts) and self.parts[-1].unknown_markers
 
     @property
     def exact(self) -> bool:

@@ -212,9 +212,9 @@ def examine(scene: Scene) -> dict[str, Any]:
     }
 
 
-def campaign() -> Iterable[dict[str, Any]]:
+def campaign(seeds: int) -> Iterable[dict[str, Any]]:
     """Captures of all kinds, easy ones first."""
-    for seed in range(SEEDS):
+    for seed in range(seeds):
         for markers in COUNTS:
             for drift in DRIFTS:
                 yield {
@@ -226,9 +226,9 @@ def campaign() -> Iterable[dict[str, Any]]:
                 }
 
 
-def accuracy() -> Iterable[dict[str, Any]]:
+def accuracy(seeds: int) -> Iterable[dict[str, Any]]:
     """The cases whose accuracy is compared with the estimate that is told the labels."""
-    for seed in range(SEEDS):
+    for seed in range(seeds):
         for target, counts in TARGETS.items():
             for moments in counts:
                 yield {"part": "accuracy", "target": target, "moments": moments, "drift": 1.0, "seed": 100 + seed}
@@ -319,6 +319,7 @@ class Options:
     """Captures of unknown markers, counted as calibrated, refused and wrong."""
 
     part: tyro.conf.Positional[Literal["campaign", "accuracy", "stream"]]
+    seeds: int = SEEDS  #: captures of each kind
 
 
 def main() -> None:
@@ -331,7 +332,7 @@ def main() -> None:
         return
     make_folder(DONE.parent)
     done = [json.loads(line) for line in DONE.read_text().splitlines()] if DONE.is_file() else []
-    for case in campaign() if options.part == "campaign" else accuracy():
+    for case in campaign(options.seeds) if options.part == "campaign" else accuracy(options.seeds):
         if any(case.items() <= row.items() for row in done):
             continue
         row = run(case)

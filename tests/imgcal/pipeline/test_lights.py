@@ -11,7 +11,7 @@ from imgcal import InputError, RefusedError
 from imgcal.association import associate
 from imgcal.pipeline.motion_check import _prepend_earlier
 from scripts.benchmarks.lights import LIGHTS, Scene, simulate, triangulation_error
-from tests.imgcal.association.stick_scenes import capture
+from tests.imgcal.association.stick_scenes import BODY, capture, several
 
 
 @pytest.fixture(scope="module")
@@ -138,3 +138,20 @@ def test_labels_say_which_blobs_are_the_one_marker() -> None:
     found = imgcal.calibrate(replace(blobs, fiducial=true), rig, obj)
     assert found.lights is None and found.identity == "coded"
     assert (found.labelled_detections.fiducial == true).all()
+
+
+def test_unknown_markers_beside_a_known_object_take_part() -> None:
+    light = ((0.0, 0.0, 0.0),)
+    rig, body, blobs, true = several([BODY, light, light], 24, seed=2)
+    alone, found = (imgcal.calibrate(blobs, rig, obj) for obj in (body, [body, LIGHTS]))
+    rows = found.labelled
+    shown = rows.detections.fiducial == len(BODY)
+    assert (true[shown] >= len(BODY)).mean() > 0.99 and shown.sum() > 0.8 * (true >= len(BODY)).sum()
+    assert (np.diff(rows.moments) >= 0).all() and rows.moment_counts == (24, 24)
+    assert (rows.by_moment().snapshot == blobs.snapshot).all()
+    names = [rows.snapshots[row].name for row in rows.detections.snapshot[shown]]
+    assert names == [blobs.snapshot_names[s] for s in blobs.snapshot[shown]]
+    assert not (found.labelled_detections.fiducial[shown] >= 0).any()  # they have no name that lasts
+    assert found.predicted_error.median_mm < 1.1 * alone.predicted_error.median_mm
+    assert 0.9 < float(found.chi2_per_dof) < 1.1
+    assert {row.part for row in rows.snapshots if row.status != "refused"} == {0, 1}
