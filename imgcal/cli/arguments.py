@@ -156,8 +156,9 @@ class Calibrate:
     count; carry the whole object through what neighbouring cameras see together; the rig's frame is that of its first
     camera"""
     distance: tuple[str, str, float] | None = None
-    """with --cameras and --object lights: CAMERA CAMERA MM, the distance of two cameras, which gives the scale; without
-    it the rig is known up to scale. The first is in the origin of the rig's frame, the second on its x axis"""
+    """with --cameras and a light, or --object lights: CAMERA CAMERA MM, the distance of two cameras, which gives the
+    scale; without it the rig is known up to scale. The first is in the origin of the rig's frame, the second on its x
+    axis"""
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
     videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
     detector: str = "classical"
