@@ -115,9 +115,10 @@ class StateWriter:
         return {"belief": self._belief(value)} if kind is RigBelief else self._object(kind, value)
 
     def _object(self, kind: type, value: Any) -> dict[str, Any]:
-        if type(value) is not kind:
-            raise TypeError(f"{type(value).__name__} cannot be saved as {kind.__name__}")
-        return {key: self.write(of, _attribute(value, attribute)) for key, attribute, of in state_entries(kind)}
+        exact: type = type(value)
+        if exact is not kind:
+            raise TypeError(f"{exact.__name__} cannot be saved as {kind.__name__}")
+        return {key: self.write(of, _attribute(value, attribute)) for key, attribute, of in state_entries(exact)}
 
     def _belief(self, belief: RigBelief) -> int:
         if id(belief) not in self._numbers:

@@ -282,7 +282,9 @@ def late_cameras(
         where, moments = dict(moved), labelled.moments.tolist()
         moments += moments[-1:]
         asked = {c: where.get(rig.camera_names[c], moments[row]) for c, row in asked.items()}
-        detections, obj = _of_part(detections, obj, int(np.bincount(labelled.part_of_rows).argmax()))
+        counts_of_parts = np.bincount(labelled.part_of_rows, minlength=len(obj.parts))
+        counts_of_parts[len(obj.parts) - obj.has_lights :] = 0
+        detections, obj = _of_part(detections, obj, int(counts_of_parts.argmax()))
 
     def others(blobs: Detections) -> tuple[list[int], RigidTransform]:
         fit = fit_labelled(associate(blobs, rig, obj, options), rig, obj, replace(options, blind_cameras=True))
