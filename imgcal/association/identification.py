@@ -27,7 +27,6 @@ from imgcal.association.hypotheses import (
     likely_blobs,
 )
 from imgcal.association.minimal_labels import compare_labellings, has_minimal_blobs
-from imgcal.association.points import identify_points
 from imgcal.association.result import Identity, IdentityOptions, Status
 from imgcal.association.search import VERIFIED, Search
 from imgcal.association.stick_poses import fit_sticks
@@ -142,9 +141,9 @@ def relocalize(
     options: IdentityOptions = IdentityOptions(),
 ) -> Identity:
     """Label the blobs of one snapshot without a known pose; arguments as in `identify`."""
-    if obj.pose_rank == 3:
-        return identify_points(detections, rig, obj, std, options)
     scene = Scene(gather(detections, rig), obj, rig, std)
+    if obj.pose_rank == 3:
+        return _refuse(scene, "a single marker has no pattern: beside snapshots with labels, others say nothing")
     if obj.pose_rank == 5:
         sticks = fit_sticks(scene, options.seed)
         if sticks is None:

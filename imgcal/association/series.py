@@ -94,15 +94,17 @@ class Associations:
             self.detections, snapshot=moments[self.detections.snapshot], snapshot_names=tuple(names.values())
         )
 
-    def repeated(self) -> Detections:
-        """The detections, with unlabelled blobs repeated in every row of their snapshot."""
+    def repeated(self, obj: CalibrationObject) -> Detections:
+        """The detections, with unlabelled blobs repeated in the row of every known object of their snapshot."""
         detections, moments = self.detections, self.moments
+        known = np.array([not obj.each[snapshot.part].unknown_markers for snapshot in self.snapshots])
         count = np.bincount(moments)
         left = np.flatnonzero((detections.fiducial < 0) & (count[moments] > 1)[detections.snapshot])
         if not len(left):
             return detections
         rows = np.split(np.arange(len(moments)), np.cumsum(count)[:-1])
         where = [np.setdiff1d(rows[moments[s]], s) for s in detections.snapshot[left]]
+        where = [others[known[others]] for others in where]
         more = np.repeat(left, [len(part) for part in where])
         table = detections.select(np.concatenate((np.arange(len(detections)), more)))
         table.snapshot[len(detections) :] = np.concatenate([*where, np.empty(0, dtype=np.int64)])

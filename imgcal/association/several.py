@@ -56,7 +56,9 @@ def associate_several(
     learnt = LearntRig(rig, obj, options, MOST_REMEMBERED * len(obj.parts))
     first = np.searchsorted(obj.part_of, np.arange(len(obj.parts)))
     trackers = [
-        Tracker(rig, part, options, learnt=learnt, first=int(row)) for part, row in zip(obj.parts, first, strict=True)
+        Tracker(rig, part, options, learnt=learnt, first=int(row))
+        for part, row in zip(obj.parts, first, strict=True)
+        if not part.unknown_markers  # they are found once the rig is known
     ]
     scene = _Capture(detections, trackers, obj)
     count = len(detections.snapshot_names)

@@ -154,8 +154,9 @@ class Calibrate:
     field of view (imgcal rig cameras writes one), or a calibration whose camera places do not count; carry
     the whole object through what neighbouring cameras see together; the rig's frame is that of its first camera"""
     distance: tuple[str, str, float] | None = None
-    """with --cameras and --object lights: CAMERA CAMERA MM, the distance of two cameras, which gives the scale; without
-    it the rig is known up to scale. The first is in the origin of the rig's frame, the second on its x axis"""
+    """with --cameras and a light, or --object lights: CAMERA CAMERA MM, the distance of two cameras, which gives the
+    scale; without it the rig is known up to scale. The first is in the origin of the rig's frame, the second on its x
+    axis"""
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
     videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
     detector: str = "classical"
@@ -208,9 +209,10 @@ class Watch:
 
     input: Annotated[str, tyro.conf.Positional]  #: folder, address, file or -
     rig: str  #: factory rig: file, or the name of a shipped one
-    object: str
-    """object: file, or the name of a shipped one; lights = whatever bright markers move through the volume, of which
-    nothing is known: RIG should come from calibrate, and its scale stays as that says"""
+    object: tuple[str, ...]
+    """object: file, or the name of a shipped one; lights = whatever bright markers move through the volume. The markers
+    of a stick, or of several objects, are followed like these, one by one: RIG should come from calibrate, and its
+    scale stays as that says"""
     out: Path  #: folder to write
     fresh: bool = False  #: forget what an earlier run left in OUT, begin from the factory rig
     tolerance: float = Timing.tolerance  #: s that the time stamps of one snapshot may be apart

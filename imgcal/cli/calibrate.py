@@ -120,7 +120,7 @@ class Calibrate(arguments.Calibrate):
                 save_rig(outcome.rig, out / RIG, covariance, self.full_covariance, posterior)
                 if outcome.shape and not obj.parts:
                     save_object(replace(outcome.object, board=None), out / "object.csv")
-                elif outcome.bend is not None:
+                if outcome.bend is not None:
                     save_object(outcome.object, out / "board.yaml")
                 found = findings(outcome, self._gauge(outcome), covariance)
                 result = summary(outcome, seconds) | found.values

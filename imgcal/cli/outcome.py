@@ -233,7 +233,8 @@ def _object_summary(calibration: Calibration) -> list[dict[str, Any]]:
         offsets[part].append(values | {"sigma_mm": offset.sigma})
     if not obj.parts:
         return offsets[0]
-    seen = np.bincount(calibration.labelled.part_of_rows, minlength=len(obj.parts)).tolist()
+    moments, part_of = calibration.labelled.moments[calibration.labelled.used], calibration.labelled.part_of_rows
+    seen = [len(np.unique(moments[part_of == part])) for part in range(len(obj.parts))]
     return [
         {"name": part.name, "snapshots_used": count, "fiducials": found}
         for part, count, found in zip(obj.parts, seen, offsets, strict=True)
@@ -379,7 +380,7 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
         print(f"object  {entry['name']} seen in {entry['snapshots_used']} snapshots")
     if result["object"] and not several:
         print(f"object  {out / 'object.csv'}")
-    elif result["board_bend"]:
+    if result["board_bend"]:
         print(f"board   {out / 'board.yaml'}")
     print(f"result  {out / 'result.json'}")
     if report:

@@ -72,6 +72,10 @@ class Simulate(arguments.Simulate):
             raise InputError(f"{self.out}: found a capture there already, expected a new folder")
         rig, obj = open_rig(self.rig), load_objects(self.object)
         generator = torch.Generator().manual_seed(self.seed)
+        if obj.has_lights:
+            raise InputError(
+                "--object: found unknown markers beside known objects, expected one or the other to simulate"
+            )
         are_known = not obj.unknown_markers
         if not are_known:
             obj = place_markers(rig, self.lights, generator)

@@ -22,7 +22,7 @@ from imgcal.cli.common import check_folder, open_rig
 from imgcal.cli.watch_display import Display
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice, missing
-from imgcal.io import holding, load_object, open_input
+from imgcal.io import Fiducials, holding, load_objects, open_input
 from imgcal.messages import shorten
 from imgcal.online import Event, RigKeeper
 from imgcal.types import CalibrationObject, CameraRig, Detections, object_difference, rig_difference
@@ -78,16 +78,21 @@ class Watch(arguments.Watch):
 
     def run(self) -> None:
         """Watch until the end."""
-        rig, obj = open_rig(self.rig), load_object(self.object)
+        rig, given = open_rig(self.rig), load_objects(self.object)
+        obj = given.as_unknown()
+        if len(given.points) > 1 and obj is not given:
+            print(
+                f"note: markers of {given.name} are followed one by one: their distances are not used", file=sys.stderr
+            )
         check_folder(self.out)
         _check_poses(self.poses, obj, self.out)
         with holding(self.out) as folder:
-            self._watch(rig, obj, folder)
+            self._watch(rig, obj, given.rows, folder)
 
-    def _watch(self, rig: CameraRig, obj: CalibrationObject, folder: Path) -> None:
+    def _watch(self, rig: CameraRig, obj: CalibrationObject, labels: Fiducials, folder: Path) -> None:
         with _going_on():
             progress = None if self.fresh else Progress.load(folder)
-        source, origin = self._source(rig, obj, progress), self._origin()
+        source, origin = self._source(rig, labels, progress), self._origin()
         rate = source.rate if isinstance(source, BlobTable) else None
         goes_on = source.live and not self.keep_all  # what came since the last state is gone
         knows = goes_on or isinstance(source, Folder)  # a folder knows which files have been read
@@ -168,8 +173,8 @@ class Watch(arguments.Watch):
         gone = isinstance(source, BlobTable) and progress.name not in source.blobs.snapshot_names
         return Known(progress.time, None if gone else progress.name, another)
 
-    def _source(self, rig: CameraRig, obj: CalibrationObject, progress: Progress | None) -> Source:
-        """Find out what INPUT is."""
+    def _source(self, rig: CameraRig, labels: Fiducials, progress: Progress | None) -> Source:
+        """Find out what INPUT is; tables call the fiducials by `labels`."""
         if self.input == "-":
             self._check_options("standard input")
             return JsonLines(sys.stdin.fileno())
@@ -198,7 +203,7 @@ class Watch(arguments.Watch):
         rate = USUAL_RATE if self.rate is None else self.rate
         if not 0 < rate < 1e6:
             raise InputError(f"--rate: found {rate:g}, expected snapshots a second")
-        source = open_input(path, rig, obj.rows)
+        source = open_input(path, rig, labels)
         assert isinstance(source, Detections)  # folders are seen to above
         return BlobTable(source, rate)
 
@@ -222,7 +227,7 @@ class Watch(arguments.Watch):
             keeper = RigKeeper.restore(path, detection=self.detection, detector=self.detector)
         for option, difference in (
             (f"--rig {self.rig}", _rig_difference(rig, keeper.given)),
-            (f"--object {self.object}", _object_difference(obj, keeper.obj)),
+            (f"--object {' '.join(self.object)}", _object_difference(obj, keeper.obj)),
         ):
             if difference is not None:
                 known = f"{path}: found what is known of another than {option}"

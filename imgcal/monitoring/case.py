@@ -17,7 +17,7 @@ from imgcal.estimation import EstimationOptions
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
-from imgcal.types import Observations, UnknownLights
+from imgcal.types import Observations
 
 EARLY_SNAPSHOTS, EARLY_SECONDS = 12, 1.0
 """Number of earlier snapshots, and seconds since the start. Below both, a moved camera cannot be told from a late one:
@@ -123,7 +123,7 @@ class Case:
         Raises:
             RefusedError: the points are lights.
         """
-        if isinstance(self.before.obj, UnknownLights):
+        if self.before.obj.unknown_markers:
             raise RefusedError("lights have no fixed shape")
 
     @property

@@ -24,7 +24,7 @@ from imgcal.monitoring.measurement_update_cpu import DAMPED, MOST_DAMPING, SLACK
 from imgcal.monitoring.rig_arrays import RigArrays
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
 from imgcal.monitoring.snapshot_information import SnapshotInformation
-from imgcal.types import CameraRig, Observations, UnknownLights
+from imgcal.types import CameraRig, Observations
 
 
 def absorb(
@@ -39,7 +39,7 @@ def absorb(
     Args:
         belief: what is known before the snapshots.
         observations: (S, C, N) of the object of `belief`.
-        rig_from_object: (S,) first guess of the object's poses; (S, N) for lights, see `UnknownLights`.
+        rig_from_object: (S,) first guess of the object's poses; (S, N) for lights, see `CalibrationObject.unknown`.
         options: how to minimize.
         start: a belief about the same rig and object at which to start, which saves iterations; None = `belief`.
 
@@ -52,7 +52,7 @@ def absorb(
         raise ValueError(f"rig_from_object: found {counts}, expected one pose per snapshot")
     constants, unit, shake = belief.constants, belief.unit, observations.shake
     given, shown = rig_from_object, None
-    if isinstance(belief.obj, UnknownLights):
+    if belief.obj.unknown_markers:
         observations, rig_from_object, shown = _select_lights(observations, rig_from_object)
     seen = observations.seen.numpy()
     uv = np.where(seen[..., None], observations.uv.numpy(), 0.0).astype(np.float64, copy=False)

@@ -22,7 +22,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.monitoring.measurement_update_cpu import NOTHING_KNOWN, WHY_NOT
 from imgcal.monitoring.rig_arrays import RigArrays
 from imgcal.monitoring.snapshot_information import SnapshotInformation, add_blocks
-from imgcal.types import CalibrationObject, CameraRig, DriftRate, RigPrior, UnknownLights
+from imgcal.types import CalibrationObject, CameraRig, DriftRate, RigPrior
 
 LEAST_STD = (1e-9,) * 3 + (1e-6,) * 3 + (1e-6,) * 4
 LEAST_COEFFICIENT = 1e-9
@@ -128,11 +128,11 @@ class RigBelief:
     @property
     def pose_freedom(self) -> int:
         """Maximum number of degrees of freedom of a snapshot's pose: six, or a position of each light."""
-        return 3 * max(self.obj.num_fiducials, 2) if isinstance(self.obj, UnknownLights) else 6
+        return 3 * max(self.obj.num_fiducials, 2) if self.obj.unknown_markers else 6
 
     def points_at(self, rig_from_object: RigidTransform) -> Tensor:
         """Fiducials of an object in poses (S,), or lights (S, N), in the rig's frame: (S, N, 3) mm."""
-        if isinstance(self.obj, UnknownLights):
+        if self.obj.unknown_markers:
             return rig_from_object.translation
         return rig_from_object.apply(self.points_object)
 
@@ -151,7 +151,7 @@ class MeasurementUpdate:
     """The result of absorbing some snapshots."""
 
     belief: RigBelief
-    rig_from_object: RigidTransform  # (S,) the object's poses; (S, N) of lights, see `UnknownLights`
+    rig_from_object: RigidTransform  # (S,) the object's poses; (S, N) of lights, see `CalibrationObject.unknown`
     residual: Tensor  # (S, C, N, 2) pixels, predicted minus observed; zero where not seen
     chi2: float  # sum of squared whitened residuals (robust) and the squared whitened change of the belief
     dof: int  # expected chi2: 2 per observation less the degrees of freedom of all poses

@@ -33,7 +33,7 @@ from imgcal.online.snapshot_labels import Labelled, label_snapshot
 from imgcal.online.snapshot_update import learn_snapshot
 from imgcal.online.state_document import StateWriter
 from imgcal.pipeline import DetectorName, check_frames
-from imgcal.types import CalibrationObject, CameraRig, Detections, DriftRate, UnknownLights
+from imgcal.types import CalibrationObject, CameraRig, Detections, DriftRate
 
 GREATEST_TIME = 2.0**37
 
@@ -70,7 +70,8 @@ class RigKeeper:
 
         Args:
             rig: the factory calibration, without batch axes.
-            obj: the calibration object, or `UnknownLights`: anything that moves through the volume.
+            obj: the calibration object. The markers of a stick, or of several objects, are followed one by one, as
+                unknown markers are: their distances are not used.
             options: how certain labels must be, and how to minimize.
             detection: how blobs are found.
             detector: how fiducials are found in frames, as for `calibrate`.
@@ -81,15 +82,14 @@ class RigKeeper:
                 keeps its last values.
             tests: other tests of each snapshot; None = `default_tests`.
         """
-        if obj.pose_rank == 3 and not isinstance(obj, UnknownLights):
-            obj = UnknownLights.of() if obj.unknown_markers else UnknownLights.of_light(obj)
+        obj = obj.as_unknown()
         if horizon is not None and horizon < 1:
             raise InputError(f"horizon: found {horizon}, expected at least 1 snapshot")
-        if horizon is not None and isinstance(obj, UnknownLights):
+        if horizon is not None and obj.unknown_markers:
             raise InputError("horizon: with unknown lights, the rig needs all snapshots; leave the horizon out")
         self.options = _for_keeping(options)
         self._memory = KeeperMemory.from_factory(rig, obj, drift, self.options, horizon)
-        usual = () if isinstance(obj, UnknownLights) else default_tests(rig.num_cameras)  # all need a rigid object
+        usual = () if obj.unknown_markers else default_tests(rig.num_cameras)  # all need a rigid object
         self.tests = tuple(usual if tests is None else tests)
         clocks = (test for test in self.tests if isinstance(test, ClockOffsets))
         self._clock = next(clocks, ClockOffsets(rig.num_cameras))

@@ -32,7 +32,6 @@ from imgcal.types import (
     DriftRate,
     Observations,
     RigPrior,
-    UnknownLights,
     check_object,
     check_rig,
 )
@@ -91,7 +90,7 @@ class KeeperMemory:
         Raises:
             InputError: the rig or the object is invalid, or the object's fiducials are collinear.
         """
-        if not isinstance(obj, UnknownLights):
+        if not obj.unknown_markers:
             obj.require_rigid("for a running rig")
         check_rig(rig)
         check_object(obj)
@@ -105,7 +104,7 @@ class KeeperMemory:
             relearning=Relearning(rig.camera_names), drift_watch=DriftWatch(rig.camera_names),
             doubts=ObjectChecks(obj.num_fiducials), search=Search(rig.num_cameras),
             looks=np.zeros(rig.num_cameras, dtype=np.int64), before=monitor.filter.belief,
-            lights=LightTracks.of(obj.num_fiducials, rig.num_cameras) if isinstance(obj, UnknownLights) else None,
+            lights=LightTracks.of(obj.num_fiducials, rig.num_cameras) if obj.unknown_markers else None,
         )  # fmt: skip
         if calibration is not None:
             memory.looks[:], memory.learnt = LEAST_LOOKS, calibration.time

@@ -69,7 +69,7 @@ def label_lights(memory: KeeperMemory, tracks: LightTracks, blobs: Detections) -
         raise RefusedError(f"identity: found no light on which three cameras agree: {seen}")
     numbers = tracks.number_lights(found.point, time)
     scene = _Scene(rig, blobs, found, rows)
-    lights = _all_lights(memory, blobs, scene.label, found, numbers)
+    lights = FoundLights(blobs, scene.label.copy(), found.point)  # also those that are more than a rig learns from
     tracks.mark_still(blobs.camera, blobs.uv, scene.label >= 0, time)
     usual, sought = scene.usual_shift(), scene.misfits()
     lost, off = np.zeros((2, rig.num_cameras), dtype=bool)
@@ -99,16 +99,6 @@ def label_lights(memory: KeeperMemory, tracks: LightTracks, blobs: Detections) -
     pose = RigidTransform(torch.eye(3, dtype=torch.float64).expand(1, len(place), 3, 3), torch.from_numpy(place)[None])
     labelled = replace(blobs, fiducial=named)
     return Checked(labelled, labelled, pose, off, usual, int((named >= 0).sum()), lights), astray
-
-
-def _all_lights(
-    memory: KeeperMemory, blobs: Detections, label: NDArray[np.int64], lights: Lights, numbers: NDArray[np.int64]
-) -> FoundLights:
-    """All lights of a snapshot, including those that a rig does not learn from; of a one-light object, that light."""
-    if memory.obj.num_fiducials > 1:
-        return FoundLights(blobs, label.copy(), lights.point)
-    place = np.where(numbers >= 0, 0, -1)
-    return FoundLights(blobs, np.where(label >= 0, place[label], -1), lights.point[numbers >= 0])
 
 
 class _Scene:

@@ -15,7 +15,6 @@ from imgcal.types import (
     CameraRig,
     Detections,
     Observations,
-    UnknownLights,
     check_object,
     check_rig,
 )
@@ -84,7 +83,6 @@ def _check_detections(blobs: Detections) -> None:
 CHECKS: dict[type, Callable[[Any], None]] = {
     CameraRig: _check_rig,
     CalibrationObject: _check_object,
-    UnknownLights: _check_object,
     RigidTransform: _check_transform,
     RigBelief: _check_belief,
     Observations: _check_observations,

@@ -28,12 +28,9 @@ import torch
 
 from imgcal.monitoring import RigBelief
 from imgcal.online.state_checks import CHECKS
-from imgcal.types import CalibrationObject, UnknownLights
 
 NOT_SAVED: Mapping[str, bool] = {"saved": False}
-"""Metadata of a field that the caller provides on resuming."""
-VARIANTS: Mapping[type, Mapping[str, type]] = {CalibrationObject: {"body": CalibrationObject, "lights": UnknownLights}}
-"""Classes with subclasses that may be saved instead, and their names in the document."""
+"""Metadata of a field that the caller gives anew on resuming."""
 DTYPES = {name: np.dtype(name) for name in ("float64", "float32", "int64", "int32", "bool", "uint8")}
 NUMBERS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 """Numbers that JSON does not have."""
@@ -118,15 +115,10 @@ class StateWriter:
         return {"belief": self._belief(value)} if kind is RigBelief else self._object(kind, value)
 
     def _object(self, kind: type, value: Any) -> dict[str, Any]:
-        plain = {}
-        if kind in VARIANTS:
-            plain["kind"] = next((name for name, one in VARIANTS[kind].items() if one is type(value)), None)
-        if plain.get("kind", "") is None or (kind not in VARIANTS and type(value) is not kind):
-            raise TypeError(f"{type(value).__name__} cannot be saved as {kind.__name__}")
         exact: type = type(value)
-        for key, attribute, of in state_entries(exact):
-            plain[key] = self.write(of, _attribute(value, attribute))
-        return plain
+        if exact is not kind:
+            raise TypeError(f"{exact.__name__} cannot be saved as {kind.__name__}")
+        return {key: self.write(of, _attribute(value, attribute)) for key, attribute, of in state_entries(exact)}
 
     def _belief(self, belief: RigBelief) -> int:
         if id(belief) not in self._numbers:
@@ -254,12 +246,7 @@ class StateReader:
         return self.read(float | np.ndarray, plain, where)
 
     def read_object(self, kind: type, plain: Any, where: str, fresh: Any = None) -> Any:
-        """Read an object; a mutable `fresh` is filled in, see `read`."""
-        if kind in VARIANTS and isinstance(plain, dict):
-            found = VARIANTS[kind].get(str(plain.get("kind")))
-            if found is None:
-                raise ValueError(f"{where}: found the kind {plain.get('kind')!r}, expected {', '.join(VARIANTS[kind])}")
-            kind, plain = found, {key: value for key, value in plain.items() if key != "kind"}
+        """Read an object; `fresh` is filled with it where it can change, see `read`."""
         entries = state_entries(kind)
         if not isinstance(plain, dict) or plain.keys() != {entry.key for entry in entries}:
             names = ", ".join(entry.key for entry in entries)

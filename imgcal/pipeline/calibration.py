@@ -236,7 +236,7 @@ class Calibration:
     def labelled_detections(self) -> Detections:
         """All blobs with their labels; outliers have the flag `BlobFlag.OUTLIER`.
 
-        The label of an unknown marker is valid at its moment only.
+        The label of an unknown marker holds at its moment only; beside known objects it has none.
         """
         detections, used = self.labelled.detections, self.labelled.used
         row = np.full(len(self.labelled.snapshots), -1)
@@ -248,6 +248,8 @@ class Calibration:
         found = replace(detections, flags=marked)
         if self.lights is not None:
             return self.lights.to_moments(found)
+        if self.obj.has_lights:
+            found = replace(found, fiducial=np.where(n == self.obj.num_fiducials - 1, -1, n))
         return replace(self.labelled, detections=found).by_moment()
 
     @cached_property

@@ -6,6 +6,7 @@ shows which blob is which fiducial. Cameras placed by these labels then vote on 
 
 from __future__ import annotations
 
+import contextlib
 import time
 from dataclasses import replace
 
@@ -30,8 +31,14 @@ from imgcal.estimation import K3, ColdStart, cold_start, ordinary_lens
 from imgcal.messages import list_names
 from imgcal.pipeline.board_turns import require_one_turn
 from imgcal.pipeline.calibration import Calibration
-from imgcal.pipeline.lights_from_scratch import calibrate_lights_from_scratch
-from imgcal.pipeline.recalibration import fit_with_timing, late_cameras, require_same_moments
+from imgcal.pipeline.lights_from_scratch import calibrate_lights_from_scratch, place_by_stick
+from imgcal.pipeline.recalibration import (
+    fit_with_timing,
+    label_again,
+    late_cameras,
+    require_same_moments,
+    without_pattern,
+)
 from imgcal.pipeline.repeats import drop_repeats, name_repeats
 from imgcal.pipeline.sources import Frames, find_blobs
 from imgcal.pipeline.units import require_solvable, require_units
@@ -73,13 +80,13 @@ def calibrate_from_scratch(
 
     Args:
         source: blobs, labelled or not, or frames in memory.
-        cameras: from `imgcal.formats.load_cameras`; the poses of a rig and their prior are ignored.
-        obj: the calibration object.
-        options: how certain the result must be.
+        cameras: from `imgcal.formats.load_cameras`; a rig's places and its prior for them are not looked at.
+        obj: the calibration object: a body, a stick, or a light.
+        options: how sure the result must be.
         detection: how blobs are found in frames.
         progress: wraps loops over snapshots.
-        distance: for unknown markers: names of two cameras and their distance, mm; None = the rig is known up to scale.
-            The first camera is then the origin of the frame, and the second lies on the x axis.
+        distance: of a light or unknown markers: names of two cameras and their distance, mm; None = the rig is known up
+            to scale. Its frame has the first of these in the origin, and the second on the x axis.
 
     Returns:
         As for `calibrate`; its `factory` is the first rig made from the data.
@@ -98,13 +105,14 @@ def calibrate_from_scratch(
         >>> abs(float(apart[0] - apart[1])) < 1  # mm
         True
     """
-    if distance is not None and not obj.unknown_markers:
+    if distance is not None and obj.pose_rank > 3:
         raise InputError("distance: found an object of known size, expected unknown markers, which know no scale")
-    if not obj.unknown_markers:
+    if obj.parts:
         obj.require_rigid("to calibrate without a factory calibration")
     started, cameras, options = time.perf_counter(), _set_prior(cameras), options.of_object(obj)
     detections, repeats = drop_repeats(find_blobs(source, cameras, obj, detection))
-    if obj.unknown_markers:
+    if obj.pose_rank == 3:
+        detections, obj = _marker_alone(detections, obj)
         found = time.perf_counter()
         with require_solvable():
             fit = calibrate_lights_from_scratch(detections, cameras, obj, options, distance)
@@ -112,16 +120,19 @@ def calibrate_from_scratch(
         return _for_what_comes_after(replace(fit, repeats=repeats), cameras, seconds)
     require_one_turn(cameras, obj)
     found = time.perf_counter()
-    is_labelled = (detections.fiducial >= 0).any()
-    alone = detections if is_labelled else label_images(detections, cameras, obj, options, progress)
-    first = _first_rig(alone, cameras, obj)
-    placed = replace(first.rig, prior=PLACED)
+    is_labelled, is_stick = (detections.fiducial >= 0).any(), obj.pose_rank == 5
+    alone = detections if is_labelled or is_stick else label_images(detections, cameras, obj, options, progress)
+    first = place_by_stick(detections, cameras, obj) if is_stick else _first_rig(alone, cameras, obj).rig
+    placed = replace(first, prior=PLACED)
     labelled: Associations | None = None
     try:
         with require_solvable():
             labelled = associate(detections, placed, obj, options, progress)
             identified = time.perf_counter()
-            fit = _fit(labelled, first.rig, cameras, obj, options)
+            fit = _fit(labelled, first, cameras, obj, options)
+            if is_stick and (again := label_again(fit, detections, obj, options)) is not None:
+                with contextlib.suppress(RefusedError):
+                    fit = _fit(again, first, cameras, obj, options)
     except RefusedError as error:
         require_units(error, detections, placed, obj, from_scratch=True)
         if labelled is not None:
@@ -135,6 +146,15 @@ def calibrate_from_scratch(
     }
     fit = replace(fit, labelled=name_repeats(fit.labelled, repeats), repeats=repeats, late=late)
     return _for_what_comes_after(fit, cameras, seconds)
+
+
+def _marker_alone(detections: Detections, obj: CalibrationObject) -> tuple[Detections, CalibrationObject]:
+    """Take an object of one marker for an unknown marker; where blobs have labels, leave out those that have none."""
+    labelled = detections.fiducial >= 0
+    if labelled.any():
+        detections = detections.select(labelled)
+        detections = replace(detections, fiducial=np.full(len(detections), -1))
+    return detections, without_pattern(obj, detections)
 
 
 def _for_what_comes_after(fit: Calibration, cameras: CameraRig, seconds: dict[str, float]) -> Calibration:

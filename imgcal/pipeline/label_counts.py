@@ -80,7 +80,7 @@ def count_labels(
         obj: N fiducials.
         rig: as estimated; None = not yet, and unlabelled blobs count as being in the wrong place.
     """
-    labelled = replace(labelled, detections=labelled.repeated())
+    labelled = replace(labelled, detections=labelled.repeated(obj))
     detections, used = labelled.detections, labelled.used
     shape = (len(labelled.snapshots), factory.num_cameras)
 

@@ -7,6 +7,7 @@ chance, and near misses must be rare.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,7 +60,9 @@ LEAST_SHARE = 0.25
 LEAST_NEAR = 0.8
 """Minimum share, among blobs near predicted markers, of those in place; corrected for chance."""
 SAME_RIG = 1.0
-"""px: median image distance below which two rigs are the same."""
+"""px: median distance of images up to which two rigs are one."""
+LEAST_MARGIN = 5.0
+"""Log odds of a marker beside known objects against the best other one that takes one of its blobs."""
 MOST_TESTED = 40
 """Maximum number of held-out moments to test, camera by camera."""
 
@@ -71,6 +74,13 @@ class Agreement:
     predicted: NDArray[np.int64]  # (C,) markers in view of the camera, found by the others
     found: NDArray[np.float64]  # (C,) share of these with a blob in place, corrected for chance
     near_misses: NDArray[np.float64]  # (C,) share of these with a blob nearby, corrected for chance
+
+    def __add__(self, other: Agreement) -> Agreement:
+        """Count both."""
+        predicted = self.predicted + other.predicted
+        share = self.predicted / np.maximum(predicted, 1)
+        found = share * self.found + (1 - share) * other.found
+        return Agreement(predicted, found, share * self.near_misses + (1 - share) * other.near_misses)
 
     @property
     def judged(self) -> NDArray[np.bool_]:
@@ -158,11 +168,11 @@ def find_lights(
     if not len(found):
         raise RefusedError(NOTHING)
     blob = np.flatnonzero(~background)[found.row[found.row >= 0]]
-    return FoundLights(rows_of_lights(found, moving, verified), detections, blob, background, agreement, starts)
+    return FoundLights(rows_of_lights(found, moving), detections, blob, background, agreement, starts)
 
 
-def rows_of_lights(lights: Lights, detections: Detections, rig: CameraRig) -> Associations:
-    """Make a row for each marker at each moment, with the moment's name and the marker's blobs only.
+def rows_of_lights(lights: Lights, detections: Detections) -> Associations:
+    """Make a row of each marker at each moment; it has the name of the moment, and only the marker's blobs.
 
     A moment without a marker becomes a refused row.
     """
@@ -176,17 +186,55 @@ def rows_of_lights(lights: Lights, detections: Detections, rig: CameraRig) -> As
     names = tuple(detections.snapshot_names[moment] for moment in moments[order])
     labels = np.zeros(len(marker), dtype=np.int64)
     blobs = replace(blobs, snapshot=number[marker], fiducial=labels, snapshot_names=names)
-    places, cameras = torch.from_numpy(lights.point).to(rig.focal_length), lights.cameras.tolist()
-    still = torch.eye(3, dtype=places.dtype)
     snapshots = tuple(
-        SnapshotIdentity(
-            name, "unique", f"{cameras[k]} cameras agree", 1, RigidTransform(still, places[k]), moment=moment
-        )
-        if k < len(places)
+        _row_of_light(lights, k, detections.snapshot_names)
+        if k < len(lights)
         else SnapshotIdentity(name, "refused", NO_MARKER, 0, None, moment=moment)
         for name, k, moment in zip(names, order.tolist(), moments[order].tolist(), strict=True)
     )
     return Associations(blobs, snapshots)
+
+
+def add_lights(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> Associations | None:
+    """Add a row for each unknown marker beside known objects, by the rig that these have calibrated.
+
+    Args:
+        labelled: rows of the known objects.
+        rig: as they have it; no unknown marker took part in it.
+        obj: several objects, the last of them unknown markers.
+
+    Returns:
+        All rows; None where no marker is found, or some camera does not agree with the others on them.
+    """
+    blobs = labelled.by_moment()
+    free = np.flatnonzero(blobs.usable & (blobs.fiducial < 0))
+    free = free[~background_rows(blobs.select(free))]
+    left = blobs.select(free)
+    agreement = measure_agreement(left, rig)
+    lights = associate_lights(left, rig, even_error(rig))
+    lights = lights.select(lights.margin >= LEAST_MARGIN)
+    if not len(lights) or bool((agreement.judged & ~agreement.agrees).any()):
+        return None
+    moments, part = labelled.moments, len(obj.parts) - 1
+    order = np.argsort(np.concatenate((moments, lights.moment)), kind="stable")  # known objects first
+    number = np.argsort(order)
+    fiducial, row = blobs.fiducial.copy(), number[labelled.detections.snapshot]
+    light, camera = np.nonzero(lights.row >= 0)
+    own = free[lights.row[light, camera]]
+    row[own], fiducial[own] = number[len(moments) + light], obj.num_fiducials - 1
+    snapshots = [*labelled.snapshots]
+    snapshots += [_row_of_light(lights, k, blobs.snapshot_names, part) for k in range(len(lights))]
+    names = tuple(snapshots[at].name for at in order)
+    table = replace(blobs, snapshot=row, fiducial=fiducial, snapshot_names=names)
+    return Associations(table, tuple(snapshots[at] for at in order))
+
+
+def _row_of_light(lights: Lights, number: int, names: Sequence[str], part: int = 0) -> SnapshotIdentity:
+    """What is known of a marker at its moment."""
+    moment, point = int(lights.moment[number]), torch.from_numpy(lights.point[number]).double()
+    place = RigidTransform(torch.eye(3, dtype=torch.float64), point)
+    reason = f"{lights.cameras[number]} cameras agree"
+    return SnapshotIdentity(names[moment], "unique", reason, 1, place, moment=moment, part=part)
 
 
 def even_error(rig: CameraRig, pixels: float = FINEST) -> NDArray[np.float64]:
@@ -200,24 +248,44 @@ def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject
     Raises:
         RefusedError: there is none, or another one explains the blobs equally well.
     """
-    learnt, tested = split_moments(detections)
     std = (rig.prior or RigPrior()).std(rig)
     generator = torch.Generator().manual_seed(0)
-    factory = measure_agreement(tested, rig)
+    factory = measure_agreement(detections, rig)  # no moment took part in it
     if bool(factory.agrees.all()):
         return rig, factory, 0
     best = factory if factory.judged.any() else None
     for start in range(STARTS):
         random = torch.randn(std.shape, generator=generator, dtype=std.dtype)
-        trial = _refine_start(learnt, rig, rig.retract(SPREAD[start] * random * std), obj, start)
-        if trial is None:
-            continue
-        agreement = measure_agreement(tested, trial)
-        if bool(agreement.agrees.all()):
+        trial, agreement = _try_start(detections, rig, rig.retract(SPREAD[start] * random * std), obj, start)
+        if trial is not None and agreement is not None and bool(agreement.agrees.all()):
             return trial, agreement, start + 1
-        if best is None or agreement.score > best.score:
+        if agreement is not None and (best is None or agreement.score > best.score):
             best = agreement
     raise RefusedError(_why(best, rig))
+
+
+def _try_start(
+    detections: Detections, factory: CameraRig, first: CameraRig, obj: CalibrationObject, seed: int
+) -> tuple[CameraRig | None, Agreement | None]:
+    """Follow one start, and judge it by the moments that took no part.
+
+    Where these show too little of some camera, others are held out in turn, each time from a rig of their own.
+
+    Returns:
+        The first of these rigs, and how well all of them agree with what they did not see; None = there is none.
+    """
+    rig: CameraRig | None = None
+    agreement: Agreement | None = None
+    for turn in range(HELD_OUT):
+        learnt, tested = split_moments(detections, turn)
+        trial = _refine_start(learnt, factory, first, obj, seed)
+        if trial is None:
+            return None, agreement
+        part = measure_agreement(tested, trial)
+        rig, agreement = rig or trial, part if agreement is None else agreement + part
+        if agreement.judged.all() or (agreement.judged & ~agreement.agrees).any():
+            break
+    return rig, agreement
 
 
 NO_MARKER = "no moving blobs of three cameras agree on a place"
@@ -228,13 +296,13 @@ NOTHING = (
 )
 
 
-def split_moments(detections: Detections) -> tuple[Detections, Detections]:
-    """Split blobs by moments: those for making the rig, and the held-out ones.
+def split_moments(detections: Detections, turn: int = 0) -> tuple[Detections, Detections]:
+    """Part blobs by moments: those from which a rig is made, and those that take no part, other ones in each turn.
 
     Raises:
         RefusedError: there are too few moments.
     """
-    held = np.arange(len(detections.snapshot_names)) % HELD_OUT == HELD_OUT - 1
+    held = (np.arange(len(detections.snapshot_names)) + turn) % HELD_OUT == HELD_OUT - 1
     if held.sum() < 2:
         raise RefusedError(
             f"unknown markers: found {len(held)} snapshots, expected at least {2 * HELD_OUT}: some are held out "

@@ -26,7 +26,7 @@ from imgcal.pipeline.initialization import Initializer
 from imgcal.pipeline.label_counts import LabelCounts, count_labels
 from imgcal.pipeline.labelled_capture import arrange_labels
 from imgcal.pipeline.learned_measurer import LearnedMeasurer
-from imgcal.pipeline.lights import find_lights
+from imgcal.pipeline.lights import add_lights, find_lights
 from imgcal.pipeline.repeats import Repeats, drop_repeats, name_repeats
 from imgcal.pipeline.sources import Detector, Frames, check_frames, find_blobs, make_sight
 from imgcal.pipeline.synchronization import NOTICEABLE, find_unsynchronized
@@ -91,6 +91,7 @@ def calibrate(
     blobs = settle_turns(find_blobs(source, rig, obj, detection, measurer), rig, obj)
     detections, repeats = drop_repeats(blobs)
     found = time.perf_counter()
+    obj = without_pattern(obj, detections)
     if obj.unknown_markers and detector != "classical":
         raise InputError(f"detector {detector}: found unknown markers, expected an object with a pattern to look for")
     sight = make_sight(detector, source, detection, measurer)
@@ -105,8 +106,14 @@ def calibrate(
             identified = time.perf_counter()
             given = detections if sight is None else _given_labels(labelled)
             fit = fit_with_timing(labelled, given, rig, obj, options, initializer)
-            if any(part.pose_rank == 5 for part in obj.each):
-                fit = _labelled_again(fit, given, rig, obj, options)
+            has_stick = any(part.pose_rank == 5 for part in obj.each)
+            if has_stick and (again := label_again(fit, given, obj, options)) is not None:
+                with contextlib.suppress(RefusedError):
+                    fit = fit_with_timing(again, given, rig, obj, options)
+            is_steady = not fit.moved and fit.unsynchronized is None
+            if obj.has_lights and is_steady and (lit := add_lights(fit.labelled, fit.estimate.rig, obj)) is not None:
+                with contextlib.suppress(RefusedError):
+                    fit = fit_steady(lit, given, rig, obj, options)
     except RefusedError as error:
         if sight is not None and labelled is not None and sight.where_blobs_fail and _used_blobs(labelled):
             # Blobs gave a pose, but the calibration failed.
@@ -152,25 +159,31 @@ def _calibrate_lights(
     return replace(fit, lights=lights, seconds=seconds, repeats=repeats)
 
 
+def without_pattern(obj: CalibrationObject, detections: Detections) -> CalibrationObject:
+    """Take an object of one marker for an unknown marker, unless labels say which blobs are it."""
+    is_one = obj.pose_rank == 3 and not obj.parts and not (detections.fiducial >= 0).any()
+    return replace(obj.about_centroid(obj.name), unknown_markers=True) if is_one else obj
+
+
 def as_one(obj: CalibrationObject | Sequence[CalibrationObject]) -> CalibrationObject:
     """One object, or several combined."""
     return obj if isinstance(obj, CalibrationObject) else CalibrationObject.of_several(obj)
 
 
-def _labelled_again(
-    fit: Calibration, given: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
-) -> Calibration:
-    """Label once more with the rig that was found, and repeat the estimate from the factory calibration.
+def label_again(
+    fit: Calibration, given: Detections, obj: CalibrationObject, options: PipelineOptions
+) -> Associations | None:
+    """Label once more with the rig that was found; None = that gives no more labels.
 
     A camera shows little of a stick: a marker with a hidden neighbour can be labelled only if the rig is known.
     """
     if fit.labelled.identity == "coded" or fit.moved or fit.unsynchronized is not None:
-        return fit
+        return None
     with contextlib.suppress(RefusedError):
         again = associate(given, replace(fit.estimate.rig, prior=FOUND), obj, options)
         if int((again.detections.fiducial >= 0).sum()) > int((fit.labelled.detections.fiducial >= 0).sum()):
-            return fit_with_timing(again, given, rig, obj, options)
-    return fit
+            return again
+    return None
 
 
 def fit_with_timing(
@@ -269,7 +282,9 @@ def late_cameras(
         where, moments = dict(moved), labelled.moments.tolist()
         moments += moments[-1:]
         asked = {c: where.get(rig.camera_names[c], moments[row]) for c, row in asked.items()}
-        detections, obj = _of_part(detections, obj, int(np.bincount(labelled.part_of_rows).argmax()))
+        counts_of_parts = np.bincount(labelled.part_of_rows, minlength=len(obj.parts))
+        counts_of_parts[len(obj.parts) - obj.has_lights :] = 0
+        detections, obj = _of_part(detections, obj, int(counts_of_parts.argmax()))
 
     def others(blobs: Detections) -> tuple[list[int], RigidTransform]:
         fit = fit_labelled(associate(blobs, rig, obj, options), rig, obj, replace(options, blind_cameras=True))

@@ -46,8 +46,6 @@ def find_blobs(
     if isinstance(source, Detections):
         if measurer is not None:
             raise InputError(f"measurer {measurer.name}: found blobs without frames, expected frames to look at")
-        if obj.unknown_markers and len(source):
-            source = replace(source, fiducial=np.full(len(source), -1))
         return check_detections(source, rig, obj)
     frames = check_frames(source, rig)
     if not frames:
@@ -158,6 +156,8 @@ def _check_frame(frame: Any, camera: str, width: int, height: int, rig: CameraRi
 def check_detections(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Detections:
     """Return detections with cameras numbered as in the rig, if they fit this rig and object.
 
+    Labels of unknown markers are taken off: they mean nothing from one snapshot to the next.
+
     Raises:
         InputError: inconsistent columns, a camera, fiducial or pixel that does not exist, or an invalid standard
             deviation.
@@ -168,6 +168,11 @@ def check_detections(detections: Detections, rig: CameraRig, obj: CalibrationObj
         if not isinstance(column, np.ndarray) or column.shape != expected:
             found = f"an array of shape {column.shape}" if isinstance(column, np.ndarray) else type(column).__name__
             raise InputError(f"detections: {name}: found {found}, expected a NumPy array of shape {expected}")
+    if obj.unknown_markers:
+        detections = replace(detections, fiducial=np.full(count, -1))
+    elif obj.has_lights:
+        nameless = detections.fiducial == obj.num_fiducials - 1
+        detections = replace(detections, fiducial=np.where(nameless, -1, detections.fiducial))
     for name, end in (("camera", len(detections.camera_names)), ("snapshot", len(detections.snapshot_names))):
         _require(
             detections, name, (getattr(detections, name) >= 0) & (getattr(detections, name) < end), f"0 to {end - 1}"

@@ -1,6 +1,6 @@
 from . import limits
 from .board import Board, BoardKind
-from .calibration_object import CalibrationObject, Symmetry
+from .calibration_object import MOST_LIGHTS, CalibrationObject, Symmetry
 from .differences import object_difference, rig_difference
 from .limits import BLOB_RADIUS, FIDUCIAL_RADIUS, MOST_PIXELS, SIGMA, Range, check_object, check_observations, check_rig
 from .moved_camera import Kind, MovedCamera, MovedError
@@ -19,7 +19,6 @@ from .rig import (
     RigPrior,
     parameter_names,
 )
-from .unknown_lights import MOST_LIGHTS, UnknownLights
 from .volume import Volume
 
 __all__ = [
@@ -53,7 +52,6 @@ __all__ = [
     "RigPosterior",
     "RigPrior",
     "Symmetry",
-    "UnknownLights",
     "Views",
     "Volume",
     "check_object",

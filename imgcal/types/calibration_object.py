@@ -17,6 +17,8 @@ from imgcal.types.board import Board
 
 ANY_LABEL = 1_000_000
 """Labels of a table of unknown markers are below this; nothing is made of them."""
+MOST_LIGHTS = 16
+"""Lights of one snapshot from which a running rig learns; of more, those that most cameras see."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class CalibrationObject:
     board: Board | None = None  # the printed pattern whose points these are; None = markers
     modes: Tensor | None = None  # (K, N, 3) mm: shapes of which it has as much as a standard normal says; None = rigid
     labels: tuple[int, ...] = ()  # what tables call the fiducials; empty = by their rows
-    unknown_markers: bool = False  # every blob may be one of these points, any number at a moment: see `unknown`
+    unknown_markers: bool = False  # every blob may be a marker of its own: see `unknown`
     parts: tuple[CalibrationObject, ...] = ()  # several objects in one capture, see `of_several`; empty = one object
     origin: Tensor | None = None  # (3,) mm in the frame of the object's file: the origin of `points`; None = the same
 
@@ -98,12 +100,43 @@ class CalibrationObject:
         return cls(points, colours, name=name, board=board, modes=modes if len(modes) else None)
 
     @classmethod
-    def unknown(cls, name: str = "lights") -> CalibrationObject:
+    def unknown(cls, name: str = "lights", most: int = 1) -> CalibrationObject:
         """Make the object that says: every blob may be a marker of its own, and nothing is known of them.
 
-        Each marker at each moment is then an object of one point.
+        In a capture each marker at each moment is an object of one point. A running rig numbers the markers of a
+        moment: its object has a point for each number, and its pose is a transform (S, N) whose translation is where
+        marker n is, nan for a number that no marker has.
+
+        Args:
+            name: of the object.
+            most: markers of one moment that can have a number, N.
+
+        Examples:
+            >>> lights = CalibrationObject.unknown(most=4)
+            >>> lights.num_fiducials, lights.pose_rank, lights.exact
+            (4, 3, True)
         """
-        return cls(torch.zeros(1, 3).double(), torch.ones(1, 3).double(), name=name, unknown_markers=True)
+        points, colours = torch.zeros(most, 3).double(), torch.ones(most, 3).double()
+        return cls(points, colours, name=name, unknown_markers=True)
+
+    def as_unknown(self) -> CalibrationObject:
+        """Take an object for unknown markers, as a running rig does with all that is no single rigid body.
+
+        Returns:
+            Up to `MOST_LIGHTS` markers at once, of the radius that all of the object's have. A single rigid body is
+            returned as it is.
+
+        Examples:
+            >>> stick = torch.tensor([[0.0, 0.0, 0.0], [500.0, 0.0, 0.0]])
+            >>> CalibrationObject(stick, torch.ones(2, 3), name="stick").as_unknown()
+            CalibrationObject('stick': unknown markers)
+        """
+        if len(self.points) > 1 and (self.unknown_markers or (not self.parts and self.pose_rank == 6)):
+            return self
+        lights = CalibrationObject.unknown(self.name, MOST_LIGHTS)
+        if self.radius is None or bool((self.radius != self.radius[0]).any()):
+            return lights
+        return replace(lights, radius=self.radius[:1].double().expand(len(lights.points)).clone())
 
     @classmethod
     def of_several(cls, objects: Sequence[CalibrationObject]) -> CalibrationObject:
@@ -113,14 +146,16 @@ class CalibrationObject:
         each object, and a row sees only the columns of its own object.
 
         Args:
-            objects: at least one; two of the same name get a number. A single one is returned as it is.
+            objects: at least one; two of the same name get a number. A single one is returned as it is. One of several
+                may be unknown markers, or a single one, which is the same: of them any number may be in view.
 
         Returns:
-            All fiducials in the order of the objects, those of each about its own centroid; `parts` holds the objects
-            with these coordinates.
+            All fiducials in the order of the objects, unknown markers last, those of each about its own centroid;
+            `parts` holds the objects with these coordinates.
 
         Raises:
-            InputError: a printed board, unknown markers, or an object whose scale has a tolerance, among several.
+            InputError: a printed board, or an object whose scale has a tolerance, among several; or only markers of
+                which nothing is known.
 
         Examples:
             >>> import imgcal
@@ -136,16 +171,19 @@ class CalibrationObject:
         for obj in objects:
             found = (
                 "a printed board" if obj.board is not None else
-                "a scale tolerance" if obj.scale_tolerance else
-                "unknown markers" if obj.unknown_markers else ""
+                "a scale tolerance" if obj.scale_tolerance else ""
             )  # fmt: skip
             if found:
                 raise InputError(f"object {obj.name}: found {found}, expected none among several objects")
+        lights = [replace(obj, unknown_markers=True) for obj in objects if obj.pose_rank == 3]
+        objects = [obj for obj in objects if obj.pose_rank > 3] + lights
+        if len(lights) > 1:
+            raise InputError("objects: found single or unknown markers twice, expected once: there may be any number")
         names: list[str] = []
         for obj in objects:
             number = sum(other.name == obj.name for other in objects[: len(names)]) + 1
             names.append(obj.name if number == 1 else f"{obj.name}-{number}")
-        parts = tuple(_centred(obj, name) for obj, name in zip(objects, names, strict=True))
+        parts = tuple(obj.about_centroid(name) for obj, name in zip(objects, names, strict=True))
         has_radius = any(part.radius is not None for part in parts)
         has_tolerance = any(part.tolerance is not None for part in parts)
         return cls(
@@ -157,6 +195,13 @@ class CalibrationObject:
             parts=parts,
         )
 
+    def about_centroid(self, name: str) -> CalibrationObject:
+        """Move the origin to the centroid of the fiducials, and name the object; `origin` says where it was."""
+        points = self.points.double()
+        centroid = points.mean(0)
+        origin = centroid if self.origin is None else centroid + self.origin
+        return replace(self, name=name, points=points - centroid, origin=origin)
+
     @property
     def each(self) -> tuple[CalibrationObject, ...]:
         """The objects that there are: `parts`, or the object itself."""
@@ -166,6 +211,11 @@ class CalibrationObject:
     def part_of(self) -> NDArray[np.int64]:
         """Number of the object to which each fiducial belongs: (N,); zero of a single object."""
         return np.repeat(np.arange(len(self.each)), [len(part.points) for part in self.each])
+
+    @property
+    def has_lights(self) -> bool:
+        """Tell whether the last of several objects is unknown markers."""
+        return bool(self.parts) and self.parts[-1].unknown_markers
 
     @property
     def exact(self) -> bool:
@@ -281,14 +331,6 @@ class CalibrationObject:
         identity = np.arange(len(points)).tobytes()
         rest = sorted((m for key, m in found.items() if key != identity), key=lambda m: m.residual)
         return (Symmetry(np.eye(3), np.zeros(3), np.arange(len(points)), 0.0), *rest)
-
-
-def _centred(obj: CalibrationObject, name: str) -> CalibrationObject:
-    """Move the origin of an object's points to their centroid."""
-    points = obj.points.double()
-    centroid = points.mean(0)
-    origin = centroid if obj.origin is None else centroid + obj.origin
-    return replace(obj, name=name, points=points - centroid, origin=origin)
 
 
 def _or_zero(radius: Tensor | None, points: Tensor) -> Tensor:

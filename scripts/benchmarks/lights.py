@@ -1,9 +1,10 @@
-"""Markers of which nothing is known: how many captures are calibrated, refused and wrong, and how good the rigs are.
+"""Markers without labels: how many captures are calibrated, refused and wrong, and how good the rigs are.
 
 Run as `python -m scripts.benchmarks.lights campaign|accuracy|stream`; each writes its part of
 docs/benchmarks/lights.json and goes on where it was stopped (out/work/lights.jsonl). Rig room10, factory values off by
 half a degree, 2 mm, 1 % and 5 px times the drift, blobs with a noise of 0.1 px, a quarter of them hidden, three false
-ones in each image, no labels. `stream` needs IMGCAL_CAPTURES.
+ones in each image, no labels. `accuracy` compares with the estimate that is told all labels, which is as good as the
+Cramer-Rao bound says, and times 2,000 lights. `stream` needs IMGCAL_CAPTURES.
 """
 
 from __future__ import annotations
@@ -39,6 +40,10 @@ MOMENTS = {5: 60, 15: 40, 40: 24, 100: 12}
 WRONG_MM, WRONG_TIMES = 2.0, 5.0
 """A rig is wrong whose median error is larger than this, and than so many times what it claims."""
 POINTS = 300
+STICKS = {"stick of two": (-250.0, 250.0), "stick of three": (-250.0, -80.0, 250.0)}
+"""mm, places of the markers along the stick."""
+TARGETS = {"1 marker": (450, 2000), "40 markers": (50,), "stick of two": (150,), "stick of three": (150,)}
+"""Moments of the cases whose accuracy is measured."""
 PAIRS, LINES = ((0, 2), (0, 4)), ((0, 1, 2), (1, 3, 4))
 """Markers of the recorded wand: two of them, and its two lines of three."""
 
@@ -54,10 +59,20 @@ class Scene:
     uv: Tensor  # (S, C, N, 2) without noise
     visible: Tensor  # (S, C, N)
     points: Tensor  # (S, N, 3) mm
+    poses: RigidTransform  # (S,) rig_from_object
+    obj: CalibrationObject = LIGHTS  # what is known of the target
 
 
-def simulate(markers: int, moments: int, drift: float, seed: int) -> Scene:
-    """Simulate a capture of a body in a room; one marker is a light that is carried around."""
+def simulate(markers: int, moments: int, drift: float, seed: int, stick: Sequence[float] = ()) -> Scene:
+    """Simulate a capture of a body in a room; one marker is a light that is carried around.
+
+    Args:
+        markers: of the body, of which nothing is known.
+        moments: snapshots.
+        drift: of the factory values.
+        seed: of everything random.
+        stick: mm, places of markers on a line, which are known; takes the body's place.
+    """
     generator, random = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
     physical = PhysicalDrift(0.5 * drift, 2.0 * drift, 0.01 * drift, 5.0 * drift, 0.005 * drift)
     spread = (physical.focal_length, physical.principal_point, physical.distortion)
@@ -66,7 +81,9 @@ def simulate(markers: int, moments: int, drift: float, seed: int) -> Scene:
     rig = physical.apply(factory, generator)
     box = torch.tensor(BODY if markers > 1 else (0.0, 0.0, 0.0), dtype=torch.float64)
     body = (torch.rand(markers, 3, generator=generator, dtype=torch.float64) - 0.5) * box
-    obj = CalibrationObject(body, torch.ones(markers, 3).double())
+    if stick:
+        body = torch.tensor([[along, 0.0, 0.0] for along in stick], dtype=torch.float64)
+    obj = CalibrationObject(body, torch.ones(len(body), 3).double(), name="stick")
     truth = simulate_volume(rig, obj, moments, generator, None)
     assert truth.visible is not None
     seen = truth.visible.numpy() & (random.random(truth.visible.shape) > HIDDEN)
@@ -85,8 +102,9 @@ def simulate(markers: int, moments: int, drift: float, seed: int) -> Scene:
         uv[order], np.full(count, NOISE), camera[order], snapshot[order], np.full(count, -1), np.full(count, np.nan),
         np.zeros(count, dtype=np.uint8), rig.camera_names, tuple(f"{moment:05d}" for moment in range(moments)),
     )  # fmt: skip
-    points = truth.rig_from_object.apply(body)
-    return Scene(factory, rig, blobs, fiducial[order], truth.uv, truth.visible, points)
+    poses = truth.rig_from_object
+    known = obj if stick else LIGHTS
+    return Scene(factory, rig, blobs, fiducial[order], truth.uv, truth.visible, poses.apply(body), poses, known)
 
 
 def triangulation_error(rig: CameraRig, scene: Scene) -> float:
@@ -113,18 +131,37 @@ def with_labels(scene: Scene) -> imgcal.Estimate:
     """Estimate the rig from the same blobs, told which of them belong together."""
     right = np.flatnonzero(scene.fiducial >= 0)
     blobs, marker = scene.detections, scene.fiducial[right]
-    markers = scene.uv.shape[2]
-    row = blobs.snapshot[right] * markers + marker
-    shape = (scene.uv.shape[0] * markers, scene.rig.num_cameras, 1)
+    is_stick, (moments, cameras, markers, _) = scene.obj is not LIGHTS, scene.uv.shape
+    row, column = blobs.snapshot[right], marker
+    if not is_stick:  # each marker at each moment is a row
+        row, column = row * markers + marker, np.zeros_like(marker)
+    shape = (moments, cameras, markers) if is_stick else (moments * markers, cameras, 1)
     uv, seen = np.zeros((*shape, 2)), np.zeros(shape, dtype=bool)
-    uv[row, blobs.camera[right], 0], seen[row, blobs.camera[right], 0] = blobs.uv[right], True
-    kept = seen.sum((1, 2)) >= 3
+    uv[row, blobs.camera[right], column], seen[row, blobs.camera[right], column] = blobs.uv[right], True
+    kept = ((seen.sum(1) >= 2).sum(1) >= 2) if is_stick else seen.sum((1, 2)) >= 3
     given = Observations(
         torch.from_numpy(uv[kept]), torch.full(shape, NOISE).double()[: int(kept.sum())], torch.from_numpy(seen[kept])
     )
-    points = scene.points.flatten(0, 1)[torch.from_numpy(kept)]
+    chosen = torch.from_numpy(kept)
+    if is_stick:
+        return estimate(given, scene.factory, scene.obj, scene.poses[chosen])
+    points = scene.points.flatten(0, 1)[chosen]
     start = RigidTransform(torch.eye(3).double().expand(len(points), 3, 3), points)
     return estimate(given, scene.factory, replace(LIGHTS, unknown_markers=False), start)
+
+
+def error_to_bound(rig: CameraRig, truth: CameraRig, told: imgcal.Estimate) -> float:
+    """RMS of the rig's errors, relative to its first camera, each over its Cramer-Rao bound.
+
+    Args:
+        rig: to be judged.
+        truth: the true rig.
+        told: the estimate with the right labels, whose covariance is the bound.
+    """
+    error = relative_difference(rig, truth).flatten()
+    std = relative_covariance(told).diagonal().clamp_min(0).sqrt()
+    known = std > 1e-9
+    return float((error[known] / std[known]).square().mean().sqrt())
 
 
 def normalized_error(found: imgcal.Estimate, truth: CameraRig) -> float:
@@ -140,19 +177,20 @@ def normalized_error(found: imgcal.Estimate, truth: CameraRig) -> float:
 
 def examine(scene: Scene) -> dict[str, Any]:
     """Calibrate a capture and compare with the truth."""
-    started = time.process_time()
     result: dict[str, Any] = {"factory_mm": triangulation_error(scene.factory, scene)}
+    started = time.process_time()
     try:
-        found = imgcal.calibrate(scene.detections, scene.factory, LIGHTS)
+        found = imgcal.calibrate(scene.detections, scene.factory, scene.obj)
     except RefusedError as error:
         return result | {"status": "refused", "reason": str(error)[:160], "cpu_s": time.process_time() - started}
-    assert found.lights is not None
+    seconds = time.process_time() - started
     labels = found.labelled_detections.fiducial
     truth, kept = scene.fiducial, labels >= 0
     key = scene.detections.snapshot * 1000 + labels
     _, group = np.unique(key[kept], return_inverse=True)
     main = np.array([np.bincount(truth[kept][group == g] + 1).argmax() - 1 for g in range(group.max() + 1)])
     wrong = (truth[kept] != main[group]) | (truth[kept] < 0)
+    told = with_labels(scene)
     off, claimed = triangulation_error(found.rig, scene), found.predicted_error.median_mm
     is_wrong = off > WRONG_MM and off > WRONG_TIMES * claimed
     return result | {
@@ -162,42 +200,45 @@ def examine(scene: Scene) -> dict[str, Any]:
         "labels": int(kept.sum()),
         "labels_of": int((truth >= 0).sum()),
         "wrong_labels": int(wrong.sum()),
-        "starts": found.lights.starts,
+        "starts": None if found.lights is None else found.lights.starts,
         "nees": normalized_error(found.estimate, scene.rig),
+        "to_bound": error_to_bound(found.rig, scene.rig, told),
+        "told_mm": triangulation_error(told.rig, scene),
+        "told_nees": normalized_error(told, scene.rig),
+        "told_to_bound": error_to_bound(told.rig, scene.rig, told),
         "scale_sigma_percent": 100 * found.scale.sigma,
-        "cpu_s": time.process_time() - started,
+        "cpu_s": seconds,
+        "seconds": dict(found.seconds),
     }
 
 
-def campaign() -> Iterable[dict[str, Any]]:
+def campaign(seeds: int) -> Iterable[dict[str, Any]]:
     """Captures of all kinds, easy ones first."""
-    for seed in range(SEEDS):
+    for seed in range(seeds):
         for markers in COUNTS:
             for drift in DRIFTS:
                 yield {
                     "part": "campaign",
-                    "markers": markers,
+                    "target": f"{markers} markers",
                     "moments": MOMENTS[markers],
                     "drift": drift,
                     "seed": seed,
                 }
 
 
-def accuracy() -> Iterable[dict[str, Any]]:
+def accuracy(seeds: int) -> Iterable[dict[str, Any]]:
     """The cases whose accuracy is compared with the estimate that is told the labels."""
-    for seed in range(SEEDS):
-        for markers, moments in ((1, 450), (1, 2000), (40, 50)):
-            yield {"part": "accuracy", "markers": markers, "moments": moments, "drift": 1.0, "seed": 100 + seed}
+    for seed in range(seeds):
+        for target, counts in TARGETS.items():
+            for moments in counts:
+                yield {"part": "accuracy", "target": target, "moments": moments, "drift": 1.0, "seed": 100 + seed}
 
 
 def run(case: dict[str, Any]) -> dict[str, Any]:
     """Simulate and examine one case."""
-    scene = simulate(case["markers"], case["moments"], case["drift"], case["seed"])
-    found = examine(scene)
-    if case["part"] == "accuracy":
-        told = with_labels(scene)
-        found |= {"told_mm": triangulation_error(told.rig, scene), "told_nees": normalized_error(told, scene.rig)}
-    return case | found
+    stick = STICKS.get(case["target"], ())
+    markers = len(stick) or int(case["target"].split()[0])
+    return case | examine(simulate(markers, case["moments"], case["drift"], case["seed"], stick))
 
 
 def stream() -> dict[str, Any]:
@@ -206,9 +247,7 @@ def stream() -> dict[str, Any]:
     labelled = reference.calibration.labelled_detections
     cases: dict[str, tuple[Detections, CalibrationObject]] = {}
     for marker in range(given.obj.num_fiducials):
-        cases[f"marker {marker} as an unknown one"] = only(labelled, [marker]), LIGHTS
-    for marker in range(given.obj.num_fiducials):
-        cases[f"marker {marker} as a light"] = only(labelled, [marker]), part_of(given.obj, [marker])
+        cases[f"marker {marker}"] = only(labelled, [marker]), part_of(given.obj, [marker])
     for first, second in PAIRS:
         cases[f"markers {first} and {second}"] = only(labelled, [first, second]), part_of(given.obj, [first, second])
     for line in LINES:
@@ -247,7 +286,7 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Count and take medians."""
     result: dict[str, Any] = {}
     for row in rows:
-        key = f"{row['markers']} markers x {row['moments']}, drift {row['drift']:g}"
+        key = f"{row['target']} x {row['moments']}, drift {row['drift']:g}"
         entry = result.setdefault(row["part"], {}).setdefault(
             key, {"calibrated": 0, "refused": 0, "wrong": 0, "rows": []}
         )
@@ -255,13 +294,24 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, Any]:
         entry["rows"].append(row)
     for part in result.values():
         for entry in part.values():
-            for name in ("error_mm", "claimed_mm", "factory_mm", "told_mm", "nees", "told_nees", "cpu_s"):
+            for name in ("error_mm", "claimed_mm", "factory_mm", "told_mm", "cpu_s"):
                 values = [row[name] for row in entry["rows"] if name in row]
                 if values:
                     entry[f"median_{name}"] = float(np.median(values))
+            good = [row for row in entry["rows"] if "nees" in row]
+            if good:
+                entry["mean_nees"] = float(np.mean([row["nees"] for row in good]))
+                entry["mean_told_nees"] = float(np.mean([row["told_nees"] for row in good]))
+                entry["to_bound"] = rms([row["to_bound"] for row in good])
+                entry["to_told"] = entry["to_bound"] / rms([row["told_to_bound"] for row in good])
             entry["wrong_labels"] = sum(row.get("wrong_labels", 0) for row in entry["rows"])
             entry["labels"] = sum(row.get("labels", 0) for row in entry["rows"])
     return result
+
+
+def rms(values: Sequence[float]) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 @dataclass(frozen=True)
@@ -269,6 +319,7 @@ class Options:
     """Captures of unknown markers, counted as calibrated, refused and wrong."""
 
     part: tyro.conf.Positional[Literal["campaign", "accuracy", "stream"]]
+    seeds: int = SEEDS  #: captures of each kind
 
 
 def main() -> None:
@@ -281,7 +332,7 @@ def main() -> None:
         return
     make_folder(DONE.parent)
     done = [json.loads(line) for line in DONE.read_text().splitlines()] if DONE.is_file() else []
-    for case in campaign() if options.part == "campaign" else accuracy():
+    for case in campaign(options.seeds) if options.part == "campaign" else accuracy(options.seeds):
         if any(case.items() <= row.items() for row in done):
             continue
         row = run(case)

@@ -25,7 +25,6 @@ import tyro
 
 import imgcal
 from imgcal.fleet import StoredResults, workers
-from imgcal.types import UnknownLights
 from scripts.benchmarks import wand_recording
 from scripts.benchmarks.wand_recording import FOLLOWED, RATE, SEEN, calibrated, recording, turned
 from scripts.output import ROOT, WORK, command, markdown, surroundings, write_json
@@ -49,7 +48,7 @@ WORST_FINAL, WORST_ON_THE_WAY = 1.0, 1.2
 
 def start(calibration: imgcal.Calibration, lights: bool = False) -> imgcal.RigKeeper:
     """Begin to keep a rig that has just been calibrated; `lights`: nothing is known of what it will see."""
-    return imgcal.RigKeeper(calibration.rig, UnknownLights.of() if lights else calibration.obj)
+    return imgcal.RigKeeper(calibration.rig, imgcal.CalibrationObject.unknown() if lights else calibration.obj)
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ POINTS = {
     "stick2": [[0, 0, 0], [500, 0, 0]],
     "stick3": [[0, 0, 0], [200, 0, 0], [500, 0, 0]],
     "body5": [[0, 0, 0], [120, 0, 10], [0, 170, 0], [60, 90, -80], [-70, 40, 50]],
+    "light": [[0, 0, 0]],
     "body6": [[0, 0, 0], [150, 20, 0], [30, 190, 20], [80, 60, -90], [-60, 80, 70], [-90, -50, 30]],
 }
 SCENES: dict[str, tuple[tuple[str, ...], int]] = {
@@ -43,6 +44,7 @@ SCENES: dict[str, tuple[tuple[str, ...], int]] = {
     "two equal objects": (("body5", "body5"), 8),
     "object and stick": (("body5", "stick3"), 10),
     "one object": (("body5",), 10),
+    "object and unknown markers": (("body5", "light", "light", "light"), 20),
 }
 COMMAND = "python -m scripts.benchmarks.targets"
 RESULT = ROOT / "docs" / "benchmarks" / "targets.json"
@@ -123,10 +125,12 @@ def outcome(scene: str, drift: float, seed: int) -> dict[str, Any]:
     names, moments = SCENES[scene]
     objects = tuple(map(named_object, names))
     factory, truth, blobs = capture(objects, moments, drift, seed)
+    known = [obj for obj in objects if obj.num_fiducials > 1]
+    given = known if len(known) == len(objects) else [*known, load_object("lights")]
     values: dict[str, Any] = {"scene": scene, "drift": drift, "seed": seed, "factory_mm": error_mm(factory, truth)[0]}
     started = time.process_time()
     try:
-        found = calibrate(replace(blobs, fiducial=np.full(len(blobs), -1)), factory, objects)
+        found = calibrate(replace(blobs, fiducial=np.full(len(blobs), -1)), factory, given)
     except RefusedError as refusal:
         return values | {"status": "refused", "reason": refusal.reason, "seconds": time.process_time() - started}
     seconds, (error, scale), predicted = (
@@ -135,6 +139,7 @@ def outcome(scene: str, drift: float, seed: int) -> dict[str, Any]:
         found.predicted_error,
     )
     labels = found.labelled.detections.fiducial
+    assert len(labels) == len(blobs)
     return values | {
         "status": "wrong" if error > WRONG * predicted.p95_mm else "calibrated",
         "error_mm": error,

@@ -7,6 +7,7 @@ from imgcal.association import PipelineOptions, Tracker, identify
 from imgcal.association.blobs import gather
 from imgcal.association.stick_poses import fit_sticks
 from imgcal.association.verification import Scene, rig_and_pose
+from imgcal.pipeline import calibrate
 from imgcal.types import CalibrationObject, RigPrior
 from tests.imgcal.association.stick_scenes import PAIR, TRIPLE, capture, one_snapshot
 
@@ -25,6 +26,19 @@ def test_labels_among_false_blobs_are_right(points):
         assert (given[named] == labels[named]).all() or (given[named] == turned).all()
         assert identity.status in ("unique", "ambiguous", "refused")
     assert found > 0.5 * (true >= 0).sum()
+
+
+def test_a_capture_of_a_stick_among_false_blobs_is_labelled_rightly():
+    rig, obj, blobs, true = capture(PAIR, 12)
+    result = calibrate(blobs, rig, obj)
+    labels = result.labelled_detections.fiducial
+    kept = (labels >= 0) & (result.labelled_detections.flags == blobs.flags)
+    assert (labels >= 0).sum() > 0.6 * (true >= 0).sum()
+    assert (true[kept] >= 0).all()
+    for snapshot in range(12):  # a stick may be held either way, but alike in all cameras
+        rows = kept & (blobs.snapshot == snapshot)
+        assert (labels[rows] == true[rows]).all() or (labels[rows] == 1 - true[rows]).all()
+    assert float(result.rms) < 0.12
 
 
 def test_false_blobs_alone_are_no_stick():

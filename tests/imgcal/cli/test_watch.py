@@ -390,6 +390,19 @@ def light_blobs(snapshots):
     return replace(truth, uv=truth.uv + noise, sigma=np.full(len(truth), 0.05)), points.numpy()
 
 
+@pytest.mark.parametrize("names", [("stick.csv",), ("stick.csv", "wand4")])
+def test_sticks_and_several_objects_keep_a_rig_calibrated(tmp_path, capsys, monkeypatch, names):
+    monkeypatch.chdir(tmp_path)
+    blobs, _ = light_blobs(30)
+    save_detections(replace(blobs, fiducial=np.full(len(blobs), -1)), "blobs.csv")
+    Path("stick.csv").write_text("x,y,z\n0,0,0\n500,0,0\n")
+    command = ["watch", "blobs.csv", "--rig", "room10", "--object", *names, "--out", "out"]
+    assert main(command) == 0
+    said = capsys.readouterr()
+    assert "30 snapshots" in said.out and "one by one" in said.err
+    assert Path("out/events.jsonl").read_text() == ""
+
+
 @pytest.mark.parametrize("suffix", [".c3d", ".trc"])
 def test_lights_become_points_in_a_file(tmp_path, capsys, suffix):
     """The third is hidden for three snapshots, the second for a second, the last one comes later."""

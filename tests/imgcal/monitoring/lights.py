@@ -3,12 +3,14 @@
 import torch
 
 from imgcal.geometry import RigidTransform
-from imgcal.types import Observations, UnknownLights
+from imgcal.types import CalibrationObject, Observations
 
 ROOM = 2  # numbers that no light has
 
 
-def lights_of(observations: Observations, places: torch.Tensor) -> tuple[UnknownLights, Observations, RigidTransform]:
+def lights_of(
+    observations: Observations, places: torch.Tensor
+) -> tuple[CalibrationObject, Observations, RigidTransform]:
     """Take fiducials for lights, with places (S, N, 3); a few numbers in front of them are free."""
     snapshots, cameras, count = observations.seen.shape
     wide = count + ROOM
@@ -18,4 +20,8 @@ def lights_of(observations: Observations, places: torch.Tensor) -> tuple[Unknown
     there = torch.full((snapshots, wide, 3), torch.nan, dtype=torch.float64)
     there[:, ROOM:] = places
     rotation = torch.eye(3, dtype=torch.float64).expand(snapshots, wide, 3, 3)
-    return UnknownLights.of(wide), Observations(uv, sigma, seen, observations.shake), RigidTransform(rotation, there)
+    return (
+        CalibrationObject.unknown(most=wide),
+        Observations(uv, sigma, seen, observations.shake),
+        RigidTransform(rotation, there),
+    )

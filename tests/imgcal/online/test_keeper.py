@@ -442,12 +442,13 @@ def test_lights_reveal_a_camera_that_was_bumped() -> None:
     assert 30 <= events[0].snapshot <= 45
 
 
-def test_one_light_is_followed_whatever_its_file_says_of_its_place() -> None:
+@pytest.mark.parametrize("points", [[[3.0, 0.0, 0.0]], [[0.0, 0.0, 0.0], [500.0, 0.0, 0.0]]])
+def test_markers_of_a_light_and_of_a_stick_are_followed_one_by_one(points: list[list[float]]) -> None:
     rig, snapshots = lights(8)
-    one = imgcal.CalibrationObject(torch.tensor([[3.0, 0.0, 0.0]]), torch.ones(1, 3), name="lamp")
-    with RigKeeper(rig, one) as keeper:
-        states = [keeper.update(blobs, number / 10) for number, blobs in enumerate(snapshots)]
-    assert keeper.obj.num_fiducials == 1
-    learnt = [state for state in states if state.refused is None]
-    assert len(learnt) > 4
-    assert all(int(state.detections.fiducial.max()) == 0 for state in learnt)
+    obj = imgcal.CalibrationObject(torch.tensor(points), torch.ones(len(points), 3), name="given")
+    given, lit = ([], [])
+    for target, states in ((obj, given), (imgcal.load_object("lights"), lit)):
+        with RigKeeper(rig, target) as keeper:
+            states += [keeper.update(blobs, number / 10) for number, blobs in enumerate(snapshots)]
+    assert all(state.refused is None for state in given)
+    assert torch.equal(given[-1].belief.factor, lit[-1].belief.factor)

@@ -11,7 +11,7 @@ from imgcal.errors import RefusedError
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.light_labels import label_lights
 from imgcal.synthesis import simulate_volume, true_detections
-from imgcal.types import Detections, UnknownLights
+from imgcal.types import CalibrationObject, Detections
 
 BUMPED = 4
 
@@ -27,7 +27,7 @@ def seen() -> tuple[imgcal.CameraRig, Detections]:
 
 
 def memory_of(rig: imgcal.CameraRig) -> KeeperMemory:
-    return KeeperMemory.from_factory(rig, UnknownLights.of(8), None, imgcal.PipelineOptions())
+    return KeeperMemory.from_factory(rig, CalibrationObject.unknown(most=8), None, imgcal.PipelineOptions())
 
 
 def shifted(blobs: Detections, by: tuple[float, float]) -> Detections:

@@ -19,8 +19,8 @@ from imgcal.monitoring import RigBelief
 from imgcal.online.keeper_file import FORMAT
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.labelling import Labelling
-from imgcal.online.state_document import NOT_SAVED, VARIANTS, StateReader, StateWriter, is_union, state_entries
-from imgcal.types import CalibrationObject, UnknownLights
+from imgcal.online.state_document import NOT_SAVED, StateReader, StateWriter, is_union, state_entries
+from imgcal.types import CalibrationObject
 from imgcal.types.board import Board
 
 KEYS = Path(__file__).parent / f"state_keys_{FORMAT.rpartition('/')[2]}.txt"
@@ -64,7 +64,9 @@ def made_state() -> State:
     belief, array = RigBelief.of_prior(imgcal.load_rig("T4"), obj), torch.arange(3.0).double()
     pose = RigidTransform(torch.eye(3).double() / 3, torch.tensor([0.1, math.pi, -0.0]).double())
     looks = {3: (Look(pose, "left", math.inf, 7), 0.1), 1: (Look(pose, "right", 2.0), None)}
-    state = State(Level(5), looks, frozenset({"b", "a"}), belief, belief, UnknownLights.of(4), [array, array])
+    state = State(
+        Level(5), looks, frozenset({"b", "a"}), belief, belief, CalibrationObject.unknown(most=4), [array, array]
+    )
     state.level._latest.extend((1.0, 2.0, math.nan, 4.0, 0.5, 0.25))
     state.level._sizes = np.array([1.0, 1e-300])
     return state
@@ -88,12 +90,12 @@ def test_values_come_back_exactly_and_what_was_shared_is_shared() -> None:
     assert found.level._latest.maxlen == 5 and math.isnan(found.level.sum)
     np.testing.assert_array_equal(found.level._sizes, state.level._sizes)
     assert found.now is found.before and torch.equal(found.now.factor, state.now.factor)
-    assert type(found.obj) is UnknownLights and found.obj.num_fiducials == 4
+    assert found.obj.unknown_markers and found.obj.num_fiducials == 4
     found.views[0][0] = 5.0
     assert found.views[1][0] == 5.0
 
 
-@pytest.mark.parametrize("kind", ["body", "tolerances", "board", "lights", "a light", "stick"])
+@pytest.mark.parametrize("kind", ["body", "tolerances", "board", "lights", "stick"])
 def test_every_kind_of_object_comes_back(kind: str) -> None:
     body = imgcal.load_object("asymmetric8")
     obj = {
@@ -103,7 +105,6 @@ def test_every_kind_of_object_comes_back(kind: str) -> None:
         ),
         "board": CalibrationObject.of_board(Board("charuco", 5, 7, 30.0, 22.0, "DICT_4X4_50", bend=(0.5, 0.0))),
         "lights": CalibrationObject.unknown(),
-        "a light": UnknownLights.of_light(CalibrationObject.unknown()),
         "stick": replace(
             body, points=body.points * torch.tensor([1.0, 0.0, 0.0]).double(), fiducial_names=("end",) * 8
         ),
@@ -204,9 +205,6 @@ def keys_of(kind: Any, where: str, known: dict[type, str], lines: list[str]) -> 
         return f"{name}[{', '.join(inner)}]"
     if kind not in known:
         known[kind] = where
-        for name, one in VARIANTS.get(kind, {}).items():
-            if one is not kind:
-                known[one] = f"{where}({name})"
         for key, _, of in state_entries(kind):
             place = len(lines)
             lines.insert(place, f"{where}.{key}: {keys_of(of, f'{where}.{key}', known, lines)}")

@@ -11,6 +11,7 @@ from imgcal import InputError, RefusedError
 from imgcal.association import associate
 from imgcal.pipeline.motion_check import _prepend_earlier
 from scripts.benchmarks.lights import LIGHTS, Scene, simulate, triangulation_error
+from tests.imgcal.association.stick_scenes import BODY, capture, several
 
 
 @pytest.fixture(scope="module")
@@ -118,3 +119,39 @@ def test_few_snapshots_are_refused(scene: Scene) -> None:
 def test_a_pattern_to_look_for_is_asked_for(scene: Scene) -> None:
     with pytest.raises(InputError, match="unknown markers"):
         imgcal.calibrate(scene.detections, scene.factory, LIGHTS, detector="matched")
+
+
+def test_an_object_of_one_marker_is_an_unknown_marker() -> None:
+    rig, obj, blobs, true = capture([(30.0, 0.0, 0.0)], 40)
+    found = imgcal.calibrate(blobs, rig, obj)
+    kept = found.labelled_detections.fiducial >= 0
+    assert (true[kept] >= 0).mean() > 0.99 and kept.sum() > 0.9 * (true >= 0).sum()
+    assert torch.equal(found.rig.focal_length, imgcal.calibrate(blobs, rig, LIGHTS).rig.focal_length)
+    moment, pose = next(iter(found.poses_by_object["object0"].items()))
+    row = [snapshot.name for snapshot in found.labelled.snapshots].index(moment)
+    there = pose.apply(torch.tensor([[30.0, 0.0, 0.0]]).double())
+    assert torch.allclose(there, found.rig_from_object.translation[found.labelled.used.index(row)])
+
+
+def test_labels_say_which_blobs_are_the_one_marker() -> None:
+    rig, obj, blobs, true = capture([(0.0, 0.0, 0.0)], 24)
+    found = imgcal.calibrate(replace(blobs, fiducial=true), rig, obj)
+    assert found.lights is None and found.identity == "coded"
+    assert (found.labelled_detections.fiducial == true).all()
+
+
+def test_unknown_markers_beside_a_known_object_take_part() -> None:
+    light = ((0.0, 0.0, 0.0),)
+    rig, body, blobs, true = several([BODY, light, light], 24, seed=2)
+    alone, found = (imgcal.calibrate(blobs, rig, obj) for obj in (body, [body, LIGHTS]))
+    rows = found.labelled
+    shown = rows.detections.fiducial == len(BODY)
+    assert (true[shown] >= 0).mean() > 0.99 and shown.sum() > 0.8 * (true >= len(BODY)).sum()
+    assert (np.diff(rows.moments) >= 0).all() and rows.moment_counts == (24, 24)
+    assert (rows.by_moment().snapshot == blobs.snapshot).all()
+    names = [rows.snapshots[row].name for row in rows.detections.snapshot[shown]]
+    assert names == [blobs.snapshot_names[s] for s in blobs.snapshot[shown]]
+    assert not (found.labelled_detections.fiducial[shown] >= 0).any()  # they have no name that lasts
+    assert found.predicted_error.median_mm < 1.1 * alone.predicted_error.median_mm
+    assert 0.9 < float(found.chi2_per_dof) < 1.1
+    assert {row.part for row in rows.snapshots if row.status != "refused"} == {0, 1}

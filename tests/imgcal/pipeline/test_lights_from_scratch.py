@@ -1,4 +1,4 @@
-"""Without a factory calibration, from one light: up to scale, or with a given distance."""
+"""Without a factory calibration, from one light: up to scale, or with a given distance; from a stick."""
 
 from dataclasses import replace
 
@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal import CameraRig, InputError, RefusedError
+from imgcal import CameraRig, InputError, RefusedError, load_rig
+from imgcal.association import Lights
 from imgcal.geometry import RigidTransform
 from imgcal.pipeline import calibrate_from_scratch
-from imgcal.types import RigPrior
+from imgcal.pipeline.lights_from_scratch import _scale_of_stick
+from imgcal.synthesis import simulate_volume, true_detections
+from imgcal.types import CalibrationObject, RigPrior
 from scripts.benchmarks.lights import LIGHTS, Scene, simulate
+from tests.imgcal.association.stick_scenes import PAIR, TRIPLE
 
 CAMERAS = [0, 2, 5, 7]
 
@@ -78,3 +82,37 @@ def test_crowds_are_refused(scene: Scene) -> None:
     )
     with pytest.raises(RefusedError, match="expected at least 24: carry one light alone"):
         calibrate_from_scratch(crowded, unplaced(scene.rig), LIGHTS)
+
+
+@pytest.mark.parametrize("points", [PAIR, TRIPLE])
+def test_a_stick_gives_the_scale(points: tuple[tuple[float, float, float], ...]) -> None:
+    rig, random = load_rig("room10").select(CAMERAS), np.random.default_rng(3)
+    stick = CalibrationObject(torch.tensor(points).double(), torch.ones(len(points), 3), name="stick")
+    seen = true_detections(simulate_volume(rig, stick, 120, torch.Generator().manual_seed(3), None))
+    uv = seen.uv + 0.1 * random.standard_normal(seen.uv.shape)
+    blobs = replace(seen, uv=uv, sigma=np.full(len(seen), 0.1), fiducial=np.full(len(seen), -1))
+    found = calibrate_from_scratch(blobs.select(random.permutation(len(blobs))), unplaced(rig), stick)
+    apart, true = (torch.cdist(one.positions, one.positions) for one in (found.rig, rig))
+    assert float((apart - true).abs().max()) < 5.0
+    assert torch.allclose(found.rig.positions[0], torch.zeros(3).double(), atol=1e-6)
+    assert found.scale.source == "object"
+
+
+def test_a_stick_of_another_length_is_refused() -> None:
+    places = np.random.default_rng(0).uniform(-1000, 1000, (40, 3))
+    moment, nothing = np.repeat(np.arange(20), 2), np.zeros(40)
+    lights = Lights(np.zeros((40, 3), dtype=int), moment, places, nothing, nothing)
+    stick = CalibrationObject(torch.tensor(PAIR).double(), torch.ones(2, 3), name="stick")
+    with pytest.raises(RefusedError, match="too few show them at the distances of stick"):
+        _scale_of_stick(lights, stick)
+
+
+def test_one_light_with_labels_leaves_out_what_has_none(scene: Scene) -> None:
+    blobs = scene.detections
+    light = CalibrationObject(torch.zeros(1, 3).double(), torch.ones(1, 3))
+    false = replace(blobs, uv=(blobs.uv + 300) % 900, fiducial=np.full(len(blobs), -1))
+    columns = ("uv", "sigma", "camera", "snapshot", "radius", "flags", "fiducial")
+    labelled = replace(blobs, fiducial=np.zeros(len(blobs), dtype=int))
+    both = replace(blobs, **{n: np.concatenate((getattr(labelled, n), getattr(false, n))) for n in columns})
+    found, alone = (calibrate_from_scratch(one, unplaced(scene.rig), light) for one in (both, blobs))
+    assert torch.equal(found.rig.focal_length, alone.rig.focal_length)

@@ -13,6 +13,7 @@ import imgcal
 from imgcal.errors import InputError
 from imgcal.io import load_object
 from imgcal.pipeline import calibrate_from_scratch
+from imgcal.types import MOST_LIGHTS, check_object
 from imgcal.types.calibration_object import CalibrationObject, Symmetry
 
 
@@ -122,13 +123,37 @@ def test_a_stick_has_two_ends_and_a_light_has_no_symmetry() -> None:
     np.testing.assert_allclose(moved, pair.points.double().numpy()[::-1], atol=1e-9)
 
 
-def test_sticks_are_refused_where_they_are_not_supported_yet():
+def test_what_is_no_single_body_is_refused_where_one_is_needed():
     points = torch.tensor([[0.0, 0, 0], [500, 0, 0]], dtype=torch.float64)
-    obj = CalibrationObject(points, torch.ones(2, 3).double(), name="it")
-    with pytest.raises(InputError, match=r"object it: found 2 fiducials on one line.* for a running rig"):
-        imgcal.RigKeeper(imgcal.load_rig("T4"), obj)
-    with pytest.raises(InputError, match="without a factory calibration"):
-        calibrate_from_scratch({}, imgcal.load_rig("T4"), obj)
+    stick = CalibrationObject(points, torch.ones(2, 3).double(), name="it")
+    with pytest.raises(InputError, match=r"object it: found 2 fiducials on one line.* to harvest crops"):
+        stick.require_rigid("to harvest crops")
+    both = CalibrationObject.of_several([stick, load_object("wand4")])
+    with pytest.raises(InputError, match="found 2, expected a single one to calibrate without a factory calibration"):
+        calibrate_from_scratch({}, imgcal.load_rig("T4"), both)
+
+
+def test_all_but_a_single_body_is_taken_for_unknown_markers():
+    body, lights = load_object("wand4"), load_object("lights")
+    points = torch.tensor([[0.0, 0, 0], [500, 0, 0]], dtype=torch.float64)
+    stick = CalibrationObject(points, torch.ones(2, 3).double(), radius=torch.full((2,), 7.0), name="it")
+    light = CalibrationObject(points[:1], torch.ones(1, 3).double(), name="lamp")
+    assert body.as_unknown() is body
+    for obj in (stick, light, lights, CalibrationObject.of_several([body, stick])):
+        found = obj.as_unknown()
+        check_object(found)
+        assert found.unknown_markers and found.num_fiducials == MOST_LIGHTS and found.exact and found.pose_rank == 3
+        assert found.name == obj.name and found.as_unknown() is found
+    assert stick.as_unknown().radius.tolist() == [7.0] * MOST_LIGHTS
+
+
+def test_unknown_markers_come_last_among_several() -> None:
+    body, lights = load_object("wand4"), load_object("lights")
+    both = CalibrationObject.of_several([lights, body])
+    assert [part.name for part in both.parts] == ["wand4", "lights"]
+    assert both.has_lights and not both.unknown_markers and not CalibrationObject.of_several([body, body]).has_lights
+    with pytest.raises(InputError, match="single or unknown markers twice"):
+        CalibrationObject.of_several([body, lights, lights])
 
 
 def test_several_objects_keep_their_shapes_and_get_different_names() -> None:
@@ -146,7 +171,7 @@ def test_several_objects_keep_their_shapes_and_get_different_names() -> None:
     assert CalibrationObject.of_several([wand]) is wand
 
 
-@pytest.mark.parametrize("other", ["charuco", "lights", "scale"])
+@pytest.mark.parametrize("other", ["charuco", "scale"])
 def test_what_cannot_be_among_several_is_named(other: str) -> None:
     wand = load_object("wand4")
     wrong = replace(wand, scale_tolerance=0.01) if other == "scale" else load_object(other)
