@@ -5,6 +5,11 @@ belongs to a place in the image. Snapshots that repeat an error bring no new evi
 snapshots, n of them say as much as n / tau independent ones: each is given tau times its variance. A shift of a whole
 image that lasts may also be mistaken for a small move. It is expected to come back, so a change of a camera must move
 the image by clearly more than that.
+
+Such errors also have heavy tails: an image that is off by far more than usual for half a second, at the edge of a lens
+or behind somebody's arm. An image that was off in the snapshot before will be off again, so its labels count by the
+precision that Student's t distribution, of which the shifts are taken to be drawn, gives them (the scale mixture of
+Lange, Little and Taylor, "Robust statistical modeling using the t distribution", JASA 1989).
 """
 
 from __future__ import annotations
@@ -33,6 +38,8 @@ USUAL, USUAL_SECONDS, USUAL_SNAPSHOTS = 0.4, 0.1, 256
 factor e, and the snapshots up to which no less is assumed of a rig that has been calibrated: few cannot tell."""
 FASTEST, SLOWEST = 1 / 60, 1.0
 """Seconds between snapshots, before anything is known of their rate; longer ones are pauses."""
+PAUSE = 2.5
+"""Intervals between snapshots after which the last one does not say any more how far an image is off."""
 SMOOTHING = 0.1
 """Weight of the latest interval between snapshots in their average."""
 EPISODE, EPISODE_SECONDS = 2.0, 0.4
@@ -50,6 +57,12 @@ SETTLING_SNAPSHOTS = 64
 """After a change of a camera, while it is learnt anew: what it leaves then follows from how little is known of it."""
 LEAST_POINTS = 2
 """Labels of a camera from which the shift of its image counts."""
+FREEDOM, MEDIAN = 4.0, 1.29
+"""Degrees of freedom of the shifts' t distribution, and the median length of such a shift in units of its scale."""
+FREEDOM_OF_SHIFT = 2.0
+"""Coordinates of a shift: its expected square, in units of its scale, where nothing else is known."""
+LEAST_WEIGHT = 1 / 16
+"""Of a camera whose image is off: one that has moved must still be noticed."""
 
 
 @dataclass
@@ -69,16 +82,22 @@ class NoiseCorrelation:
     usual: float = 1.0  # least correlation time as long as too few have been taken
     interval: float = 0.0  # s between snapshots; 0 = not known
     settled_at: dict[int, int] = field(default_factory=dict)  # number of snapshots from which changed cameras count
+    scale: Tensor = field(init=False)  # (C,) px, of the t distribution of the shifts
+    off: Tensor = field(init=False)  # (C,) squared shift in the last snapshot, in units of the scale; nan = not known
 
     def __post_init__(self) -> None:
         """Begin with errors that are independent from snapshot to snapshot."""
         self.time = torch.ones(self.cameras, dtype=torch.float64)
         self.lasting = torch.zeros(self.cameras, dtype=torch.float64)
+        self.scale = torch.full_like(self.time, LEAST_LASTING)
+        self.off = torch.full_like(self.time, math.nan)
 
     def pass_time(self, seconds: float) -> None:
         """Note how long ago the last snapshot was."""
         if 0 < seconds <= SLOWEST:
             self.interval += (SMOOTHING if self.interval else 1.0) * (seconds - self.interval)
+        if seconds > PAUSE * (self.interval or FASTEST):
+            self.off = torch.full_like(self.off, math.nan)
 
     def expect_usual(self) -> None:
         """Assume the usual correlation of snapshots at this rate, until enough have been taken."""
@@ -121,9 +140,18 @@ class NoiseCorrelation:
         """Give observations (S, C, N) the variance with which their number is an effective sample size."""
         if not bool((self.time > 1).any()):
             return observations
-        root = self.time.sqrt()
+        root = (self.time / self._weight).sqrt()
+        self.off = torch.full_like(self.off, math.nan)
         shake = None if observations.shake is None else observations.shake * root
         return replace(observations, sigma=observations.sigma * root[:, None], shake=shake)
+
+    @property
+    def _weight(self) -> Tensor:
+        """Precision (C,) of the next snapshot over the usual one, given how far each image was off in the last one."""
+        lasts = ((self.time - 1) / (self.time + 1)).square()  # the part of a squared shift that is expected to remain
+        expected = torch.where(self.off.isnan(), FREEDOM_OF_SHIFT, lasts * self.off + (1 - lasts) * FREEDOM_OF_SHIFT)
+        weight = (FREEDOM + FREEDOM_OF_SHIFT) / (FREEDOM + expected)
+        return torch.where(self.time > 1, weight.clamp_min(LEAST_WEIGHT), 1.0)
 
     def settle(self, cameras: Collection[int]) -> None:
         """Leave out the next snapshots of cameras that have changed."""
@@ -136,11 +164,13 @@ class NoiseCorrelation:
             observations: (1, C, N).
             residual: (1, C, N, 2) pixels.
         """
-        shift = shared_shifts(observations, residual)[0][0]
+        (shift,), (variance,) = shared_shifts(observations, residual)
         shift[observations.seen[0].sum(1).numpy() < LEAST_POINTS] = np.nan
         shift[[camera for camera, settled in self.settled_at.items() if self.taken < settled]] = np.nan
         self.shifts.append(shift)
         self.taken += 1
+        scale = np.maximum(self.scale.numpy(), np.sqrt(variance))
+        self.off = torch.from_numpy(np.square(shift / scale[:, None]).sum(1))
         if self.taken in FIRST or self.taken % EVERY == 0:
             self._measure()
 
@@ -159,6 +189,8 @@ class NoiseCorrelation:
             [np.nanquantile(column, TAIL) if some.any() else 0.0 for column, some in zip(length.T, seen.T, strict=True)]
         )
         self.lasting = torch.from_numpy(np.where(time > 1, tail / TAIL_SIGMAS, 0.0))
+        usual = np.array([np.nanmedian(column) if some.any() else 0.0 for column, some in zip(length.T, seen.T, strict=True)])
+        self.scale = torch.from_numpy(np.maximum(usual / MEDIAN, LEAST_LASTING))
 
 
 def usual_time(seconds: float) -> float:
