@@ -189,7 +189,9 @@ class NoiseCorrelation:
             [np.nanquantile(column, TAIL) if some.any() else 0.0 for column, some in zip(length.T, seen.T, strict=True)]
         )
         self.lasting = torch.from_numpy(np.where(time > 1, tail / TAIL_SIGMAS, 0.0))
-        usual = np.array([np.nanmedian(column) if some.any() else 0.0 for column, some in zip(length.T, seen.T, strict=True)])
+        usual = np.array(
+            [np.nanmedian(column) if some.any() else 0.0 for column, some in zip(length.T, seen.T, strict=True)]
+        )
         self.scale = torch.from_numpy(np.maximum(usual / MEDIAN, LEAST_LASTING))
 
 
