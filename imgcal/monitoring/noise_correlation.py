@@ -137,7 +137,10 @@ class NoiseCorrelation:
         return torch.where(self.time > 1, LEAST_SHIFT * self.model_error, 0.0).tolist()
 
     def weigh(self, observations: Observations) -> Observations:
-        """Give observations (S, C, N) the variance with which their number is an effective sample size."""
+        """Give observations (S, C, N) the variance with which their number is an effective sample size.
+
+        Images that were off in the last snapshot get more; each last snapshot counts once.
+        """
         if not bool((self.time > 1).any()):
             return observations
         root = (self.time / self._weight).sqrt()
