@@ -31,7 +31,7 @@ from imgcal.types import Observations
 
 MEMORY = 1024
 """Latest snapshots from which correlation times are measured ..."""
-FIRST, EVERY = (48, 64, 96), 128
+FIRST_MEASUREMENTS, MEASUREMENT_INTERVAL = (48, 64, 96), 128
 """... after the first of them, and again after as many more."""
 USUAL, USUAL_SECONDS, USUAL_SNAPSHOTS = 0.4, 0.1, 256
 """Autocorrelation of the errors of infrared cameras at short intervals, the time (s) after which it has fallen by a
@@ -102,7 +102,7 @@ class NoiseCorrelation:
     def expect_usual(self) -> None:
         """Assume the usual correlation of snapshots at this rate, until enough have been taken."""
         self.usual = usual_time(self.interval) if self.taken < USUAL_SNAPSHOTS else 1.0
-        if self.taken < FIRST[0]:
+        if self.taken < FIRST_MEASUREMENTS[0]:
             self.time = torch.full_like(self.time, self.usual)
 
     @property
@@ -174,7 +174,7 @@ class NoiseCorrelation:
         self.taken += 1
         scale = np.maximum(self.scale.numpy(), np.sqrt(variance))
         self.off = torch.from_numpy(np.square(shift / scale[:, None]).sum(1))
-        if self.taken in FIRST or self.taken % EVERY == 0:
+        if self.taken in FIRST_MEASUREMENTS or self.taken % MEASUREMENT_INTERVAL == 0:
             self._measure()
 
     def _measure(self) -> None:

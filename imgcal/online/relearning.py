@@ -14,7 +14,7 @@ from imgcal.online.events import UNITS, ChangeKind, Event
 
 RELEARNT = 1.1
 """Times the standard deviations that a camera's values had before it moved, from which it is known again."""
-EVERY = 4
+RELEARNING_SNAPSHOTS = 4
 """Snapshots between two looks at that."""
 EXTRINSICS_AND_PINHOLE = 10
 """Values of a camera that are compared: the distortion changes with none of the changes that are told."""
@@ -74,7 +74,7 @@ class Relearning:
             number: of the update.
         """
         waiting = [camera for camera in self.events if camera not in still_open]
-        if not waiting or number % EVERY:
+        if not waiting or number % RELEARNING_SNAPSHOTS:
             return []
         std, told = relative_std(belief), []
         for camera in waiting:

@@ -18,7 +18,7 @@ import math
 import sys
 import typing
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
@@ -31,8 +31,9 @@ from imgcal.monitoring import RigBelief
 from imgcal.online.state_checks import CHECKS
 from imgcal.types import CalibrationObject, UnknownLights
 
-get_origin, get_args = cache(typing.get_origin), cache(typing.get_args)
-"""Of a type; each is asked of thousands of values."""
+get_origin: Callable[[Any], Any] = cache(typing.get_origin)
+get_args: Callable[[Any], tuple[Any, ...]] = cache(typing.get_args)
+"""Of a type; asked of thousands of values."""
 SIMPLE = frozenset((NoneType, bool, int, str))
 """Types whose values stand in a document as they are."""
 NOT_SAVED: Mapping[str, bool] = {"saved": False}

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.monitoring.noise_correlation import FASTEST, FIRST, LEAST_WEIGHT, MEMORY, NoiseCorrelation, usual_time
+from imgcal.monitoring.noise_correlation import (
+    FASTEST,
+    FIRST_MEASUREMENTS,
+    LEAST_WEIGHT,
+    MEMORY,
+    NoiseCorrelation,
+    usual_time,
+)
 from imgcal.types import Observations
 
 SIGMA = 0.1
@@ -82,7 +89,7 @@ def test_a_calibrated_rig_expects_what_is_usual_until_it_knows_better() -> None:
     for number in range(512):
         noise.expect_usual()
         noise.add(observations(), torch.randn(1, 2, 5, 2, dtype=torch.float64))
-        if FIRST[0] <= number < 200:
+        if FIRST_MEASUREMENTS[0] <= number < 200:
             assert float(noise.time.min()) >= usual_time(FASTEST)  # too few to tell
     assert float(noise.time.max()) < 3
 
