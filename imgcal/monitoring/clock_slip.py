@@ -41,8 +41,9 @@ INEXACT = 0.03
 """Share of the way that a camera is behind by which blobs may be off that are put where they were in time."""
 TOO_LONG = f"the slip would be longer than {MOST_SLIP_SECONDS:g} s"
 VAGUE_SLIP_SECONDS = 5e-4
-"""Seconds, one standard deviation, beyond `INEXACT`, above which a slip is not believed of a camera of which hardly
-anything is known."""
+"""Seconds, one standard deviation, above which a slip is not believed of a camera that is hardly known ..."""
+VAGUE_SLIP = 0.07
+"""... and the same as a share of the slip, where that is more."""
 
 
 class ClockSlipExplanation(Explanation):
@@ -59,7 +60,7 @@ class ClockSlipExplanation(Explanation):
         """Wait where the slip of a camera that is hardly known is itself hardly known."""
         uncertain = case.uncertain or len(found.snapshots) > case.count
         slips = found.finding.slips if uncertain else ()
-        vague = any(slip.sigma > VAGUE_SLIP_SECONDS + INEXACT * abs(slip.seconds) for slip in slips)
+        vague = any(slip.sigma > max(VAGUE_SLIP_SECONDS, VAGUE_SLIP * abs(slip.seconds)) for slip in slips)
         return "the slip is hardly known" if vague else None
 
 
