@@ -40,10 +40,9 @@ VELOCITY_SECONDS = 1e-3
 INEXACT = 0.03
 """Share of the way that a camera is behind by which blobs may be off that are put where they were in time."""
 TOO_LONG = f"the slip would be longer than {MOST_SLIP_SECONDS:g} s"
-VAGUE_SLIP_SECONDS = 5e-4
-"""Seconds, one standard deviation, above which a slip is not believed of a camera that is hardly known ..."""
-VAGUE_SLIP = 0.07
-"""... and the same as a share of the slip, where that is more."""
+VAGUE_SLIP_SECONDS, VAGUE_SLIP = (5e-4, 8.5e-4), 0.07
+"""Standard deviation above which a slip is not believed of a camera that is hardly known: this share of it, but within
+these bounds (s)."""
 
 
 class ClockSlipExplanation(Explanation):
@@ -60,7 +59,8 @@ class ClockSlipExplanation(Explanation):
         """Wait where the slip of a camera that is hardly known is itself hardly known."""
         uncertain = case.uncertain or len(found.snapshots) > case.count
         slips = found.finding.slips if uncertain else ()
-        vague = any(slip.sigma > max(VAGUE_SLIP_SECONDS, VAGUE_SLIP * abs(slip.seconds)) for slip in slips)
+        least, most = VAGUE_SLIP_SECONDS
+        vague = any(slip.sigma > min(max(VAGUE_SLIP * abs(slip.seconds), least), most) for slip in slips)
         return "the slip is hardly known" if vague else None
 
 
