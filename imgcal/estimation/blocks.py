@@ -42,7 +42,7 @@ LEAST_BLOCKS = 6
 """Smallest number of blocks for a reliable scatter."""
 MANY_BLOCKS = 32
 """Blocks at first (up to twice as many): each costs a factorization; they are then joined two by two."""
-SURE = 4.0
+SCATTER_SIGMAS = 4.0
 """Standard deviations by which the scatter must exceed its value for independent noise."""
 OWN = 0.5
 """Weight of a camera's own scatter; the remainder is the weight of the average over all cameras."""
@@ -91,7 +91,7 @@ def block_scatter(problem: Problem, solution: Solution, loss: NamedLoss) -> Bloc
         if before is not None:
             whole = max(2 * whole - before.average, whole)
             by_camera = torch.maximum(2 * by_camera - before.by_camera, by_camera)
-        sure = sure or scatter.average > 1 + SURE * scatter.deviation
+        sure = sure or scatter.average > 1 + SCATTER_SIGMAS * scatter.deviation
         if sure:
             largest = torch.maximum(largest, by_camera)
             most, length = max((most, length), (whole, size * joined))

@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-SURE = 2.0
-"""An autocorrelation is significant above `SURE` (log10 n / n)^1/2 for n pairs: three sigma of white noise."""
+LAG_THRESHOLD = 2.0
+"""An autocorrelation is significant above `LAG_THRESHOLD` (log10 n / n)^1/2 for n pairs: three sigma of white noise."""
 QUIET = 5
 """Consecutive lags without significant autocorrelation that end the sum."""
 MOST_LAGS = 0.25
@@ -117,7 +117,7 @@ def _centre(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _last_lag(rho: NDArray[np.float64], pairs: NDArray[np.float64]) -> int:
     """Last significant lag before `QUIET` insignificant ones; 0 = none. Arrays (L + 1,) are from `autocorrelation`."""
-    noise = SURE * np.sqrt(np.log10(np.maximum(pairs, 10)) / np.maximum(pairs, 1))
+    noise = LAG_THRESHOLD * np.sqrt(np.log10(np.maximum(pairs, 10)) / np.maximum(pairs, 1))
     counts = (pairs >= LEAST_PAIRS) & (np.nan_to_num(rho) > noise)
     last = 0
     for lag in range(1, len(rho)):

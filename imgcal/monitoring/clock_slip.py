@@ -39,10 +39,10 @@ VELOCITY_SECONDS = 1e-3
 """Time step for the velocity of an image."""
 INEXACT = 0.03
 """Error of a blob that is moved to its place in time, as a share of the distance moved."""
-
-
-VAGUE_SLIP_SECONDS = 5e-4
-"""Largest standard deviation (s) of a slip that is believed of a camera whose pose is hardly known."""
+TOO_LONG = f"the slip would be longer than {MOST_SLIP_SECONDS:g} s"
+VAGUE_SLIP_SECONDS, VAGUE_SLIP = (5e-4, 8.5e-4), 0.07
+"""Largest standard deviation of a slip that is believed of a camera whose pose is hardly known: this share of the slip,
+within these bounds (s)."""
 
 
 class ClockSlipExplanation(Explanation):
@@ -58,7 +58,9 @@ class ClockSlipExplanation(Explanation):
     def premature(self, case: Case, found: Explained) -> str | None:
         """Wait while neither the camera's pose nor its slip is well known."""
         uncertain = case.uncertain or len(found.snapshots) > case.count
-        vague = uncertain and any(slip.sigma > VAGUE_SLIP_SECONDS for slip in found.finding.slips)
+        slips = found.finding.slips if uncertain else ()
+        least, most = VAGUE_SLIP_SECONDS
+        vague = any(slip.sigma > min(max(VAGUE_SLIP * abs(slip.seconds), least), most) for slip in slips)
         return "the slip is hardly known" if vague else None
 
 
@@ -87,14 +89,14 @@ def _slip(case: Case, start: Start, cameras: Sequence[int]) -> Variant:
     sigma = dict.fromkeys(cameras, math.nan)
     for step in SEARCH_STEPS[0 if uncertain else 1 :]:
         for camera in cameras:
-            three = [cases.evidence({**late, camera: late[camera] + way}) for way in (-step, 0.0, step)]
+            three = cases.climb(late, camera, step)
             curvature = (2 * three[1] - three[0] - three[2]) / step**2
             if not curvature > 0:
                 raise RefusedError("no slip is more probable than others")
             late[camera] += (three[2] - three[0]) / (2 * step) / curvature
             sigma[camera] = curvature**-0.5
             if not abs(late[camera]) < MOST_SLIP_SECONDS:
-                raise RefusedError(f"the slip would be longer than {MOST_SLIP_SECONDS:g} s")
+                raise RefusedError(TOO_LONG)
     corrected, log_prior = cases.correct(late)
     log_prior += sum(math.log(spread / SLIP_SECONDS) for spread in sigma.values())  # over all slips, not only the best
     spreads = {camera: math.hypot(sigma[camera], INEXACT * late[camera]) for camera in cameras}
@@ -149,6 +151,25 @@ class _Late:
         log_prior -= sum(0.5 * (seconds / SLIP_SECONDS) ** 2 for seconds in late.values())
         given, poses = Observations(uv, sigma, seen, self.given.shake), self.there.rig_from_object
         return [(given.of_snapshots([s]), poses[s : s + 1]) for s in range(len(uv))], log_prior
+
+    def climb(self, late: dict[int, float], camera: int, step: float) -> list[float]:
+        """Go on with the slip of one camera by steps (s) while that makes the snapshots more probable.
+
+        Returns:
+            Evidence a step before, at, and a step after the slip, which `late` then holds.
+
+        Raises:
+            RefusedError: the slip becomes too long, or see `absorb`.
+        """
+        before, here, after = (self.evidence({**late, camera: late[camera] + way}) for way in (-step, 0.0, step))
+        while max(before, after) > here:
+            way = step if after > before else -step
+            late[camera] += way
+            if not abs(late[camera]) < MOST_SLIP_SECONDS:
+                raise RefusedError(TOO_LONG)
+            further = self.evidence({**late, camera: late[camera] + way})
+            before, here, after = (here, after, further) if way > 0 else (further, before, here)
+        return [before, here, after]
 
     def evidence(self, late: Mapping[int, float]) -> float:
         """Log probability of the snapshots where cameras expose later.

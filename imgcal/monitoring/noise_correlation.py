@@ -5,6 +5,11 @@ belongs to a place in the image. Snapshots that repeat an error add no new evide
 snapshots, n of them are worth n / tau independent ones, so their variance is multiplied by tau. A persistent shift of a
 whole image may also be mistaken for a small move. Such a shift is expected to go away, so a change of a camera must
 move the image by clearly more than that.
+
+Such errors also have heavy tails. An image may be shifted by far more than usual for half a second, at the edge of a
+lens or behind somebody's arm. An image that was off in the previous snapshot will be off in the next one. Its labels
+are therefore weighted by the precision that Student's t distribution of the shifts implies (the scale mixture of
+Lange, Little and Taylor, "Robust statistical modeling using the t distribution", JASA 1989).
 """
 
 from __future__ import annotations
@@ -26,13 +31,15 @@ from imgcal.types import Observations
 
 MEMORY = 1024
 """Number of latest snapshots used to measure correlation times ..."""
-FIRST, EVERY = (48, 64, 96), 128
+FIRST_MEASUREMENTS, MEASUREMENT_INTERVAL = (48, 64, 96), 128
 """... counts of snapshots at which they are first measured, and the interval after that."""
 USUAL, USUAL_SECONDS, USUAL_SNAPSHOTS = 0.4, 0.1, 256
 """Autocorrelation of the errors of infrared cameras at short intervals, its decay time (s, to 1/e), and the number of
 snapshots until which a calibrated rig is assumed to have no less: fewer snapshots cannot tell."""
 FASTEST, SLOWEST = 1 / 60, 1.0
 """Seconds between snapshots while their rate is unknown; the longest interval that is not a pause."""
+PAUSE = 2.5
+"""Number of intervals between snapshots after which the previous shift of an image says nothing about the next one."""
 SMOOTHING = 0.1
 """Weight of the latest interval in the running mean of intervals."""
 EPISODE, EPISODE_SECONDS = 2.0, 0.4
@@ -50,6 +57,12 @@ SETTLING_SNAPSHOTS = 64
 """Snapshots to leave out after a camera has changed: their errors come from how little is known about it."""
 LEAST_POINTS = 2
 """Minimum number of labels of a camera for the shift of its image to count."""
+FREEDOM, MEDIAN = 4.0, 1.29
+"""Degrees of freedom of the shifts' t distribution, and the median length of such a shift in units of its scale."""
+FREEDOM_OF_SHIFT = 2.0
+"""Coordinates of a shift: the expected squared shift, in units of its scale, without further knowledge."""
+LEAST_WEIGHT = 1 / 16
+"""Minimum weight of a camera whose image is off: a camera that has moved must still be noticed."""
 
 
 @dataclass
@@ -69,21 +82,27 @@ class NoiseCorrelation:
     usual: float = 1.0  # least correlation time until enough snapshots are taken
     interval: float = 0.0  # s between snapshots; 0 = unknown
     settled_at: dict[int, int] = field(default_factory=dict)  # snapshot number from which a changed camera counts again
+    scale: Tensor = field(init=False)  # (C,) px, scale of the shifts' t distribution
+    off: Tensor = field(init=False)  # (C,) squared shift in the last snapshot, in units of the scale; nan = unknown
 
     def __post_init__(self) -> None:
         """Start with errors that are independent from snapshot to snapshot."""
         self.time = torch.ones(self.cameras, dtype=torch.float64)
         self.lasting = torch.zeros(self.cameras, dtype=torch.float64)
+        self.scale = torch.full_like(self.time, LEAST_LASTING)
+        self.off = torch.full_like(self.time, math.nan)
 
     def pass_time(self, seconds: float) -> None:
         """Note the time since the previous snapshot."""
         if 0 < seconds <= SLOWEST:
             self.interval += (SMOOTHING if self.interval else 1.0) * (seconds - self.interval)
+        if seconds > PAUSE * (self.interval or FASTEST):
+            self.off = torch.full_like(self.off, math.nan)
 
     def expect_usual(self) -> None:
         """Assume the usual correlation at this rate until enough snapshots have been taken."""
         self.usual = usual_time(self.interval) if self.taken < USUAL_SNAPSHOTS else 1.0
-        if self.taken < FIRST[0]:
+        if self.taken < FIRST_MEASUREMENTS[0]:
             self.time = torch.full_like(self.time, self.usual)
 
     @property
@@ -118,12 +137,24 @@ class NoiseCorrelation:
         return torch.where(self.time > 1, LEAST_SHIFT * self.model_error, 0.0).tolist()
 
     def weigh(self, observations: Observations) -> Observations:
-        """Scale the variance of observations (S, C, N) so that they count by their effective sample size."""
+        """Scale the variance of observations (S, C, N) so that they count by their effective sample size.
+
+        Images that were off in the last snapshot get a larger variance; each snapshot is used once for that.
+        """
         if not bool((self.time > 1).any()):
             return observations
-        root = self.time.sqrt()
+        root = (self.time / self._weight).sqrt()
+        self.off = torch.full_like(self.off, math.nan)
         shake = None if observations.shake is None else observations.shake * root
         return replace(observations, sigma=observations.sigma * root[:, None], shake=shake)
+
+    @property
+    def _weight(self) -> Tensor:
+        """Precision (C,) of the next snapshot over the usual one, given how far each image was off in the last one."""
+        lasts = ((self.time - 1) / (self.time + 1)).square()  # the part of a squared shift that is expected to remain
+        expected = torch.where(self.off.isnan(), FREEDOM_OF_SHIFT, lasts * self.off + (1 - lasts) * FREEDOM_OF_SHIFT)
+        weight = (FREEDOM + FREEDOM_OF_SHIFT) / (FREEDOM + expected)
+        return torch.where(self.time > 1, weight.clamp_min(LEAST_WEIGHT), 1.0)
 
     def settle(self, cameras: Collection[int]) -> None:
         """Ignore the next snapshots of cameras that have changed."""
@@ -136,12 +167,14 @@ class NoiseCorrelation:
             observations: (1, C, N).
             residual: (1, C, N, 2) pixels.
         """
-        shift = shared_shifts(observations, residual)[0][0]
+        (shift,), (variance,) = shared_shifts(observations, residual)
         shift[observations.seen[0].sum(1).numpy() < LEAST_POINTS] = np.nan
         shift[[camera for camera, settled in self.settled_at.items() if self.taken < settled]] = np.nan
         self.shifts.append(shift)
         self.taken += 1
-        if self.taken in FIRST or self.taken % EVERY == 0:
+        scale = np.maximum(self.scale.numpy(), np.sqrt(variance))
+        self.off = torch.from_numpy(np.square(shift / scale[:, None]).sum(1))
+        if self.taken in FIRST_MEASUREMENTS or self.taken % MEASUREMENT_INTERVAL == 0:
             self._measure()
 
     def _measure(self) -> None:
@@ -159,6 +192,10 @@ class NoiseCorrelation:
             [np.nanquantile(column, TAIL) if some.any() else 0.0 for column, some in zip(length.T, seen.T, strict=True)]
         )
         self.lasting = torch.from_numpy(np.where(time > 1, tail / TAIL_SIGMAS, 0.0))
+        usual = np.array(
+            [np.nanmedian(column) if some.any() else 0.0 for column, some in zip(length.T, seen.T, strict=True)]
+        )
+        self.scale = torch.from_numpy(np.maximum(usual / MEDIAN, LEAST_LASTING))
 
 
 def usual_time(seconds: float) -> float:

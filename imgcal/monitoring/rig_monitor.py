@@ -244,6 +244,7 @@ class RigMonitor:
         """
         quarantine = self.quarantine
         case = quarantine.case(self._recent, self.filter.options, self.noise.correlated)
+        case = replace(case, beginning=self._beginning)
         quarantine.unsynchronized = False
         verdict = self._diagnosis.decide(case, patient=self._pending is None)
         quarantine.unsynchronized = bool(verdict.best.finding.unsynchronized)
@@ -259,6 +260,8 @@ class RigMonitor:
             decided = self._decide_kinds(last=True)
             anew = self._learn_moved(case, dict.fromkeys(case.cameras), JUMPS[-1], sum(case.pauses[-case.count :]))
             return replace(anew, changes=(*found.changes, *decided, *anew.changes))
+        if verdict.best.finding.slips and len(verdict.best.snapshots) > case.count:  # late from the beginning
+            return replace(self._adopt(case, verdict), changes=found.changes)
         return replace(found, slips=self._clock_slips(verdict))
 
     def _diagnose_alarm(self, age: int, changes: list[Change]) -> MonitorUpdate:
@@ -322,13 +325,17 @@ class RigMonitor:
     def _case(self, before: RigBelief, age: int, cameras: tuple[int, ...], excluded: Mapping[str, str]) -> Case:
         """Make a case of cameras that seem to have moved before the latest `age` snapshots."""
         kept = len(self._recent)
-        everything = self.filter.count - self.known_since == kept
-        beginning = self._anywhere(self._moved_early) if everything else None
         snapshots, pauses = self._recent.snapshots(kept), self._recent.pauses(kept)
         return Case(
             before, snapshots, pauses, age, self.filter.options, cameras,
-            lasting=self.noise.correlated, beginning=beginning, excluded=excluded,
+            lasting=self.noise.correlated, beginning=self._beginning, excluded=excluded,
         )  # fmt: skip
+
+    @property
+    def _beginning(self) -> RigBelief | None:
+        """What the factory says, where the latest snapshots are all that is known beside it."""
+        everything = self.filter.count - self.known_since == len(self._recent)
+        return self._anywhere(self._moved_early) if everything else None
 
     def _adopt(self, case: Case, verdict: Verdict, new: bool = False) -> MonitorUpdate:
         """Learn snapshots again according to the best explanation.

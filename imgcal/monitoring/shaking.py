@@ -25,7 +25,7 @@ from imgcal.types import Observations
 
 SHAKES = (0.15, 0.5, 1.5)
 """Pixels, one standard deviation: candidate shake levels. A camera that shakes more than that counts as moved."""
-EVERY = 64
+SHAKE_SNAPSHOTS = 64
 """Number of snapshots between estimates of the level."""
 OTHER = 2.0
 """Minimum ratio of variances that counts as different; 1.3 occurs by chance."""
@@ -108,7 +108,7 @@ class ShakeLevel:
 
     cameras: int
     shake: Tensor = field(init=False)  # (C,) px, one standard deviation of each axis
-    latest: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=EVERY))  # (3, C): see `take`
+    latest: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=SHAKE_SNAPSHOTS))  # (3, C)
 
     def __post_init__(self) -> None:
         """Start with cameras that stand still."""
@@ -129,14 +129,14 @@ class ShakeLevel:
         both = np.concatenate((shift.T, variance[None]))
         both[:, observations.seen[0].sum(1).numpy() < LEAST_POINTS] = np.nan
         self.latest.append(both)
-        if len(self.latest) == EVERY:
+        if len(self.latest) == SHAKE_SNAPSHOTS:
             self._ask()
 
     def _ask(self) -> None:
         """Estimate the levels by comparing shifts with those expected from noise."""
         known = np.stack(self.latest)
         self.latest.clear()
-        often = np.isfinite(known[:, 0]).sum(0) > EVERY // 2
+        often = np.isfinite(known[:, 0]).sum(0) > SHAKE_SNAPSHOTS // 2
         if not often.any():
             return
         found, expected = np.full((2, self.cameras), np.nan)

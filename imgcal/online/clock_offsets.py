@@ -19,7 +19,7 @@ MEMORY = 5.0
 """Decay time (s, to 1/e) of a residual's weight."""
 LONGEST = 0.2
 """Maximum time (s) between snapshots for which the difference of predictions is a velocity."""
-SIGNIFICANT, LEAST = 40.0, 1e-3
+OFFSET_CHI2, LEAST = 40.0, 1e-3
 """Chi-squared (one degree of freedom; chance: once in 10^9 independent tests), and seconds, to report an offset ..."""
 LEAST_KNOWN = 1e-4
 """... and seconds from which it is corrected."""
@@ -76,7 +76,7 @@ class ClockOffsets:
         self._add(state, (state.predicted - self._predicted(state, last[1])) / self._period)
         offset, sigma = self.offsets()
         changed = np.abs(offset - self.late)
-        sure = changed > np.maximum(math.sqrt(SIGNIFICANT) * sigma, LEAST_KNOWN)
+        sure = changed > np.maximum(math.sqrt(OFFSET_CHI2) * sigma, LEAST_KNOWN)
         sure &= self._seconds >= LEAST_MEMORY
         if not sure.any():
             return ()

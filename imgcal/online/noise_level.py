@@ -23,7 +23,7 @@ ASKED = (1, 2, 4, 8, 16, 32)
 """Numbers of first snapshots that are tested together."""
 OTHER = 1.2
 """Minimum ratio of noise levels that counts as different."""
-FIRST, EVERY = (16, 32), 64
+FIRST_ESTIMATES, ESTIMATE_INTERVAL = (16, 32), 64
 """Numbers of snapshots at which cameras are first tested one by one; then the interval, and the most snapshots used."""
 
 
@@ -52,7 +52,7 @@ class NoiseLevel:
         """Test first snapshots again."""
         self._early: list[tuple[Detections, SnapshotIdentity]] = []  # one snapshot each
         self._asking = True
-        self._ratios: deque[NDArray[np.float64]] = deque(maxlen=EVERY)  # (C, N)
+        self._ratios: deque[NDArray[np.float64]] = deque(maxlen=ESTIMATE_INTERVAL)  # (C, N)
         self.first: list[tuple[Detections, RigidTransform]] = []  # snapshots with another noise level, and poses
 
     def observe(
@@ -120,7 +120,7 @@ class NoiseLevel:
         whitened = residual / observations.sigma[0, ..., None].numpy()
         squared = np.einsum("cni,cni->cn", whitened, whitened) / (2 * math.log(2) * free)
         self._ratios.append(np.where(seen.numpy(), squared, np.nan))
-        if (count in FIRST or count % EVERY == 0) and len(self._ratios) >= FIRST[0]:
+        if (count in FIRST_ESTIMATES or count % ESTIMATE_INTERVAL == 0) and len(self._ratios) >= FIRST_ESTIMATES[0]:
             self._ask_later(observations)
 
     def _ask_later(self, observations: Observations) -> None:

@@ -14,7 +14,7 @@ from imgcal.online.events import UNITS, ChangeKind, Event
 
 RELEARNT = 1.1
 """Largest standard deviations of a relearnt camera, relative to those before it moved."""
-EVERY = 4
+RELEARNING_SNAPSHOTS = 4
 """Number of snapshots between two checks for that."""
 EXTRINSICS_AND_PINHOLE = 10
 """Number of a camera's values that are compared: distortion is not affected by the changes that are reported."""
@@ -74,7 +74,7 @@ class Relearning:
             number: of the update.
         """
         waiting = [camera for camera in self.events if camera not in still_open]
-        if not waiting or number % EVERY:
+        if not waiting or number % RELEARNING_SNAPSHOTS:
             return []
         std, events = relative_std(belief), []
         for camera in waiting:

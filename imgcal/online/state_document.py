@@ -16,12 +16,13 @@ import base64
 import binascii
 import math
 import sys
+import typing
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
-from typing import Any, Literal, NamedTuple, Union, get_args, get_origin
+from typing import Any, Literal, NamedTuple, Union
 
 import numpy as np
 import torch
@@ -29,9 +30,15 @@ import torch
 from imgcal.monitoring import RigBelief
 from imgcal.online.state_checks import CHECKS
 
+get_origin: Callable[[Any], Any] = cache(typing.get_origin)
+get_args: Callable[[Any], tuple[Any, ...]] = cache(typing.get_args)
+"""Of a type; asked of thousands of values."""
+SIMPLE = frozenset((NoneType, bool, int, str))
+"""Types whose values stand in a document as they are."""
 NOT_SAVED: Mapping[str, bool] = {"saved": False}
 """Metadata of a field that the caller gives anew on resuming."""
 DTYPES = {name: np.dtype(name) for name in ("float64", "float32", "int64", "int32", "bool", "uint8")}
+NAMES = {dtype: name for name, dtype in DTYPES.items()}
 NUMBERS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 """Numbers that JSON does not have."""
 MOST_AXES = 8
@@ -89,6 +96,8 @@ class StateWriter:
         Raises:
             TypeError: the value is of another type.
         """
+        if type(value) is kind and (kind in SIMPLE or (kind is float and math.isfinite(value))):
+            return value
         origin, args = get_origin(kind), get_args(kind)
         if is_union(kind):
             kind = next((one for one in args if _is_of(one, value)), kind)
@@ -131,9 +140,9 @@ class StateWriter:
     def _array(self, value: torch.Tensor | np.ndarray) -> int:
         """Return the number of an array; views of the same memory with the same layout share one number."""
         array = value.detach().numpy() if isinstance(value, torch.Tensor) else value
-        if array.dtype.name not in DTYPES:
+        if array.dtype not in NAMES:
             raise TypeError(f"an array of {array.dtype} cannot be saved")
-        key = array.__array_interface__["data"][0], array.shape, array.strides, array.dtype.name
+        key = array.__array_interface__["data"][0], array.shape, array.strides, array.dtype
         if key not in self._numbers or not array.size:
             self._numbers[key] = len(self._arrays)
             self._alive.append(array)
@@ -147,6 +156,9 @@ class StateWriter:
         Raises:
             TypeError: the value is of another type.
         """
+        kind = type(value)
+        if kind in SIMPLE or kind is float:
+            return self.write(kind, value)
         if isinstance(value, list):
             return [self.write_plain(item) for item in value]
         if isinstance(value, tuple):
@@ -160,7 +172,7 @@ class StateWriter:
     def tables(self) -> dict[str, Any]:
         """The tables that values refer to; for an array: type, shape, base64 of its bytes, whether by columns."""
         arrays = [
-            [array.dtype.name, list(array.shape), base64.b64encode(array.tobytes()).decode("ascii"), by_columns]
+            [NAMES[array.dtype], list(array.shape), base64.b64encode(array.tobytes()).decode("ascii"), by_columns]
             for array, by_columns in self._arrays
         ]
         return {"beliefs": self._beliefs, "arrays": arrays}

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.monitoring.noise_correlation import FASTEST, FIRST, MEMORY, NoiseCorrelation, usual_time
+from imgcal.monitoring.noise_correlation import (
+    FASTEST,
+    FIRST_MEASUREMENTS,
+    LEAST_WEIGHT,
+    MEMORY,
+    NoiseCorrelation,
+    usual_time,
+)
 from imgcal.types import Observations
 
 SIGMA = 0.1
@@ -46,6 +53,7 @@ def test_errors_that_last_count_by_their_effective_number() -> None:
     # The shift has 5/6 of the variance of the mean of five points; its correlation time is (1 + r) / (1 - r).
     expected = 1 + 2 * (5 / 6) * 0.9 / 0.1
     assert 0.5 * expected < float(noise.time[0]) < 1.6 * expected
+    noise.weigh(observations())  # the next one knows nothing of a snapshot before
     weighed = noise.weigh(observations())
     assert torch.allclose(weighed.sigma[0, 0], SIGMA * noise.time[0].sqrt())
     assert 0.7 * SIGMA < float(noise.lasting[0]) < 1.3 * SIGMA
@@ -81,7 +89,7 @@ def test_a_calibrated_rig_expects_what_is_usual_until_it_knows_better() -> None:
     for number in range(512):
         noise.expect_usual()
         noise.add(observations(), torch.randn(1, 2, 5, 2, dtype=torch.float64))
-        if FIRST[0] <= number < 200:
+        if FIRST_MEASUREMENTS[0] <= number < 200:
             assert float(noise.time.min()) >= usual_time(FASTEST)  # too few to tell
     assert float(noise.time.max()) < 3
 
@@ -95,3 +103,35 @@ def test_a_camera_that_sees_nothing_for_long_has_the_noise_of_the_others() -> No
         residual = shift[:, None] + rng.normal(0, SIGMA / 3, (3, 5, 2))
         noise.add(seen, torch.from_numpy(np.where(seen.seen[0].numpy()[..., None], residual, 0.0))[None])
     assert float(noise.time[2]) > 3
+
+
+def test_an_image_that_was_off_a_moment_ago_counts_less() -> None:
+    noise = follow([0.9, 0.9])
+    seen, off = observations(), torch.zeros(1, 2, 5, 2, dtype=torch.float64)
+    off[:, 0, :, 0] = 1.0
+    usual = SIGMA * noise.time.sqrt()
+
+    def weights() -> list[float]:
+        return (noise.weigh(seen).sigma[0, :, 0] / usual).pow(-2).tolist()
+
+    noise.pass_time(FASTEST)
+    noise.add(seen, off)
+    first, second = weights()
+    assert LEAST_WEIGHT <= first < 0.2 and 1.0 <= second < 1.5
+    assert weights() == [1.0, 1.0]  # nothing was learnt since
+    noise.add(seen, off)
+    noise.pass_time(1.0)  # a pause
+    assert weights() == [1.0, 1.0]
+    noise.settle((0,))
+    noise.add(seen, off)
+    assert weights()[0] == 1.0  # it is being learnt anew
+
+
+def test_the_mean_weight_of_usual_shifts_is_one() -> None:
+    noise, rng, shift, weights = follow([0.9]), np.random.default_rng(5), np.zeros(2), []
+    for _ in range(2000):
+        shift = 0.9 * shift + np.sqrt(1 - 0.81) * rng.normal(0, SIGMA, 2)
+        residual = shift + rng.normal(0, SIGMA, (1, 1, 5, 2))
+        noise.add(observations(1), torch.from_numpy(residual))
+        weights.append(SIGMA**2 * float(noise.time[0]) / float(noise.weigh(observations(1)).sigma[0, 0, 0]) ** 2)
+    assert 0.9 < np.mean(weights) < 1.1

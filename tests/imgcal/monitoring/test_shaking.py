@@ -11,7 +11,7 @@ from imgcal.monitoring import RigBelief, absorb
 from imgcal.monitoring.case import Case, Snapshot
 from imgcal.monitoring.explanations import Steady, weigh
 from imgcal.monitoring.measurement_update import stack_snapshots
-from imgcal.monitoring.shaking import EVERY, ShakeLevel, Shaking
+from imgcal.monitoring.shaking import SHAKE_SNAPSHOTS, ShakeLevel, Shaking
 from imgcal.types import Observations
 from tests.imgcal.monitoring.followed import followed
 
@@ -68,12 +68,12 @@ def test_how_much_each_camera_shakes_is_followed() -> None:
             shift = size[:, None, None] * torch.randn(4, 1, 2, generator=generator, dtype=torch.float64)
             level.observe(observations, math.sqrt(1 - 1.5 / 4) * (noise + shift))
 
-    take(EVERY - 1, size)
+    take(SHAKE_SNAPSHOTS - 1, size)
     assert not level.shake.any() and level.apply_to(observations) is observations
     take(1, size)
     assert level.shake.tolist() == pytest.approx(size.tolist(), rel=0.35)
     assert torch.equal(level.apply_to(observations).shake, level.shake[None])
-    take(EVERY, torch.zeros(4))
+    take(SHAKE_SNAPSHOTS, torch.zeros(4))
     assert not level.shake.any()
     level.believe(size)
     level.observe(replace(observations, seen=torch.zeros_like(observations.seen)), torch.zeros(1, 4, 8, 2))
