@@ -58,6 +58,8 @@ class Proposal:
     rig_from_object: RigidTransform | None
     margin: float  # natural log of the odds against the best distinct labelling (other pose, turn, shift, or chance)
     reason: str = ""  # why it declines; empty = it does not
+    otherwise: Callable[[], Proposal] | None = None  # what another proposer says, asked where this one is refused
+    found_by: str = ""  # who proposes, where that is another one than was asked
 
     @classmethod
     def decline(cls, snapshot: Snapshot, reason: str, margin: float = 0.0) -> Proposal:

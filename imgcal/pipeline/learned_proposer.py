@@ -79,15 +79,22 @@ class LearnedProposer:
 
     @torch.no_grad()
     def propose(self, snapshot: Snapshot) -> Proposal:
-        """Look at one snapshot: around known poses, and if they show too little, where the finder sees the object."""
+        """Look at one snapshot: around known poses, and if they show too little, where the finder sees the object.
+
+        Where what the network says is refused, what the finder has measured itself is proposed.
+        """
         near = self._around(snapshot) if snapshot.candidates else None
-        if self.finder is None or (near is not None and self._convinces(near, snapshot)):
+        if self.finder is None:
             return near or Proposal.decline(snapshot, "found no pose to look around")
-        found = self.finder.propose(snapshot)
+        finder = self.finder
+        if near is not None and self._convinces(near, snapshot):
+            return replace(near, otherwise=lambda: replace(finder.propose(snapshot), found_by=finder.name))
+        found = finder.propose(snapshot)
         if found.rig_from_object is None:
             return near or self._at_origin(snapshot) or Proposal.decline(snapshot, found.reason)
         there = self._around(replace(snapshot, candidates=(found.rig_from_object,)))
-        return there if near is None or len(there.detections) > len(near.detections) else near
+        best = there if near is None or len(there.detections) > len(near.detections) else near
+        return replace(best, otherwise=lambda: replace(found, found_by=finder.name))
 
     def _at_origin(self, snapshot: Snapshot) -> Proposal | None:
         """Look where many captures have their object, if it is one of many small markers: the finder gives up on these.
