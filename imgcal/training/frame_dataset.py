@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +118,19 @@ def turn(crops: FrameDataset, generator: torch.Generator) -> FrameDataset:
         light, place = light.rot90(1, (-2, -1)), torch.stack((place[..., 1], last - place[..., 0]), -1)
     values = {field.name: getattr(crops, field.name) for field in fields(crops)}
     return FrameDataset(**values | {"crops": light, "place": place})
+
+
+def thin(crops: FrameDataset, most: int, generator: torch.Generator) -> FrameDataset:
+    """Keep `most` fiducials a crop, those nearest to one that is drawn: as many as a tile has, in a tile's time."""
+    if crops.place.shape[1] <= most:
+        return crops
+    drawn = torch.multinomial(crops.asked.float() + 1e-9, 1, generator=generator)
+    middle = crops.place.gather(1, drawn[..., None].expand(-1, 1, 2))
+    far = (crops.place - middle).norm(dim=-1).masked_fill(~crops.asked, torch.inf)
+    kept = far.argsort(1)[:, :most]
+    values = {name: getattr(crops, name).gather(1, kept) for name in ("sigma", "radius", "depth", "asked", "seen")}
+    place = crops.place.gather(1, kept[..., None].expand(-1, -1, 2))
+    return replace(crops, place=place, **values)
 
 
 def expect_elsewhere(crops: FrameDataset, generator: torch.Generator, near: bool) -> Queries:

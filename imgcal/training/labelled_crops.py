@@ -6,8 +6,8 @@ then learns is the user's own markers, lamps, lenses and walls.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import fields, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from imgcal.errors import RefusedError
 from imgcal.estimation import estimate
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.matching import measure_markers
-from imgcal.networks import Expectation, Tiles, cut_crops
+from imgcal.networks import Expectation, Tiles, cut_crops, cut_patches
 from imgcal.training.frame_dataset import FrameDataset
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 
@@ -30,6 +30,10 @@ TURN_DEG, ASIDE = 1.5, 0.01
 """Standard deviations of the poses that crops are placed by: degrees, and parts of the distance to the object."""
 LEAST_SEEN = 3
 """Markers that a crop must show."""
+ALIKE, LEAST_LIGHT = 0.5, 0.4
+"""Correlation with the usual look of the capture's markers, and part of their usual light, from which one is seen."""
+SNAPSHOTS_LOOKED_AT = 20
+"""Snapshots that tell how markers usually look."""
 LARGEST_SIGMA = 1.0
 """Crop pixels: a projection that is known less well is no label."""
 FARTHEST = 4.0
@@ -74,20 +78,47 @@ def harvest(
     Raises:
         RefusedError: no snapshot can be decided, no pose fits, or one of the two would be empty.
     """
+    crops = cut_labelled(
+        frames, detections, rig, obj, options, detection=detection, sight=sight, size=size, seed=seed,
+        progress=progress,
+    )  # fmt: skip
+    return split(crops, len(detections.snapshot_names), rig.num_cameras)
+
+
+def cut_labelled(
+    frames: Callable[[int], Mapping[str, Frame | None]],
+    detections: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions = PipelineOptions(),
+    *,
+    detection: DetectionOptions = DetectionOptions(),
+    sight: Sight | None = None,
+    size: int = 96,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> FrameDataset:
+    """Cut the crops of all snapshots that can be decided; arguments as of `harvest`.
+
+    Raises:
+        RefusedError: no snapshot can be decided, or no pose fits.
+    """
     rig, options = rig.to(torch.float64), options.of_object(obj)
     labelled = associate(detections, rig, obj, options, progress, sight)
     observations, poses = fit_poses(labelled, rig, obj, options)
     generator = torch.Generator().manual_seed(seed)
     numbers: Iterable[int] = range(len(labelled.used))
-    parts = []
+    parts, look = [], usual_look(frames, labelled.used, rig, obj, poses, detection)
     for row in progress(numbers, len(labelled.used)) if progress else numbers:
         snapshot = labelled.used[row]
-        shown = frames(snapshot)
-        seen, sigma = find_visible(shown, rig, obj, poses[row : row + 1], observations.of_snapshots([row]), detection)
+        shown, pose = frames(snapshot), poses[row : row + 1]
+        seen, sigma = find_visible(shown, rig, obj, pose, observations.of_snapshots([row]), detection)
+        if look is not None:
+            seen |= look.shows(shown, rig, Expectation.of(rig, obj, pose), detection)
         for _ in range(COPIES):
-            part = _cut(shown, rig, obj, poses[row : row + 1], seen, sigma, detection, size, generator)
+            part = _cut(shown, rig, obj, pose, seen, sigma, detection, size, generator)
             parts.append(replace(part, snapshot=torch.full_like(part.snapshot, snapshot)))
-    return split(_join(parts), len(detections.snapshot_names), rig.num_cameras)
+    return _join(parts)
 
 
 def fit_poses(
@@ -149,6 +180,69 @@ def find_visible(
         near = apart < 1.5 + FARTHEST * (found.sigma + float(usual))
         seen[camera] |= torch.from_numpy(found.seen & np.nan_to_num(near).astype(bool))
     return seen & expected.visible[0], sigma
+
+
+@dataclass(frozen=True)
+class Look:
+    """How the markers of a capture look, whatever their shape."""
+
+    patch: Tensor  # (24, 24) light of the usual marker, without its mean
+    light: float  # how strongly it shows: `_patches` of it
+
+    @torch.no_grad()
+    def shows(
+        self, frames: Mapping[str, Frame | None], rig: CameraRig, expected: Expectation, detection: DetectionOptions
+    ) -> Tensor:
+        """Tell which of the expected fiducials (1, C, N) look like the others: (C, N) bool."""
+        patches, light = _patches(frames, rig, expected, detection)
+        alike = (patches * self.patch).sum((-1, -2)) / (light * self.patch.norm()).clamp(min=1e-9)
+        return (alike > ALIKE) & (light > LEAST_LIGHT * self.light) & expected.visible[0]
+
+
+def usual_look(
+    frames: Callable[[int], Mapping[str, Frame | None]],
+    snapshots: Sequence[int],
+    rig: CameraRig,
+    obj: CalibrationObject,
+    poses: RigidTransform,
+    detection: DetectionOptions,
+) -> Look | None:
+    """Find out how most markers look, at their projections in some of the snapshots with poses (S,).
+
+    Returns:
+        None where they look like nothing that recurs.
+    """
+    every = max(len(snapshots) // SNAPSHOTS_LOOKED_AT, 1)
+    patches, light = [], []
+    for row in range(0, len(snapshots), every):
+        expected = Expectation.of(rig, obj, poses[row : row + 1])
+        own, strength = _patches(frames(snapshots[row]), rig, expected, detection)
+        kept = expected.visible[0] & (strength > 0)
+        patches.append(own[kept])
+        light.append(strength[kept])
+    all_patches, all_light = torch.cat(patches), torch.cat(light)
+    if not len(all_light):
+        return None
+    # The median pixel by pixel: a marker that is hidden, or another one beside it, does not show in it.
+    usual = (all_patches / all_light[:, None, None]).median(0).values
+    usual = usual - usual.mean()
+    alike = (all_patches * usual).sum((-1, -2)) / (all_light * usual.norm()).clamp(min=1e-9)
+    if float(alike.median()) < ALIKE:
+        return None
+    return Look(usual, float(all_light.median()))
+
+
+def _patches(
+    frames: Mapping[str, Frame | None], rig: CameraRig, expected: Expectation, detection: DetectionOptions
+) -> tuple[Tensor, Tensor]:
+    """Cut patches around expected fiducials (1, C, N): less their mean (C, N, 24, 24), and the norm of that (C, N)."""
+    radius = expected.radius[0].clamp(0.5, 64)
+    patches, _ = cut_patches(
+        frames, rig.camera_names, expected.uv[0], radius, inverted=detection.polarity == "dark"
+    )  # fmt: skip
+    patches = patches - patches.flatten(2).nanmean(-1)[..., None, None]
+    patches = patches.nan_to_num()
+    return patches, patches.flatten(2).norm(dim=-1)
 
 
 def split(crops: FrameDataset, snapshots: int, cameras: int) -> tuple[FrameDataset, FrameDataset]:
