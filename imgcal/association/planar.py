@@ -281,17 +281,21 @@ def _place(cells: Cells, numbers: NDArray[np.int64]) -> list[tuple[NDArray[np.in
     """Lay the object's lattice on the grown one every way that shows most fiducials: fiducials and their blobs."""
     seen, blobs = np.array(list(cells)), np.array(list(cells.values()))
     index = {(int(i), int(j)): fiducial for fiducial, (i, j) in enumerate(numbers)}
-    placements = []
+    placements: list[tuple[int, NDArray[np.int64], bytes]] = []
     for turn in TURNS:
-        turned = seen @ turn
+        turned, back = seen @ turn, np.rint(np.linalg.inv(turn)).astype(np.int64)
         shifts = (numbers[:, None] - turned).reshape(-1, 2)
-        low, wide = shifts.min(0), np.ptp(shifts[:, 1]) + 1
+        low, wide = shifts.min(0), int(np.ptp(shifts[:, 1])) + 1
         counts = np.bincount((shifts[:, 0] - low[0]) * wide + shifts[:, 1] - low[1])
         for code in np.flatnonzero(counts >= CLOSE * counts.max()).tolist():
-            placements.append((int(counts[code]), turned + low + np.array(divmod(code, int(wide)))))
-    most = max(count for count, _ in placements)
-    result = []
-    for _, where in (each for each in placements if each[0] >= CLOSE * most):
+            shift = low + np.array(divmod(code, wide))
+            covered = np.unique((numbers - shift) @ back, axis=0).tobytes()
+            placements.append((int(counts[code]), turned + shift, covered))
+    most, covers, result = max(count for count, _, _ in placements), set(), []
+    for count, where, covered in placements:
+        if count < CLOSE * most or covered in covers:
+            continue  # turns of a symmetric object onto itself are one
+        covers.add(covered)
         fiducial = np.array([index.get((int(i), int(j)), -1) for i, j in where])
         result.append((fiducial[fiducial >= 0], blobs[fiducial >= 0]))
     return result

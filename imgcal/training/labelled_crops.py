@@ -32,6 +32,8 @@ LEAST_SEEN = 3
 """Markers that a crop must show."""
 ALIKE, LEAST_LIGHT = 0.5, 0.4
 """Correlation with the usual look of the capture's markers, and part of their usual light, from which one is seen."""
+BRIGHTEST = 3
+"""Crop pixels, each way, within which a marker is brightest."""
 SNAPSHOTS_LOOKED_AT = 20
 """Snapshots that tell how markers usually look."""
 LARGEST_SIGMA = 1.0
@@ -309,7 +311,9 @@ def _normalize_light(light: Tensor, place: Tensor, shown: Tensor) -> tuple[Tenso
     size = light.shape[-1]
     ground = light.flatten(1).nanmedian(1).values.nan_to_num()
     where = place.round().clamp(0, size - 1).long()
-    peak = light.flatten(1).gather(1, where[..., 1] * size + where[..., 0]) - ground[:, None]
+    # The brightest place of a marker need not be its middle: a ring has none there.
+    brightest = functional.max_pool2d(light.nan_to_num(-torch.inf)[:, None], 2 * BRIGHTEST + 1, 1, BRIGHTEST)[:, 0]
+    peak = brightest.flatten(1).gather(1, where[..., 1] * size + where[..., 0]) - ground[:, None]
     level = peak.masked_fill(~shown, torch.nan).nanmedian(1).values.nan_to_num()
     usable = (shown.sum(1) >= LEAST_SEEN) & (level > 0)
     scale = torch.where(usable, level, 1.0)

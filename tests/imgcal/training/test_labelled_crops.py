@@ -55,6 +55,28 @@ def test_a_marker_that_the_frame_does_not_show_is_not_seen(sample) -> None:
     assert train.seen[there, 3].all()
 
 
+def test_markers_of_any_shape_are_seen_where_they_recur(sample) -> None:
+    """Rings, which have no light in their middle and which no fit of a spot measures."""
+    frames, blobs, rig, obj = sample
+    found = imgcal.score(blobs, rig, obj).labelled
+    u, v = np.meshgrid(np.arange(-20, 21), np.arange(-20, 21))
+    far = np.hypot(u, v)
+    shown = {number: {name: np.full_like(frame, 20) for name, frame in each.items()} for number, each in frames.items()}
+    table = found.detections
+    for row in np.flatnonzero(table.fiducial >= 0):
+        frame = shown[int(table.snapshot[row])][rig.camera_names[table.camera[row]]]
+        column, line = table.uv[row].round().astype(int)
+        size = 1.6 * table.radius[row]
+        window = frame[line - 20 : line + 21, column - 20 : column + 21]
+        if window.shape == far.shape:
+            window[abs(far - size) < 0.3 * size] = 150
+    train, held_out = harvest(shown.get, blobs, rig, obj)
+    for part in (train, held_out):
+        assert part.seen.sum() > 0.8 * part.asked.sum()
+        light = part.crops.float().flatten(1).nan_to_num().amax(1)
+        assert light.median() == pytest.approx(1.0, abs=0.2)
+
+
 def made(snapshots: int, cameras: int) -> FrameDataset:
     """Crops of every camera in every snapshot, with nothing in them."""
     snapshot, camera = (
