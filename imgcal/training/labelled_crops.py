@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -21,13 +22,19 @@ from imgcal.estimation import estimate
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.matching import measure_markers
 from imgcal.networks import Expectation, Tiles, cut_crops, cut_patches
-from imgcal.training.frame_dataset import FrameDataset
+from imgcal.training.frame_dataset import FrameDataset, PatchDataset
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 
 COPIES = 3
 """Crops of each place, each with another corner and another reduction."""
 TURN_DEG, ASIDE = 1.5, 0.01
 """Standard deviations of the poses that crops are placed by: degrees, and parts of the distance to the object."""
+BESIDE = 3.0
+"""Patch pixels, each way, within which markers are beside the middle of their patches."""
+BRIGHT_PIXEL = 559
+"""Of the 576 pixels of a patch, in ascending order: as bright as its marker, whatever a few pixels show."""
+LARGEST_PATCH_SIGMA = 1.0
+"""Pixels: where a projection is known less well, it says nothing of a marker's exact place."""
 LEAST_SEEN = 3
 """Markers that a crop must show."""
 ALIKE, LEAST_LIGHT = 0.5, 0.4
@@ -80,11 +87,11 @@ def harvest(
     Raises:
         RefusedError: no snapshot can be decided, no pose fits, or one of the two would be empty.
     """
-    crops = cut_labelled(
+    made = cut_labelled(
         frames, detections, rig, obj, options, detection=detection, sight=sight, size=size, seed=seed,
         progress=progress,
     )  # fmt: skip
-    return split(crops, len(detections.snapshot_names), rig.num_cameras)
+    return split(made[0], len(detections.snapshot_names), rig.num_cameras)
 
 
 def cut_labelled(
@@ -99,8 +106,8 @@ def cut_labelled(
     size: int = 96,
     seed: int = 0,
     progress: Progress | None = None,
-) -> FrameDataset:
-    """Cut the crops of all snapshots that can be decided; arguments as of `harvest`.
+) -> tuple[FrameDataset, PatchDataset]:
+    """Cut the crops of all snapshots that can be decided, and patches of their markers; arguments as of `harvest`.
 
     Raises:
         RefusedError: no snapshot can be decided, or no pose fits.
@@ -110,17 +117,22 @@ def cut_labelled(
     observations, poses = fit_poses(labelled, rig, obj, options)
     generator = torch.Generator().manual_seed(seed)
     numbers: Iterable[int] = range(len(labelled.used))
-    parts, look = [], usual_look(frames, labelled.used, rig, obj, poses, detection)
+    parts, patches, look = [], [], usual_look(frames, labelled.used, rig, obj, poses, detection)
     for row in progress(numbers, len(labelled.used)) if progress else numbers:
         snapshot = labelled.used[row]
         shown, pose = frames(snapshot), poses[row : row + 1]
         seen, sigma = find_visible(shown, rig, obj, pose, observations.of_snapshots([row]), detection)
         if look is not None:
             seen |= look.shows(shown, rig, Expectation.of(rig, obj, pose), detection)
+        usable = seen & (sigma < LARGEST_PATCH_SIGMA)
+        around = Expectation.of(rig, obj, pose)
         for _ in range(COPIES):
+            own = _cut_patches(shown, rig, around, usable, detection, generator)
+            patches.append(replace(own, snapshot=torch.full_like(own.snapshot, snapshot)))
             part = _cut(shown, rig, obj, pose, seen, sigma, detection, size, generator)
             parts.append(replace(part, snapshot=torch.full_like(part.snapshot, snapshot)))
-    return _join(parts)
+    columns = (torch.cat([getattr(part, field.name) for part in patches]) for field in fields(PatchDataset))
+    return _join(parts), PatchDataset(*columns)
 
 
 def fit_poses(
@@ -247,7 +259,39 @@ def _patches(
     return patches, patches.flatten(2).norm(dim=-1)
 
 
-def split(crops: FrameDataset, snapshots: int, cameras: int) -> tuple[FrameDataset, FrameDataset]:
+def _cut_patches(
+    frames: Mapping[str, Frame | None],
+    rig: CameraRig,
+    expected: Expectation,
+    usable: Tensor,
+    detection: DetectionOptions,
+    generator: torch.Generator,
+) -> PatchDataset:
+    """Cut patches of the usable (C, N) of the expected fiducials, each as if it were expected somewhere beside."""
+    uv, radius = expected.uv[0], expected.radius[0].clamp(0.5, 64)
+    _, usual = cut_patches({}, rig.camera_names, uv, radius)
+    aside = (2 * torch.rand(uv.shape, generator=generator, dtype=uv.dtype) - 1) * BESIDE * usual.scale[..., None]
+    patches, placement = cut_patches(
+        frames, rig.camera_names, uv + aside, radius, inverted=detection.polarity == "dark"
+    )  # fmt: skip
+    light, place = patches[usable], placement.to_crop(uv[..., None, :])[..., 0, :][usable]
+    ground = light.flatten(1).nanmedian(1).values.nan_to_num()[:, None, None]
+    light = (light - ground).nan_to_num()
+    level = light.flatten(1).kthvalue(BRIGHT_PIXEL, 1).values[:, None, None]
+    kept = (level > 0).flatten()
+    camera = torch.arange(rig.num_cameras)[:, None].expand_as(usable)[usable]
+    reduced = (radius / placement.scale)[usable]
+    middle = (placement.size - 1) / 2
+    return PatchDataset(
+        (light / level.clamp(min=1e-9)).clamp(-100, 100).half()[kept], reduced.float()[kept],
+        (place - middle).float()[kept], camera[kept], torch.zeros(int(kept.sum()), dtype=torch.int64),
+    )  # fmt: skip
+
+
+Part = TypeVar("Part", FrameDataset, PatchDataset)
+
+
+def split(crops: Part, snapshots: int, cameras: int) -> tuple[Part, Part]:
     """Hold out stretches of snapshots, with a gap on both sides of each; of few snapshots, cameras.
 
     Raises:

@@ -76,7 +76,7 @@ def prepare(runs: Path) -> None:
             rig = given.rig.select([given.rig.camera_names.index(camera) for camera in ADAPT[name]])
         found = imgcal.calibrate(frames, rig, given.obj, detection=given.detection)
         blobs = imgcal.detect(frames, given.detection)
-        crops = cut_labelled(
+        crops, _ = cut_labelled(
             lambda s, frames=frames: {camera: each[s] for camera, each in frames.items()},  # type: ignore[misc]
             blobs, found.rig, given.obj, detection=given.detection,
         )  # fmt: skip

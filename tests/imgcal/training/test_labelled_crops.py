@@ -9,7 +9,7 @@ from imgcal.errors import RefusedError
 from imgcal.io import data_path, open_capture
 from imgcal.training import harvest
 from imgcal.training.frame_dataset import FrameDataset
-from imgcal.training.labelled_crops import split
+from imgcal.training.labelled_crops import cut_labelled, split
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +37,20 @@ def test_markers_are_bright_where_the_rig_has_them(sample) -> None:
         assert part.seen.sum() > 0.9 * part.asked.sum()
     # Of four snapshots, cameras are held out.
     assert set(train.camera.tolist()).isdisjoint(held_out.camera.tolist())
+
+
+def test_patches_have_their_markers_where_they_say(sample) -> None:
+    frames, blobs, rig, obj = sample
+    crops, patches = cut_labelled(frames.get, blobs, rig, obj)
+    assert len(patches) > 2 * 0.9 * int(crops.seen.sum()) / 3
+    light = patches.light.float().clamp(min=0)
+    near = torch.arange(24) - 11.5
+    bright = light * ((near[None, None] - patches.offset[:, :1, None]).abs() < 5)
+    bright = bright * ((near[None, :, None] - patches.offset[:, 1:, None]).abs() < 5)
+    total = bright.sum((1, 2))
+    centre = torch.stack(((bright.sum(1) * near).sum(1), (bright.sum(2) * near).sum(1)), 1) / total[:, None]
+    assert (centre - patches.offset).norm(dim=1).median() < 0.3
+    assert patches.offset.abs().max() > 2  # not always in the middle
 
 
 def test_a_marker_that_the_frame_does_not_show_is_not_seen(sample) -> None:
