@@ -213,20 +213,27 @@ def key(row: dict[str, Any]) -> tuple[Any, ...]:
 def tables(rows: list[dict[str, Any]]) -> str:
     """Calibrated, refused and wrong of each detector; and of what each network labelled itself."""
     references = captures.references_of(rows)
-    names = [name for name in detectors() if any(row["detector"] == name for row in rows)]
+    count = len({row["kind"] + str(row["level"]) for row in rows})
     lines = []
-    for name in names:
-        line = [name]
-        for sets in ([each] for each in captures.SETS), [list(captures.SETS)]:
-            for some in sets:
-                mine = [row for row in rows if row["detector"] == name and row["captures"] in some]
-                said = [captures.status(row, references) for row in mine]
-                line.append(" / ".join(str(said.count(kind)) for kind in ("calibrated", "refused", "wrong")))
-        own = [row for row in rows if row["detector"] == name and "learned" in row["found_by"]]
-        line.append(str(len(own)) if " seed " in name or name == "learned" else "")
-        lines.append(line)
-    head = ["calibrated / refused / wrong", *captures.SETS.values(), "all", "with labels of the network"]
+    for name in detectors():
+        mine = {
+            each: [row for row in rows if (row["detector"], row["captures"]) == (name, each)] for each in captures.SETS
+        }
+        whole = {each: found for each, found in mine.items() if len(found) == count}  # others are under way
+        if not whole:
+            continue
+        cells = [_outcomes(whole.get(each, []), references) for each in captures.SETS]
+        every = [row for found in whole.values() for row in found] if len(whole) == len(captures.SETS) else []
+        own = sum("learned" in row["found_by"] for row in every)
+        network = every and (" seed " in name or name == "learned")
+        lines.append([name, *cells, _outcomes(every, references), str(own) if network else ""])
+    head = ["calibrated / refused / wrong", *captures.SETS.values(), "all", "rigs with labels of the network"]
     return markdown(head, lines)
+
+
+def _outcomes(rows: list[dict[str, Any]], references: dict[str, float]) -> str:
+    said = [captures.status(row, references) for row in rows]
+    return " / ".join(str(said.count(kind)) for kind in ("calibrated", "refused", "wrong")) if said else ""
 
 
 def main(

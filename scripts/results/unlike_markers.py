@@ -127,7 +127,7 @@ def prepare(runs: Path, markers: Sequence[str] = MARKERS) -> None:
 def trainings(runs: Path, markers: Sequence[str] = MARKERS) -> list[list[str]]:
     """Arguments of `imgcal train` of each adaptation."""
     return [
-        [name, "--from", str(runs / "data" / f"{shape}-{count}"), "--out", str(runs / f"{shape}-{count}-{seed}{suffix}"),
+        [name, "--from", f"{runs}/data/{shape}-{count}", "--out", f"{runs}/{shape}-{count}-{seed}{suffix}",
          "--set", f"training.seed={seed}"]
         for count, seeds in reversed(FRAMES.items()) for shape in markers for seed in seeds
         for name, suffix in (("ir-cnn", ""), ("measurer-cnn", MEASURER))
