@@ -1,4 +1,4 @@
-"""Which blob is which fiducial, for the unlabelled blobs of all cameras together."""
+"""Match the unlabelled blobs of all cameras to fiducials."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""Other labellings that might do as well: those of an object moved onto itself, wholly or in part."""
+"""Rival labellings: those of an object moved onto itself, wholly or in part."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from imgcal.association.hypotheses import Poses
 from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject
 
-LEAST_OVERLAP = 0.6  # part of the fiducials that must fall onto others for a shift to be mistaken for none
-MOST_SHIFTS = 8  # the smallest ones; larger ones are made of them
+LEAST_OVERLAP = 0.6  # minimum share of fiducials that fall onto others for a shift to be confusing
+MOST_SHIFTS = 8  # the smallest ones; larger ones are combinations of them
 
 
 @dataclass(frozen=True)
 class Ambiguity:
-    """A rigid motion that takes most fiducials near others; fiducial i falls onto `permutation[i]`, -1 = onto none."""
+    """A rigid motion that takes most fiducials near others; fiducial i falls onto `permutation[i]`, -1 = none."""
 
     rotation: NDArray[np.float64]  # (3, 3)
     translation: NDArray[np.float64]  # (3,) mm
@@ -39,7 +39,7 @@ def lattice_shifts(obj: CalibrationObject) -> list[Ambiguity]:
 
 @lru_cache(maxsize=16)
 def _lattice_shifts(coordinates: bytes, tolerance: float) -> tuple[Ambiguity, ...]:
-    """Find the shifts once for each object: snapshots are many, objects few."""
+    """Find the shifts once per object: there are many snapshots, but few objects."""
     points = np.frombuffer(coordinates).reshape(-1, 3)
     differences = (points[None] - points[:, None]).reshape(-1, 3)
     cells, place, counts = np.unique(
@@ -53,9 +53,9 @@ def _lattice_shifts(coordinates: bytes, tolerance: float) -> tuple[Ambiguity, ..
 
 
 def near_symmetries(obj: CalibrationObject, tolerance: float) -> list[Ambiguity]:
-    """Find the turns that take every fiducial to within `tolerance` (mm) of another, but are no symmetries.
+    """Find the rotations that take every fiducial to within `tolerance` (mm) of another, but are not symmetries.
 
-    Sizes of fiducials do not count here: that they break a symmetry must be seen in the blobs.
+    Sizes of fiducials are ignored here: only the blobs can show that they break a symmetry.
     """
     exact = {motion.permutation.tobytes() for motion in obj.symmetries}
     turns = replace(obj, radius=None).near_symmetries(min(tolerance, 0.2 * obj.size))
@@ -69,7 +69,7 @@ def near_symmetries(obj: CalibrationObject, tolerance: float) -> list[Ambiguity]
 def relabel(
     pose: RigidTransform, labels: NDArray[np.int64], motions: list[Ambiguity]
 ) -> tuple[Poses, NDArray[np.int64]]:
-    """Label the blobs as if the object had made each motion backwards.
+    """Label the blobs as if the object had made the inverse of each motion.
 
     Args:
         pose: rig_from_object of a labelling.
@@ -77,7 +77,7 @@ def relabel(
         motions: K motions.
 
     Returns:
-        K poses and labellings (K, C, N) under which the blobs lie where they lay.
+        K poses and labellings (K, C, N) under which the blobs stay in place.
     """
     rotation, translation = pose.rotation.numpy(), pose.translation.numpy()
     turns = np.stack([rotation @ motion.rotation.T for motion in motions])
@@ -96,18 +96,18 @@ def displacement(uv: NDArray[np.float64], motion: Ambiguity) -> NDArray[np.float
 
 
 def conflicts(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]) -> float:
-    """Share of commonly labelled blobs that two labellings (C, N) call differently, up to the object's symmetry.
+    """Share of commonly labelled blobs that two labellings (C, N) name differently, up to the object's symmetry.
 
-    Labellings without a common blob conflict entirely.
+    Labellings without a common blob conflict completely.
     """
     common = max(int(common_blobs(first, second).sum()), 1)
     return min(1 - int(agreed.sum()) / common for agreed in _count_agreements(obj, first, second))
 
 
 def differ(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]) -> bool:
-    """Tell whether two labellings (C, N) are different answers, up to the object's symmetry, not one with odd labels.
+    """Tell whether two labellings (C, N) are different solutions, up to symmetry, rather than one with odd labels.
 
-    They are when a third of all common blobs, or of one camera's (three at least), are called differently.
+    They are if a third of all common blobs, or of one camera's (at least three), are named differently.
     """
     common = common_blobs(first, second)
     if not common.any():
@@ -121,7 +121,7 @@ def differ(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.
 def _count_agreements(
     obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]
 ) -> list[NDArray[np.int64]]:
-    """Number of blobs that two labellings call the same, for each camera (C,) and symmetry."""
+    """Number of blobs that two labellings name alike, for each camera (C,) and symmetry."""
     return [((first >= 0) & (first == second[:, motion.permutation])).sum(1) for motion in obj.symmetries]
 
 

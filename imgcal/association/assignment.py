@@ -15,12 +15,12 @@ from renderers.compiling import njit
 
 @njit(cache=True)
 def mutual_nearest(places, blobs, reach, labels):
-    """Pair places with blobs where each is the other's nearest.
+    """Pair places with blobs that are mutually nearest.
 
     Args:
         places: (N, 2) pixels.
         blobs: (M, 2) pixels.
-        reach: pixels; pairs this far apart or farther are not made.
+        reach: pixels; only closer pairs are made.
         labels: (N,), filled with the blob of each place, -1 = none.
     """
     back, nearest = np.empty(len(blobs), np.int64), np.empty(len(blobs))
@@ -42,7 +42,7 @@ def mutual_nearest(places, blobs, reach, labels):
 
 
 def spacing(places: NDArray[np.float64]) -> float:
-    """Median distance (px) from a fiducial's image to the nearest other one in the same camera; places (C, N, 2)."""
+    """Median distance (px) from a fiducial's image to the nearest other one in its camera; places (C, N, 2)."""
     return float(np.median(distances_to_nearest(np.ascontiguousarray(places))))
 
 
@@ -61,7 +61,7 @@ def distances_to_nearest(places):
 
 
 def assign(cost: NDArray[np.floating], gate: float) -> NDArray[np.int64]:
-    """Pair fiducials and blobs at the least total cost, where leaving a fiducial out costs `gate`.
+    """Pair fiducials and blobs at the lowest total cost; leaving a fiducial out costs `gate`.
 
     Args:
         cost: (*B, N, M).
@@ -73,7 +73,7 @@ def assign(cost: NDArray[np.floating], gate: float) -> NDArray[np.int64]:
     batch, (fiducials, blobs) = cost.shape[:-2], cost.shape[-2:]
     flat = cost.reshape(-1, fiducials, blobs)
     labels = np.full(flat.shape[:2], -1, dtype=np.int64)
-    # Where all cheapest blobs differ, nothing is cheaper. Only the others need the full search.
+    # If all cheapest blobs differ, they are the optimum. Only the rest needs the full search.
     for b in np.flatnonzero(_cheapest(flat, gate, labels)):
         possible = flat[b] < gate
         rows, columns = np.flatnonzero(possible.any(1)), np.flatnonzero(possible.any(0))
@@ -87,7 +87,7 @@ def assign(cost: NDArray[np.floating], gate: float) -> NDArray[np.int64]:
 
 @njit(cache=True)
 def _cheapest(cost, gate, labels):
-    """Give each fiducial its cheapest blob, and tell where two would share one: (B,)."""
+    """Give each fiducial its cheapest blob, and return where two would share one: (B,)."""
     contested, taken = np.empty(len(cost), np.bool_), np.empty(cost.shape[2], np.bool_)
     for b in range(len(cost)):
         contested[b], taken[:] = False, False

@@ -1,4 +1,4 @@
-"""One snapshot's blobs as dense arrays, and how far the prior lets predictions be off."""
+"""One snapshot's blobs as dense arrays, and the errors of predictions that the prior allows."""
 
 # Compiled functions take their types from their arguments.
 # ruff: noqa: ANN001, ANN202
@@ -19,7 +19,7 @@ from imgcal.types import CameraRig, Detections
 from renderers.compiling import njit
 
 FAR = 1e6
-"""Pixel coordinate of padding: no gate reaches it."""
+"""Pixel coordinate of padding: beyond any gate."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class PaddedBlobs:
 
     @cached_property
     def noise(self) -> tuple[NDArray[np.float64], float]:
-        """Variance of each blob's place (C, M) px^2, and the usual one."""
+        """Variance of each blob's place (C, M) px^2, and the typical one."""
         variance, valid = self.sigma**2, self.row >= 0
         return variance, float(np.median(variance[valid])) if valid.any() else 0.0
 
@@ -47,7 +47,7 @@ class PaddedBlobs:
         return PaddedBlobs(*kept, self.rows)
 
     def to_rows(self, labels: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Turn blob indices of fiducials (C, N) into fiducials of detection rows (rows,)."""
+        """Convert blob indices of fiducials (C, N) into fiducials of detection rows (rows,)."""
         result = np.full(self.rows, -1, dtype=np.int64)
         camera, fiducial = np.nonzero(labels >= 0)
         result[self.row[camera, labels[camera, fiducial]]] = fiducial
@@ -55,7 +55,7 @@ class PaddedBlobs:
 
 
 def gather(detections: Detections, rig: CameraRig) -> PaddedBlobs:
-    """Collect the usable blobs of one snapshot that the lens can show; of several at exactly the same place the first.
+    """Collect a snapshot's usable blobs that the lens can show; of several at exactly the same place, the first.
 
     Args:
         detections: blobs of one snapshot; its cameras are the rig's, in the rig's order.
@@ -74,7 +74,7 @@ def gather(detections: Detections, rig: CameraRig) -> PaddedBlobs:
     places = np.column_stack((detections.camera[rows], detections.uv[rows]))
     rows = rows[np.sort(np.unique(places, axis=0, return_index=True)[1])]
     ideal = undistort(detections.uv[rows], detections.camera[rows], rig)
-    finite = np.isfinite(ideal).all(-1)  # a lens that was fitted to next to nothing may show no such place
+    finite = np.isfinite(ideal).all(-1)  # a poorly determined lens may not reach this place
     rows, ideal = rows[finite], ideal[finite]
     order = np.argsort(detections.camera[rows], kind="stable")
     rows, ideal = rows[order], ideal[order]
@@ -92,7 +92,7 @@ def gather(detections: Detections, rig: CameraRig) -> PaddedBlobs:
 
 
 def undistort(uv: NDArray[np.float64], camera: NDArray[np.int64], rig: CameraRig) -> NDArray[np.float32]:
-    """Pixels (R, 2) from the principal point, without distortion; not finite where a lens can show no such place."""
+    """Pixels (R, 2) from the principal point, without distortion; not finite where the lens cannot show a place."""
     ideal = np.empty((len(uv), 2), dtype=np.float32)
     lens = (rig.focal_length.numpy(), rig.principal_point.numpy(), rig.distortion.numpy())
     _undistort(uv, camera, *lens, lens_codes(rig.lens_model, *rig.distortion.shape), ideal)
@@ -112,19 +112,19 @@ def _undistort(uv, camera, focal, principal, distortion, lenses, ideal):
 
 @dataclass(frozen=True)
 class PatternPrior:
-    """How far the factory values may be off, boiled down to what moves a pattern and what bends it."""
+    """The factory prior, reduced to a pattern's shift in the image and its deformation."""
 
     shift: NDArray[np.float64]  # (C,) pixels, one standard deviation of a pattern's place in the image
     shape: float  # relative: one standard deviation of distances within a pattern
 
 
 def pattern_prior(std: Tensor, rig: CameraRig, distance: float) -> PatternPrior:
-    """Boil the prior down.
+    """Reduce the prior to these two numbers.
 
     Args:
         std: (C, K) prior standard deviation of each camera's parameters.
         rig: factory rig.
-        distance: mm, from the cameras to the object, roughly.
+        distance: mm, approximate distance from the cameras to the object.
     """
     s, focal = std.numpy(), rig.focal_length.mean(-1).numpy()
     turn, travel = np.sqrt((s[:, :3] ** 2).mean(1)), np.sqrt((s[:, 3:6] ** 2).mean(1)) / distance

@@ -1,4 +1,4 @@
-"""Candidate poses: blob triples of one camera against all fiducial triples, tested on the camera's other blobs."""
+"""Candidate poses: blob triples of one camera matched to all fiducial triples, tested on the camera's other blobs."""
 
 # Compiled functions take their types from their arguments.
 # ruff: noqa: ANN001, ANN202
@@ -19,23 +19,23 @@ from imgcal.association.p3p import FAST, rotation_towards, three_point_pose
 from imgcal.types import CalibrationObject, CameraRig
 from renderers.compiling import njit
 
-MOST_TRIPLES = 40_000  # of an object's fiducials, up to which all are tried
-MOST_FIDUCIAL_TRIPLES = 300_000  # of its outer ones, beyond which some are drawn
-DRAWS = 3  # blob triples of which the widest is taken
-PROBES = 8  # fiducials that every hypothesis is tested on; only promising ones are tested on all
-CELLS = 4  # raster cells to a tolerance
-MOST_CELLS = 512  # across the blobs; where that makes cells larger, the tolerance is larger too
+MOST_TRIPLES = 40_000  # maximum number of fiducial triples to try them all
+MOST_FIDUCIAL_TRIPLES = 300_000  # of the outer fiducials; beyond that, a random subset is used
+DRAWS = 3  # blob triples drawn, to use the widest
+PROBES = 8  # fiducials for the first test of a hypothesis; only promising ones are tested on all
+CELLS = 4  # raster cells per tolerance
+MOST_CELLS = 512  # across the blobs; larger cells also increase the tolerance
 
 
 @dataclass(frozen=True)
 class FiducialTriples:
-    """Ordered triples of fiducials, one of each set that the object's symmetry cannot tell apart."""
+    """Ordered triples of fiducials, one of each set that the object's symmetry makes equivalent."""
 
     triples: NDArray[np.int64]  # (T, 3)
     sides: NDArray[np.float64]  # (T, 3) mm^2, squared distances 0-1, 0-2, 1-2
     frames: NDArray[np.float64]  # (T, 3, 3) columns: along the first side, in the plane, normal
     points: NDArray[np.float64]  # (N, 3) mm
-    order: NDArray[np.int64]  # (N,) random order in which a hypothesis is tested
+    order: NDArray[np.int64]  # (N,) random order for testing a hypothesis
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,9 @@ class Poses:
 
 
 def fiducial_triples(obj: CalibrationObject, generator: np.random.Generator) -> FiducialTriples:
-    """List the triples to try: all of them; of many fiducials those of the outer ones, or a random choice of these."""
+    """List the triples to try: all of them; if there are many, those of the outer fiducials, or a random subset of
+    these.
+    """
     points = obj.points.double().cpu().numpy()
     count = len(points)
     symmetries = tuple(motion.permutation.astype(np.int64).tobytes() for motion in obj.symmetries)
@@ -78,7 +80,7 @@ Triples = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
 
 @lru_cache(maxsize=4)
 def _every_triple(coordinates: bytes, symmetries: tuple[bytes, ...], outer: bool) -> Triples | None:
-    """All ordered triples, once for each object: snapshots are many, objects few. None = there are too many."""
+    """All ordered triples, computed once per object: snapshots are many, objects few. None = too many."""
     points = np.frombuffer(coordinates).reshape(-1, 3)
     among = _outer(points, outer)
     if _orders(len(among)) > MOST_FIDUCIAL_TRIPLES:
@@ -87,12 +89,12 @@ def _every_triple(coordinates: bytes, symmetries: tuple[bytes, ...], outer: bool
 
 
 def _outer(points: NDArray[np.float64], outer: bool) -> NDArray[np.int64]:
-    """Fiducials to make triples of: the outermost ones, or all."""
+    """Fiducials to use in triples: the outermost ones, or all."""
     return ConvexHull(points).vertices if outer else np.arange(len(points))
 
 
 def _drop_symmetric(points: NDArray[np.float64], triples: NDArray[np.int64], symmetries: tuple[bytes, ...]) -> Triples:
-    """Triples (T, 3) that are not in line, one of each set that symmetries cannot tell apart, and their shape."""
+    """Triples (T, 3) that are not collinear, one of each set of equivalent ones, and their shape."""
     count = len(points)
     if len(symmetries) > 1:
         permuted = np.stack([np.frombuffer(motion, dtype=np.int64)[triples] for motion in symmetries])  # (G, T, 3)
@@ -109,9 +111,9 @@ def _drop_symmetric(points: NDArray[np.float64], triples: NDArray[np.int64], sym
 
 
 def has_many_triples(obj: CalibrationObject) -> bool:
-    """Tell whether the object has more triples than can be tried.
+    """Tell whether the object has too many triples to try.
 
-    Then only outer blobs are compared with outer fiducials: what is outermost in an image is so in space.
+    If so, only outer blobs are matched with outer fiducials: what is outermost in an image is so in space.
     """
     return _orders(obj.num_fiducials) > MOST_TRIPLES
 
@@ -122,11 +124,11 @@ def _orders(count: int) -> int:
 
 
 def likely_blobs(blobs: PaddedBlobs, camera: int, outer: bool) -> NDArray[np.int64]:
-    """List the blobs of a camera that are likely to be fiducials: those close to others.
+    """List the blobs of a camera that are probably fiducials: those close to others.
 
     Args:
         blobs: the snapshot.
-        camera: index of the camera, which has four blobs at least.
+        camera: index of the camera, which has at least four blobs.
         outer: take the outermost blobs only, see `has_many_triples`.
     """
     uv = blobs.ideal[camera, : blobs.count[camera]].astype(np.float64)
@@ -140,15 +142,15 @@ def likely_blobs(blobs: PaddedBlobs, camera: int, outer: bool) -> NDArray[np.int
 def blob_triples(
     uv: NDArray[np.floating], likely: NDArray[np.int64], count: int, generator: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Draw triples of blobs (count, 3) that are not too narrow.
+    """Draw triples of blobs (count, 3) that are wide enough.
 
     Args:
         uv: (M, 2) pixels, the blobs of a camera.
-        likely: (L >= 3,) those to draw from.
+        likely: (L >= 3,) blobs to draw from.
         count: number of triples.
         generator: source of randomness.
     """
-    # Three different ones: numbers among those that are left, moved past the ones that are taken.
+    # Draw three different numbers: each counts among the remaining ones and is moved past those already drawn.
     drawn = generator.integers(0, len(likely) - np.arange(3), (DRAWS * count, 3))
     drawn[:, 1] += drawn[:, 1] >= drawn[:, 0]
     taken = np.sort(drawn[:, :2], axis=1)
@@ -170,7 +172,7 @@ def single_camera_poses(
     tolerance: float,
     keep: int,
 ) -> Poses:
-    """Find poses under which the blobs of one camera look like the object, for several triples of blobs at once.
+    """Find poses under which the blobs of one camera look like the object, for several blob triples at once.
 
     Args:
         blobs: the snapshot.
@@ -178,8 +180,8 @@ def single_camera_poses(
         cameras: (Q,) camera of each triple.
         triples: (Q, 3) blobs.
         fiducials: triples to match them with.
-        tolerance: pixels within which a predicted fiducial counts as seen, at least.
-        keep: poses to keep of each triple of blobs.
+        tolerance: minimum distance (px) within which a predicted fiducial counts as seen.
+        keep: number of poses to keep for each blob triple.
     """
     focal = rig.focal_length.mean(-1).numpy()
     rays = blobs.ideal[cameras[:, None], triples].astype(np.float64) / focal[cameras, None, None]
@@ -204,13 +206,13 @@ def single_camera_poses(
 
 @njit(cache=True, fastmath=FAST)
 def _search(blobs, fiducials, images, poses):
-    """Fill the best poses (in the camera's frame) of each triple of blobs.
+    """Fill in the best poses (in the camera's frame) of each blob triple.
 
     Args:
-        blobs: of each triple the rays as `rotation_towards` turns them, its rotations, and the camera.
+        blobs: for each triple, the rays as turned by `rotation_towards`, its rotations, and the camera.
         fiducials: triples, sides, frames, points and order of `FiducialTriples`.
-        images: of each camera focal length, raster of the blobs and its origin; cells a pixel.
-        poses: score, rotation and translation of the best, the best first.
+        images: for each camera, focal length, raster of the blobs and its origin; cells per pixel.
+        poses: score, rotation and translation of the best ones, best first.
     """
     rays, directions, cameras = blobs
     triples, sides, frames, points, order = fiducials
@@ -254,7 +256,7 @@ def _search(blobs, fiducials, images, poses):
 
 @njit(cache=True, fastmath=FAST)
 def _score_pose(turn, shift, points, order, image, least):
-    """Sum over fiducials of their nearness to a blob; give up early where it cannot or will hardly reach `least`."""
+    """Sum, over fiducials, their nearness to a blob; stop early if `least` cannot, or will probably not, be reached."""
     x, y, z = shift
     focal, raster, origin, per_pixel = image
     height, width = raster.shape
@@ -277,7 +279,7 @@ def _score_pose(turn, shift, points, order, image, least):
 
 @njit(cache=True)
 def _rasterize(uv, count, cell, origin):
-    """Raster 1 - (distance to the nearest blob / tolerance)^2 for each camera, so that looking up replaces searching.
+    """Raster 1 - (distance to the nearest blob / tolerance)^2 for each camera, so that a lookup replaces the search.
 
     Returns:
         raster (C, H, W); `origin` gets the pixel coordinates (C, 2) of its corner.

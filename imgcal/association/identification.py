@@ -1,4 +1,4 @@
-"""Decide which blob is which fiducial: by prediction where a pose is known, else by votes of the whole rig."""
+"""Match blobs to fiducials: by prediction if a pose is known, otherwise by votes of the whole rig."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
 FIRST_HYPOTHESES = 8_000  # in the first round: large objects get fewer triples of blobs; then twice as many each time
-MOST_HYPOTHESES = 400_000  # in a round
-MOST_FALSE = 40  # blobs a fiducial, above which three of them drawn in all rounds are hardly ever fiducials
-MOST_PAIRS = 30_000_000  # of fiducials and blobs: what memory allows
-PATIENCE = 3  # rounds that end with two good labellings
-MOST_STEPS = 6  # from one labelling to a better one of the moved object
-APPROXIMATE = 0.02  # rad, what poses from three points are off by, even for a perfect camera
-EXCLUDED = 60.0  # margin of a labelling in one camera, above which the rig need not be asked
-LEAST_ALONE = 6  # labels from which one camera can be fitted by itself
-STICK_SHARE = 0.5  # of the share that others must explain: a marker whose neighbour is hidden has no label at first
-MOST_SHARED = 0.2  # share of a labelling's blobs that another one may use, for both to be in view
-# Explained part near a known pose, below which it is asked whether another pose explains more: an object shifted by its
-# own edge still explains half.
+MOST_HYPOTHESES = 400_000  # per round
+MOST_FALSE = 40  # blobs per fiducial; with more, random triples are hardly ever three fiducials
+MOST_PAIRS = 30_000_000  # of fiducials and blobs: limit of memory
+PATIENCE = 3  # number of rounds with two good labellings before giving up
+MOST_STEPS = 6  # number of moves to a better labelling of the shifted or turned object
+APPROXIMATE = 0.02  # rad, error of poses from three points, even for a perfect camera
+EXCLUDED = 60.0  # margin of a labelling in one camera that makes a test with the rig unnecessary
+LEAST_ALONE = 6  # minimum number of labels for a fit of one camera alone
+STICK_SHARE = 0.5  # factor on the required share: a marker with a hidden neighbour has no label at first
+MOST_SHARED = 0.2  # maximum share of common blobs for two labellings to be two objects in view
+# Explained share near a known pose below which other poses are tried, too: an object shifted by its own edge still
+# explains half.
 CONVINCING = 0.6
 
 
@@ -74,17 +74,18 @@ def identify(
     options: IdentityOptions = IdentityOptions(),
     guesses: Sequence[RigidTransform] = (),
 ) -> Identity:
-    """Label the blobs of one snapshot: try the candidate poses first, then the guesses, then look for others.
+    """Label the blobs of one snapshot: try the candidate poses, then the guesses, then search for others.
 
     Args:
         detections: blobs of one snapshot; only usable ones count.
         rig: factory rig without batch axes, float64.
         obj: the calibration object.
-        std: (C, K) prior standard deviation of each camera's parameters: how far the factory values may be off.
-        candidates: rig_from_object that may hold, the likeliest first: last snapshot's, or one known from the set-up.
-        options: how sure to be.
-        guesses: rig_from_object that nobody knows anything of, but that are worth a look: what is found there must
-            stand against all turns of the object, as without them.
+        std: (C, K) prior standard deviation of each camera's parameters relative to the factory values.
+        candidates: rig_from_object that may hold, most probable first: the last snapshot's, or one known from the
+            set-up.
+        options: how certain the result must be.
+        guesses: rig_from_object that are mere guesses worth a try: a labelling found there must beat all rotations of
+            the object, as one found without them.
 
     Returns:
         The decision; `Identity.accepted` tells whether the labels may be used.
@@ -112,8 +113,8 @@ def track(
     *,
     pose_known: bool = True,
 ) -> Identity:
-    """Label the blobs of one snapshot near a pose; arguments as in `identify`, `pose_known` = it is no mere guess."""
-    if obj.pose_rank < 6:  # where it was says little: it takes no pattern to be shifted onto something else
+    """Label the blobs of one snapshot near a pose; arguments as in `identify`; `pose_known`: it is not a mere guess."""
+    if obj.pose_rank < 6:  # its last pose says little: without a pattern it easily fits something else
         return relocalize(detections, rig, obj, std, options)
     scene = Scene(gather(detections, rig), obj, rig, std)
     if scene.blobs.uv[..., 0].size * obj.num_fiducials > MOST_PAIRS:
@@ -122,7 +123,7 @@ def track(
     predicted = predict_ideal(rig, scene.obj.points.numpy(), poses)
     distance = float(np.median(_distances(rig, poses, obj)))
     tolerance, gate = _bounds(scene, distance, pose_known=True)
-    # Where the fiducials are dense, a wide tolerance pairs them with anything: also try a narrow one.
+    # If the fiducials are dense, a wide tolerance pairs them with anything: also try a narrow one.
     gap = spacing(predicted[0])
     tolerances = [tolerance, max(3.0, 0.2 * gap)] if tolerance > 0.4 * gap else [tolerance]
     attempts = [
@@ -140,14 +141,14 @@ def relocalize(
     std: Tensor,
     options: IdentityOptions = IdentityOptions(),
 ) -> Identity:
-    """Label the blobs of one snapshot with no pose known; arguments as in `identify`."""
+    """Label the blobs of one snapshot without a known pose; arguments as in `identify`."""
     if obj.pose_rank == 3:
         return identify_points(detections, rig, obj, std, options)
     scene = Scene(gather(detections, rig), obj, rig, std)
     if obj.pose_rank == 5:
         sticks = fit_sticks(scene, options.seed)
         if sticks is None:
-            return _refuse(scene, "no markers at the object's distances from each other, on which cameras agree")
+            return _refuse(scene, "cameras agree on no markers with the distances of the object")
         return replace(_decide(scene, sticks, options, known_pose=False), hypotheses=1)
     cameras = np.flatnonzero(scene.blobs.count >= 4)
     if len(cameras) == 0:
@@ -172,7 +173,7 @@ def relocalize(
         if fresh is not None:
             fits = fresh if fits is None else _best(scene, join((fits, fresh)), 2 * VERIFIED)
             result = _decide(scene, fits, options, known_pose=False)
-            # Where two labellings explain enough, more hypotheses will not tell them apart.
+            # If two labellings explain enough, more hypotheses will not separate them.
             undecided += result.undecided
         if result.accepted or undecided == PATIENCE or search.hypotheses > options.most_hypotheses:
             break
@@ -182,14 +183,14 @@ def relocalize(
 
 
 def _best(scene: Scene, fits: Fits, count: int) -> Fits:
-    """Keep the labellings with the most evidence, if there are more than so many."""
+    """Keep the `count` labellings with the most evidence."""
     if len(fits.labels) <= count:
         return fits
     return fits.select(np.argsort(-evidence(scene, fits), kind="stable")[:count])
 
 
 def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool) -> Identity:
-    """Accept the best labelling or say why not."""
+    """Accept the best labelling, or say why not."""
     odds, least_share = (options.label_odds, options.least_label_odds), options.least_share
     if scene.obj.pose_rank < 6:
         least_share *= STICK_SHARE
@@ -230,11 +231,11 @@ def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool
 
 
 def _too_little(name: str, fitted: float, certain_share: float, least: float) -> str:
-    """Say why too few labels are certain: nothing fits, or what fits could be something else."""
+    """Say why too few labels are certain: nothing fits, or the fit is ambiguous."""
     if fitted >= least:
         return (
             f"the best fit explains {100 * fitted:.0f} % of the visible markers, but labels are certain of only "
-            f"{100 * certain_share:.0f} %, expected {100 * least:.0f} %: too few blobs, or too many that are no "
+            f"{100 * certain_share:.0f} %, expected {100 * least:.0f} %: too few blobs, or too many that are not "
             "fiducials; show more of the object, to more cameras"
         )
     return (
@@ -245,9 +246,9 @@ def _too_little(name: str, fitted: float, certain_share: float, least: float) ->
 
 
 def _share(scene: Scene, fits: Fits, options: IdentityOptions) -> float:
-    """Labelled part of what could be seen: in each camera, the smaller of blobs and fiducials.
+    """Labelled share of the visible fiducials: in each camera, at most the smaller number of blobs and fiducials.
 
-    Of sticks, and where other objects may be in view, only fiducials that the fit has in the image could be seen.
+    For sticks, and if other objects may be in view, only fiducials that the fit puts into the image count as visible.
     """
     fiducials: NDArray[np.int64] | int = scene.obj.num_fiducials
     if options.others_in_view or scene.obj.pose_rank < 6:
@@ -262,13 +263,13 @@ def _cameras(fits: Fits) -> int:
 
 
 def _beside(best: Fits, others: Fits) -> NDArray[np.bool_]:
-    """Tell which labellings (K,) are of other blobs than the best one: they may be another object."""
+    """Tell which labellings (K,) use other blobs than the best one: they may be another object."""
     shared = np.array([common_blobs(best.labels[0], labels).sum() for labels in others.labels])
     return shared <= MOST_SHARED * np.maximum((others.labels >= 0).sum((1, 2)), 1)
 
 
 def _nearly_as_good(scene: Scene, best: Fits, others: Fits, least: float) -> NDArray[np.int64] | None:
-    """Labels (M,) of the best of other labellings; None where it is worse by `least` log odds."""
+    """Labels (M,) of the best of other labellings; None if it is worse by `least` log odds."""
     strength = evidence(scene, others)
     row = int(strength.argmax())
     if strength[row] <= max(0.0, float(evidence(scene, best)[0]) - least):
@@ -284,7 +285,7 @@ def _margin(scene: Scene, best: Fits, others: Fits) -> float:
 
 
 def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, float]:
-    """Compare a labelling with those of an object shifted or turned onto itself; change to a better one.
+    """Compare a labelling with those of an object shifted or turned onto itself, and change to a better one.
 
     A lattice may be shifted in all cameras together, or in a single one as far as its prior allows.
 
@@ -322,19 +323,20 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
 def _compare_with_shifts(
     scene: Scene, best: Fits, shifts: list[Ambiguity], reach: NDArray[np.float64]
 ) -> list[tuple[float, int, NDArray[np.int64]]]:
-    """Compare a labelling with those in which the object is shifted for one camera alone, as that camera sees it.
+    """Compare a labelling with those in which a single camera sees the object shifted, by that camera's own fit.
 
-    A camera by itself, its pose free, knows only which labelling explains more of its blobs. What it would rather not
-    have, the rig does not want either: there, the shift must be borne by the camera's prior in addition.
+    A single camera with a free pose only shows which labelling explains more of its blobs. A shift that it rejects is
+    also rejected by the rig, where the camera's prior must bear the shift as well.
 
     Args:
         scene: the snapshot.
         best: a labelling, fitted.
         shifts: steps of a lattice.
-        reach: (C,) pixels, farther shifts are beyond the prior.
+        reach: (C,) pixels; larger shifts are beyond the prior.
 
     Returns:
-        Margin against the labelling in that camera, camera, labels (C, N) of all cameras; margin 0 = it cannot tell.
+        Margin of the labelling over the shifted one in that camera, camera, labels (C, N) of all cameras; 0 =
+        undecided.
     """
     pose = select_pose(scene, best, 0)
     labels, uv, found = best.labels[0], predictions(best), []
@@ -362,7 +364,7 @@ def _compare_with_shifts(
 def _prefer_shifts(
     labels: NDArray[np.int64], alone: list[tuple[float, int, NDArray[np.int64]]]
 ) -> NDArray[np.int64] | None:
-    """Labels (C, N) in which every camera has the shift that it likes better; None = they all like theirs best."""
+    """Labels (C, N) with the shift that each camera prefers; None = no camera prefers a shift."""
     together, least = labels.copy(), np.zeros(len(labels))
     for margin, camera, shifted in alone:
         if margin < least[camera]:
@@ -378,7 +380,7 @@ def _too_many(scene: Scene) -> str:
     name = scene.rig.camera_names[int(scene.blobs.count.argmax())]
     return (
         f"too many blobs: found {scene.blobs.count.max()} in camera {name}, where an object of "
-        f"{scene.obj.num_fiducials} fiducials is expected; raise the detection threshold, or mask what is no marker"
+        f"{scene.obj.num_fiducials} fiducials is expected; raise the detection threshold, or mask what is not a marker"
     )
 
 
@@ -388,10 +390,10 @@ def _refuse(scene: Scene, reason: str) -> Identity:
 
 
 def _bounds(scene: Scene, distance: float, pose_known: bool) -> tuple[float, float]:
-    """How far (px) a fiducial may be from its place in the pattern, and how far the pattern from its own.
+    """Maximum errors (px) of a fiducial within the pattern, and of the pattern's place.
 
-    Both follow from the prior. A pose from one camera is off as much as that camera, and its depth as much as its focal
-    length, which shifts the images of cameras at other places.
+    Both follow from the prior. A pose from one camera inherits the camera's error, and its depth that of the focal
+    length, which shifts the images of cameras elsewhere.
     """
     pattern: PatternPrior = pattern_prior(scene.std, scene.rig, distance)
     focal = float(scene.rig.focal_length.mean())
@@ -404,12 +406,12 @@ def _bounds(scene: Scene, distance: float, pose_known: bool) -> tuple[float, flo
 
 
 def _guess_distance(scene: Scene) -> float:
-    """Distance at which the object looks about as large as the cloud of blobs, mm."""
+    """Distance (mm) at which the object looks about as large as the cloud of blobs."""
     focal = scene.rig.focal_length.mean(-1).numpy()
     guesses = []
     for camera in np.flatnonzero(scene.blobs.count >= 4):
         uv = scene.blobs.ideal[camera, : scene.blobs.count[camera]]
-        away = np.hypot(*(uv - np.median(uv, axis=0)).T)  # which a lens that is far from the truth may make huge
+        away = np.hypot(*(uv - np.median(uv, axis=0)).T)  # may be huge if the lens is far from the truth
         guesses.append(focal[camera] * scene.obj.size / max(float(away.mean()), 1.0))
     return float(np.median(guesses))
 

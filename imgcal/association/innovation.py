@@ -17,29 +17,29 @@ from imgcal.geometry import NEAREST_DEPTH, kernels, lens_codes, lens_kernels
 from renderers.compiling import njit
 
 THRESHOLD = 3.0
-"""Of the Cauchy loss of the fits, in standard deviations."""
+"""Threshold of the fits' Cauchy loss, in standard deviations."""
 
 
 @dataclass(frozen=True)
 class Innovations:
-    """How well each blob fits each fiducial, given all labels but the fiducial's own."""
+    """How well each blob fits each fiducial, predicted from all labels except the fiducial's own."""
 
     squared: NDArray[np.float64]  # (K, C, N, M) squared distance from the prediction, normalized by its covariance
-    log_det: NDArray[np.float64]  # (K, C, N) of that covariance, which includes the blob's noise, px^4
+    log_det: NDArray[np.float64]  # (K, C, N) log determinant of that covariance, blob noise included, px^4
     own: NDArray[np.float64]  # (K, C, N) `squared` of the fiducial's own blob, inf = no label
     residual: NDArray[np.float64]  # (K, C, N) squared distance px^2 from the fit that includes the label
-    freedom: NDArray[np.float64]  # (K, C, N) degrees of freedom that the label leaves to its residual: 0 to 2
+    freedom: NDArray[np.float64]  # (K, C, N) degrees of freedom of the label's residual: 0 to 2
     uv: NDArray[np.float64]  # (K, C, N, 2) px, predictions
-    complexity: NDArray[np.float64]  # (K,) log of det of posterior precision over prior precision
+    complexity: NDArray[np.float64]  # (K,) log determinant ratio of posterior and prior precision
 
     def select(self, rows: NDArray[np.int64]) -> Innovations:
-        """Keep the given labellings; a single one is not copied."""
+        """Keep the given labellings, without a copy if it is a single one."""
         chosen = one_or_some(rows)
         return Innovations(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 def one_or_some(rows: NDArray[np.int64]) -> slice | NDArray[np.int64]:
-    """Index that keeps rows of an array: as a view where it is one, which may be many megabytes."""
+    """Index for rows of an array: for a single row a slice, to avoid a copy of many megabytes."""
     return slice(rows[0], rows[0] + 1) if len(rows) == 1 else rows
 
 
@@ -50,16 +50,16 @@ def innovations(
 
     Args:
         blobs: the snapshot.
-        labels: (K, C, N) blob of each fiducial, -1 = none: those of the fit.
-        sigma: (K,) px, noise of blob centres beyond their own.
-        problem: the fit's.
+        labels: (K, C, N) labels of the fit: blob of each fiducial, -1 = none.
+        sigma: (K,) px, noise of blob centres beyond their own sigmas.
+        problem: the problem of the fit.
         solution: the fit.
     """
     count, cameras, fiducials = labels.shape
     radius_squared = np.zeros(fiducials) if problem.radius_squared is None else problem.radius_squared.numpy()
     noise, typical = blobs.noise
     shape = (count, cameras, fiducials)
-    # Filled below, all of it; it may be many megabytes.
+    # Uninitialized: filled completely below, and may be many megabytes.
     squared, log_det, own = np.empty((*shape, blobs.uv.shape[1])), np.zeros(shape), np.full(shape, np.inf)
     residual, freedom, uv = np.zeros(shape), np.zeros(shape), np.zeros((*shape, 2))
     complexity = np.full(count, np.inf)
@@ -84,7 +84,7 @@ def innovations(
         if not fitted:
             squared[k] = np.inf
             continue
-        # Lower factors of the cameras' blocks, of the couplings' and of the pose's: see schur.reduce.
+        # Lower factors of the blocks of the cameras, the couplings and the pose: see schur.reduce.
         eliminated = equations.camera[k].numpy().copy()
         whitened = equations.coupling[k, 0].numpy().copy()
         kept = equations.pose[k, 0].numpy().copy()
@@ -102,12 +102,12 @@ def innovations(
 
 
 def find_contested(labels: NDArray[np.int64], found: Innovations, undecided: float) -> NDArray[np.bool_]:
-    """Mark labels (K, C, N) whose blob may as well belong to another fiducial, alone or in exchange for its blob.
+    """Mark labels (K, C, N) whose blob fits another fiducial about as well, alone or in exchange for its blob.
 
     Args:
-        labels: (K, C, N) blob of each fiducial, -1 = none: those of the fit.
+        labels: (K, C, N) labels of the fit: blob of each fiducial, -1 = none.
         found: from `innovations`.
-        undecided: how little the squared normalized innovations of two pairings may differ.
+        undecided: difference of squared normalized innovations below which two pairings are indistinguishable.
     """
     result = np.zeros(labels.shape, dtype=bool)
     _contest(labels, found.squared, found.log_det, found.own, undecided, result)
@@ -133,7 +133,7 @@ def _contest(labels, squared, log_det, own, undecided, result):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _factorize(blocks, coupling, kept):
-    """Factorize the arrow in place; return the logarithm of its determinant, inf where it is not positive definite."""
+    """Factorize the arrow matrix in place; return its log determinant, inf if it is not positive definite."""
     log_det = 0.0
     for c in range(len(blocks)):
         if not kernels.cholesky(blocks[c]):
@@ -158,12 +158,12 @@ def _factorize(blocks, coupling, kept):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _compare(given, factors, blobs, outputs):
-    """Fill the outputs for one labelling.
+    """Fill in the outputs for one labelling.
 
     Args:
-        given: the factory's rotations, and the rest of the fitted cameras, the prior, the object and its place.
-        factors: of the arrow; see `_factorize`.
-        blobs: their places, noise, usual noise and number, what they are labelled, and noise beyond their own.
+        given: the factory's rotations; the other values of the fitted cameras; the prior; the object and its position.
+        factors: factors of the arrow matrix; see `_factorize`.
+        blobs: their places, noise, typical noise, number, labels, and noise beyond their own.
         outputs: as in `Innovations`.
     """
     rotation0, turn, position, focal, principal, distortion, prior_std, rotated, centre, radius_squared, lenses = given
@@ -189,7 +189,7 @@ def _compare(given, factors, blobs, outputs):
             residual[c, n], freedom[c, n], own[c, n] = 0.0, 0.0, np.inf
             if label >= 0:
                 # Leaving the label out turns the prediction's covariance H into (W - H)^-1 W H and its error e into
-                # (W - H)^-1 W e, with W the noise over the weight that the robust loss gave the label.
+                # (W - H)^-1 W e, where W is the noise divided by the weight that the robust loss gave the label.
                 eu, ev = at_u - blob_uv[c, label, 0], at_v - blob_uv[c, label, 1]
                 residual[c, n] = eu * eu + ev * ev
                 weighted = noise + residual[c, n] / THRESHOLD**2
@@ -197,7 +197,7 @@ def _compare(given, factors, blobs, outputs):
                 a, b, d = weighted - uu, -uv_, weighted - vv
                 det = a * d - b * b
                 if not (a > 0 and d > 0 and det > 1e-9 * weighted * weighted):
-                    # Nothing but the label itself says where the fiducial is.
+                    # Only the label itself determines the fiducial's place.
                     a, b, d, det = 1e-4 * weighted, 0.0, 1e-4 * weighted, 1e-8 * weighted * weighted
                 scale = weighted / det
                 at_u = blob_uv[c, label, 0] + scale * (d * eu - b * ev)
@@ -223,10 +223,10 @@ def _rows(
     rotated, rotation, left, centre, position, focal, principal, lenses, camera, distortion, prior_std, radius_squared,
     unit, rows, uv,
 ):  # fmt: skip
-    """Fill the Jacobian (2, K + 6) of a pixel by K whitened camera and 6 pose parameters, and the pixel.
+    """Fill in the Jacobian (2, K + 6) of a pixel by K whitened camera and 6 pose parameters, and the pixel.
 
-    To the last digit that of the fit (`linearization_cpu.linearize_rig`): where a label alone decides a parameter,
-    nothing is left of it but the difference of two almost equal numbers.
+    Equal to that of the fit (`linearization_cpu.linearize_rig`) to the last digit: if a label alone determines a
+    parameter, the result is the difference of two almost equal numbers.
     """
     ax, ay, az = rotated[0], rotated[1], rotated[2]
     ox, oy, oz = ax + centre[0] - position[0], ay + centre[1] - position[1], az + centre[2] - position[2]
@@ -262,7 +262,7 @@ def _rows(
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _whiten(rows, eliminated, whitened, kept, parts):
-    """Apply the inverse of the arrow's triangular factor; return the covariance parts @ parts.T: uu, uv, vv."""
+    """Apply the inverse of the arrow matrix's triangular factor; return the covariance parts @ parts.T: uu, uv, vv."""
     free = len(eliminated)
     for r in range(2):
         for i in range(free):

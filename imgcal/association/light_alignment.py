@@ -1,4 +1,4 @@
-"""Compiled sums that bring a rig nearer to blobs without labels: each blob lies on the likeliest epipolar lines."""
+"""Compiled sums for aligning a rig to unlabelled blobs: each blob should lie on its most probable epipolar lines."""
 
 # Compiled functions take their types from their arguments.
 # ruff: noqa: ANN001, ANN201, ANN202
@@ -13,11 +13,11 @@ import numpy as np
 from renderers.compiling import njit
 
 FREE = 10
-"""Parameters of a camera that take part: rotation, position, focal lengths, principal point."""
+"""Number of a camera's free parameters: rotation, position, focal lengths, principal point."""
 CUT = 9.0
 """Squared standard deviations beyond which a blob is not on a line."""
 REDUNDANCY = 0.4
-"""Of pairs of cameras: ten cameras that see a point make 45 distances of 20 coordinates, less three of the point."""
+"""Weight of pairs of cameras: ten cameras give 45 distances from 20 coordinates, less three of the point."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -25,14 +25,14 @@ def epipolar_equations(xy, start, rotation, position, focal, scale, width, chanc
     """Fill in the normal equations of whitened parameters, and return the cost and the sum of weights.
 
     Args:
-        xy: (M, 2) blobs of all moments in the order of moments and cameras, on the plane z = 1 without distortion.
-        start: (S, C + 1) where the blobs of each camera begin.
+        xy: (M, 2) blobs of all moments, ordered by moment and camera, on the plane z = 1 without distortion.
+        start: (S, C + 1) first blob of each camera.
         rotation: (C, 3, 3) cam_from_rig.
         position: (C, 3) mm.
         focal: (C, 2) px.
         scale: (C, FREE) standard deviation of each parameter.
-        width: px, of the distance of a blob from the epipolar line of the same marker.
-        chance: weight of no partner, in units of a partner right on the line.
+        width: px, standard deviation of the distance of a blob from its marker's epipolar line.
+        chance: weight of "no partner", relative to a partner exactly on the line.
         information: (C FREE, C FREE).
         gradient: (C FREE,).
     """
@@ -96,7 +96,7 @@ def epipolar_equations(xy, start, rotation, position, focal, scale, width, chanc
 
 @njit(cache=True, error_model="numpy")
 def _distance(one, two, rotation1, rotation2, position1, position2, focal1, focal2, jacobian, with_jacobian):
-    """Distance (px) of two blobs from being one point (Sampson's), inf behind a camera; its derivatives if wanted."""
+    """Distance (px) of two blobs from showing one point (Sampson's), inf behind a camera; derivatives on request."""
     x1, y1, x2, y2 = one[0], one[1], two[0], two[1]
     ax = rotation1[0, 0] * x1 + rotation1[1, 0] * y1 + rotation1[2, 0]
     ay = rotation1[0, 1] * x1 + rotation1[1, 1] * y1 + rotation1[2, 1]
@@ -118,7 +118,7 @@ def _distance(one, two, rotation1, rotation2, position1, position2, focal1, foca
     if not spread > 0:
         return np.inf
     if not with_jacobian:
-        # before both cameras: along1 and along2 of the nearest points, up to a positive factor
+        # In front of both cameras: along1 and along2 of the nearest points, up to a positive factor.
         aa, bb, ab = ax * ax + ay * ay + az * az, bx * bx + by * by + bz * bz, ax * bx + ay * by + az * bz
         pa, pb = px * ax + py * ay + pz * az, px * bx + py * by + pz * bz
         if pa * bb - pb * ab <= 0 or pa * ab - pb * aa <= 0:
@@ -148,16 +148,16 @@ def image_equations(
     """Fill in the normal equations of one camera's whitened parameters; return the sum of weights.
 
     Args:
-        uv: (M, 2) px, its blobs in the order of moments, from the principal point and without distortion.
-        start: (S + 1,) where the blobs of each moment begin.
-        point: (P, 3) mm, markers that other cameras see, in the order of moments.
-        point_start: (S + 1,) where those of each moment begin.
+        uv: (M, 2) px, its blobs ordered by moment, from the principal point and without distortion.
+        start: (S + 1,) first blob of each moment.
+        point: (P, 3) mm, markers that other cameras see, ordered by moment.
+        point_start: (S + 1,) first marker of each moment.
         rotation: (3, 3) cam_from_rig.
         position: (3,) mm.
         focal: (2,) px.
         scale: (FREE,) standard deviation of each parameter.
-        width: px, of the distance of a blob from the image of its marker.
-        chance: weight of no partner, in units of a partner in its place.
+        width: px, standard deviation of the distance of a blob from its marker's image.
+        chance: weight of "no partner", relative to a partner exactly in place.
         information: (FREE, FREE).
         gradient: (FREE,).
     """
@@ -212,7 +212,7 @@ def image_equations(
 
 @njit(cache=True, error_model="numpy")
 def _camera_point(rotation, position, point):
-    """A point on the plane z = 1 of a camera, and its depth, 1 mm at least."""
+    """A point on the plane z = 1 of a camera, and its depth, at least 1 mm."""
     x, y, z = point[0] - position[0], point[1] - position[1], point[2] - position[2]
     depth = max(rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z, 1.0)
     across = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z

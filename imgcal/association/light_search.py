@@ -1,4 +1,4 @@
-"""Compiled search for unknown markers: places on which the rays of three cameras or more agree."""
+"""Compiled search for unknown markers: positions on which the rays of at least three cameras agree."""
 
 # Compiled functions take their types from their arguments.
 # ruff: noqa: ANN001, ANN201, ANN202
@@ -13,42 +13,42 @@ import numpy as np
 from renderers.compiling import njit
 
 REACH = 4.0
-"""Standard deviations of a camera's error within which a blob may be a place's image."""
+"""Maximum distance, in standard deviations of a camera's error, between a blob and a position's image."""
 FIRST_REACH = 6.0
-"""The same about the middle of two rays, which says less of where a third camera sees it."""
+"""The same for the midpoint of two rays, which predicts a third camera's view less accurately."""
 HIDDEN = 0.25
-"""Chance that a camera in whose view a marker is does not show it."""
+"""Probability that a camera does not show a marker in its view."""
 ROUNDS = 3
-"""Of choosing blobs near a place and placing it anew."""
+"""Iterations of choosing blobs near a position and triangulating it again."""
 CERTAIN = 4
-"""Cameras of a place whose pairs of rays need not be looked at any more."""
+"""Number of cameras of a position at which its pairs of rays need no further search."""
 MOST_PLACES = 60_000
-"""Of one moment; no more are collected."""
+"""Maximum number of positions at one moment."""
 SAME = 8.0
-"""Squared distances, in standard deviations, that a blob must be nearer than another one to be told from it."""
+"""Difference of squared distances, in standard deviations, that separates the right blob from another one."""
 PASSES = 6
-"""Of giving each blob to the best place."""
+"""Number of passes that give each blob to the best position."""
 NEIGHBOUR = 3
-"""The neighbour of a blob whose distance says how dense blobs are there."""
+"""Index of the neighbour whose distance defines the local density of blobs."""
 
 
 @njit(cache=True, error_model="numpy")
 def find_lights(xy, start, rotation, position, gate, half, least, witnesses, chosen, point, odds, margin):
-    """Fill in the places of one moment, the likeliest first, and return their number.
+    """Fill in the markers of one moment, most probable first, and return their number.
 
     Args:
-        xy: (M, 2) blobs in the order of their cameras, on the plane z = 1 without distortion.
-        start: (C + 1,) where the blobs of each camera begin.
+        xy: (M, 2) blobs ordered by camera, on the plane z = 1 without distortion.
+        start: (C + 1,) first blob of each camera.
         rotation: (C, 3, 3) cam_from_rig.
         position: (C, 3) mm.
-        gate: (C,) one standard deviation of what rig and blobs may be off, on the plane z = 1.
-        half: (C, 2) half of what the camera sees, on the plane z = 1.
-        least: log odds against false blobs that a place must have.
-        witnesses: cameras that must agree on a place.
+        gate: (C,) standard deviation of errors of rig and blobs, on the plane z = 1.
+        half: (C, 2) half of the camera's view, on the plane z = 1.
+        least: minimum log odds of a marker against false blobs.
+        witnesses: minimum number of cameras that agree on a marker.
         chosen: (R, C) blob in each camera, -1 = none.
         point: (R, 3) mm.
-        odds: (R,) log odds of the place against false blobs.
-        margin: (R,) log odds against the best other place that takes one of its blobs; inf = there is none.
+        odds: (R,) log odds of the marker against false blobs.
+        margin: (R,) log odds against the best other marker that uses one of its blobs; inf = there is none.
     """
     cameras, blobs = len(gate), len(xy)
     ray, density = np.empty((blobs, 3)), np.empty(blobs)
@@ -138,9 +138,9 @@ def find_lights(xy, start, rotation, position, gate, half, least, witnesses, cho
 
 @njit(cache=True, error_model="numpy")
 def find_all_lights(xy, start, rotation, position, gate, half, least, witnesses, chosen, point, odds, margin, moment):
-    """Do the work of `find_lights` for moments whose blobs follow each other: `start` (S, C + 1); return the rows.
+    """Do the work of `find_lights` for successive moments: `start` (S, C + 1); return the number of rows.
 
-    `moment` (R,) is filled with the number of each row's moment; blobs are counted over all moments.
+    `moment` (R,) is filled with the moment of each row; blobs are counted over all moments.
     """
     rows = 0
     for s in range(len(start)):
@@ -160,7 +160,7 @@ def find_all_lights(xy, start, rotation, position, gate, half, least, witnesses,
 
 @njit(cache=True, error_model="numpy")
 def _prepare(xy, start, rotation, position, half, ray, density):
-    """Fill in unit rays in the rig's frame and the density of blobs around each; return the volume of places, mm^3."""
+    """Fill in unit rays in the rig's frame and the local densities of blobs; return the volume of positions, mm^3."""
     cameras = len(position)
     mean = np.zeros(3)
     for c in range(cameras):
@@ -197,7 +197,7 @@ def _length(x, y, z):
 
 @njit(cache=True, error_model="numpy")
 def _meet(d1, d2, p1, p2, gate1, gate2, place):
-    """Tell whether two rays nearly meet before both cameras, and fill in the place in the middle."""
+    """Tell whether two rays nearly meet in front of both cameras, and fill in the midpoint."""
     bx, by, bz = p2[0] - p1[0], p2[1] - p1[1], p2[2] - p1[2]
     cosine = d1[0] * d2[0] + d1[1] * d2[1] + d1[2] * d2[2]
     sine = 1 - cosine * cosine
@@ -218,7 +218,7 @@ def _meet(d1, d2, p1, p2, gate1, gate2, place):
 
 @njit(cache=True, error_model="numpy")
 def _explore(xy, start, ray, density, rotation, position, gate, half, used, volume, witnesses, place, hit):
-    """Choose the blobs near a place and move it to where these see it, by turns; return log odds and cameras."""
+    """Alternate between choosing blobs near a position and triangulating it from them; return log odds and cameras."""
     seen, value, information = 0, -np.inf, np.empty((3, 3))
     for turn in range(ROUNDS + 1):
         reach = FIRST_REACH if turn == 0 else REACH
@@ -256,7 +256,7 @@ def _explore(xy, start, ray, density, rotation, position, gate, half, used, volu
 
 @njit(cache=True, error_model="numpy")
 def _image(rotation, position, place):
-    """A place on the plane z = 1 of a camera, and its depth."""
+    """A position on the plane z = 1 of a camera, and its depth."""
     x, y, z = place[0] - position[0], place[1] - position[1], place[2] - position[2]
     depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
     across = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
@@ -266,7 +266,7 @@ def _image(rotation, position, place):
 
 @njit(cache=True, error_model="numpy")
 def _solve(ray, position, gate, hit, place, information):
-    """Move a place to where its rays pass nearest, and fill in its information (3, 3), 1 / mm^2."""
+    """Move a position to where its rays pass nearest, and fill in its information (3, 3), 1 / mm^2."""
     target = np.zeros(3)
     information[:] = 0.0
     for c in range(len(gate)):
@@ -304,7 +304,7 @@ def _determinant(m):
 
 @njit(cache=True, error_model="numpy")
 def _note_rival(hits, value, owner, odds, margin, rows):
-    """Lower the margin of places whose blobs another place would put together with two or more others."""
+    """Lower the margin of markers whose blobs another one would combine with at least two others."""
     total = 0
     for c in range(len(hits)):
         total += hits[c] >= 0
@@ -318,7 +318,7 @@ def _note_rival(hits, value, owner, odds, margin, rows):
 
 @njit(cache=True, error_model="numpy")
 def _drop_doubtful(xy, start, rotation, position, gate, chosen, point, owner, rows):
-    """Leave out blobs beside which another one may be the marker as well, alone or in exchange."""
+    """Remove blobs if a blob nearby may equally be the marker, alone or in exchange."""
     doubtful = np.zeros((rows, len(gate)), dtype=np.bool_)
     for row in range(rows):
         for c in range(len(gate)):

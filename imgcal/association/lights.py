@@ -1,7 +1,7 @@
-"""Unknown markers: which blobs of different cameras are the same one, moment by moment.
+"""Unknown markers: find which blobs of different cameras are the same marker, moment by moment.
 
-`associate_lights` needs a rig that is right to a few pixels (`error`). Where the rig is farther off than
-markers are apart, `align_rig` brings it nearer first, from the blobs of many moments at once and without labels.
+`associate_lights` needs a rig that is accurate to a few pixels (`error`). If the rig is off by more than the spacing of
+the markers, `align_rig` improves it first, from the unlabelled blobs of many moments at once.
 """
 
 from __future__ import annotations
@@ -23,35 +23,35 @@ from imgcal.types import CameraRig, Detections
 Array = NDArray[np.float64]
 
 LEAST_ODDS = 6.0
-"""Log odds against false blobs from which a place is a marker."""
+"""Minimum log odds of a marker against false blobs."""
 LEAST_CAMERAS = 3
-"""That must agree on a marker."""
+"""Minimum number of cameras that agree on a marker."""
 STEPS, SHRINK = 20, 0.8
-"""Of `align_rig`, and how much narrower each takes the lines."""
+"""Number of steps of `align_rig`, and the factor by which each narrows the lines."""
 NARROWEST = 1.0
-"""px, width of the lines at the end."""
+"""px, final width of the lines."""
 CHANCE = 0.5
-"""Weight of no partner on a line, in units of a partner right on it."""
+"""Weight of "no partner" on a line, relative to a partner exactly on it."""
 SHIFTS = ((60.0, 0.0), (-60.0, 0.0), (0.0, 60.0), (0.0, -60.0), (45.0, 45.0), (-45.0, -45.0))
-"""px: places beside predicted ones that tell how often a blob is there by chance."""
+"""px: offsets from predicted places at which chance matches are counted."""
 VIEW = 0.03
-"""Of the image's size, from its border: as far predicted markers may be out of view."""
+"""Margin at the image border, as a share of its size, in which predicted markers may be out of view."""
 LEAST_MOMENTS, STILL, SHARE_OF_MOMENTS = 8, 1.0, 0.5
-"""Moments of a camera from which on something can be said never to move; px that it may; and in how many of them it
-must be there."""
+"""Minimum number of a camera's moments for background detection; maximum motion (px) of a static blob; minimum share of
+moments that show it."""
 MOST_PAIRS = 150_000
-"""Of blobs, that each step of `align_rig` looks at: it takes moments evenly from all."""
+"""Maximum number of blob pairs per step of `align_rig`, evenly over the moments."""
 
 
 @dataclass(frozen=True)
 class Lights:
-    """Markers found at some moments, the likeliest of each moment first."""
+    """Markers found at some moments, most probable first at each moment."""
 
     row: NDArray[np.int64]  # (R, C) row of the detections in each camera, -1 = none
     moment: NDArray[np.int64]  # (R,) number of the snapshot
     point: Array  # (R, 3) mm in the rig's frame
     odds: Array  # (R,) log odds against false blobs
-    margin: Array  # (R,) log odds against the best other place that takes one of its blobs; inf = there is none
+    margin: Array  # (R,) log odds against the best rival that uses one of its blobs; inf = none
 
     def __len__(self) -> int:
         return len(self.row)
@@ -68,10 +68,10 @@ class Lights:
 
 @dataclass(frozen=True)
 class SortedBlobs:
-    """Usable blobs in the order of moments and cameras, on the plane z = 1 without distortion."""
+    """Usable blobs ordered by moment and camera, on the plane z = 1 without distortion."""
 
     xy: Array  # (M, 2)
-    start: NDArray[np.int64]  # (S, C + 1) where the blobs of each moment and camera begin
+    start: NDArray[np.int64]  # (S, C + 1) first blob of each moment and camera
     row: NDArray[np.int64]  # (M,) row of the detections
 
 
@@ -82,20 +82,20 @@ def associate_lights(
     least_odds: float = LEAST_ODDS,
     least_cameras: int = LEAST_CAMERAS,
 ) -> Lights:
-    """Find the markers of each moment: blobs of three cameras or more that may be one place.
+    """Find the markers of each moment: blobs of at least three cameras that may show one point.
 
-    Each blob belongs to one marker at most. Blobs beside which another one may be the marker as well are left out.
+    Each blob belongs to at most one marker. Blobs are left out if a blob nearby may equally be the marker.
 
     Args:
-        detections: blobs of one moment or more, cameras as in the rig; labels are not looked at.
+        detections: blobs of one or more moments, cameras as in the rig; labels are ignored.
         rig: without batch axes, float64.
-        error: (C,) px, one standard deviation of what rig and blobs may be off in each camera, see `image_error`; the
-            nearer the rig, the denser the markers may be.
-        least_odds: log odds against false blobs that a marker must have.
-        least_cameras: that must agree on it; two rays that happen to meet are no witness of each other.
+        error: (C,) px, standard deviation of errors of rig and blobs in each camera, see `image_error`; a more accurate
+            rig allows denser markers.
+        least_odds: minimum log odds of a marker against false blobs.
+        least_cameras: minimum number of cameras that agree on it; two rays may meet by chance.
 
     Returns:
-        One row a marker and moment.
+        One row per marker and moment.
 
     Examples:
         >>> import imgcal
@@ -142,7 +142,7 @@ def sort_blobs(detections: Detections, rig: CameraRig) -> SortedBlobs:
 
 
 def image_error(rig: CameraRig, std: Tensor) -> Array:
-    """How far blobs may be from where a rig has them: (C,) px, one standard deviation.
+    """Standard deviation of blobs around their predictions by a rig: (C,) px.
 
     Args:
         rig: without batch axes.
@@ -159,17 +159,18 @@ def image_error(rig: CameraRig, std: Tensor) -> Array:
 def align_rig(
     detections: Detections, rig: CameraRig, std: Tensor, first: CameraRig | None = None, seed: int = 0
 ) -> tuple[CameraRig, float]:
-    """Bring a rig nearer to blobs without labels, so that most of them lie on epipolar lines of blobs of all others.
+    """Align a rig to unlabelled blobs, so that most of them lie on epipolar lines of blobs of all other cameras.
 
-    Each blob is laid onto the likeliest lines of each other camera, lines as wide as the rig is off at first and
-    narrower step by step; what is least squares then is solved by Gauss and Newton, with the factory's prior.
+    Each blob is attracted by the most probable lines of each other camera. The lines are as wide as the rig's error at
+    first, and become narrower step by step. Each least squares problem is solved by Gauss-Newton, with the factory's
+    prior.
 
     Args:
-        detections: blobs of many moments; labels are not looked at.
+        detections: blobs of many moments; labels are ignored.
         rig: the factory rig.
         std: (C, K) its prior.
-        first: where to begin; None = the factory rig.
-        seed: of the choice of moments.
+        first: initial rig; None = the factory rig.
+        seed: of the random choice of moments.
 
     Returns:
         The rig, and the mean log likelihood of a blob in a pair of cameras: larger is better.
@@ -207,18 +208,18 @@ def align_rig(
 def align_camera(
     detections: Detections, rig: CameraRig, std: Tensor, now: CameraRig, camera: int, lights: Lights
 ) -> CameraRig:
-    """Bring one camera nearer to markers that the others see: each blob is laid onto the likeliest of them.
+    """Align one camera to markers that the others see: each blob is attracted by its most probable markers.
 
     Args:
-        detections: blobs of the same moments; labels are not looked at.
-        rig: the factory rig, from whose values the camera starts.
+        detections: blobs of the same moments; labels are ignored.
+        rig: the factory rig, whose values the camera starts from.
         std: (C, K) its prior.
         now: the rig in whose frame the markers are.
-        camera: which.
+        camera: index of the camera.
         lights: markers that others see.
 
     Returns:
-        `now` with another camera.
+        `now` with this camera aligned.
     """
     blobs = sort_blobs(detections.select(detections.camera == camera), rig)
     order = np.argsort(lights.moment, kind="stable")
@@ -255,7 +256,7 @@ def align_camera(
 
 
 def _spread_area(blobs: SortedBlobs, start: NDArray[np.int64]) -> float:
-    """Area that the blobs of one moment cover, on the plane z = 1: the median over moments, four deviations wide."""
+    """Median area of one moment's blobs on the plane z = 1, four standard deviations wide."""
     parts = [blobs.xy[a:b] for a, b in pairwise(start) if b - a > 2]
     sides = [16 * float(np.prod(np.std(part, axis=0))) for part in parts]
     return max(float(np.median(sides)) if sides else 1.0, 1e-4)
@@ -288,7 +289,7 @@ def background_rows(detections: Detections) -> NDArray[np.bool_]:
         if moments < LEAST_MOMENTS:
             continue
         near = cKDTree(uv).query_ball_point(uv, STILL, return_length=True)
-        for k in np.flatnonzero(near >= SHARE_OF_MOMENTS * moments):  # few: markers move on
+        for k in np.flatnonzero(near >= SHARE_OF_MOMENTS * moments):  # few: markers move
             there = np.square(uv - uv[k]).sum(1) <= STILL**2
             marked[rows[k]] = len(np.unique(snapshot[there])) >= SHARE_OF_MOMENTS * moments
     return marked
@@ -297,20 +298,20 @@ def background_rows(detections: Detections) -> NDArray[np.bool_]:
 def predicted_misses(
     lights: Lights, detections: Detections, rig: CameraRig, camera: int, error: Array, near: float, far: float
 ) -> tuple[int, float, float]:
-    """Compare the blobs of one camera with where markers that the others have found should be.
+    """Compare one camera's blobs with the predicted markers found by the others.
 
     Args:
         lights: found without this camera.
         detections: blobs of the same moments.
         rig: the rig they were found with.
-        camera: which.
+        camera: index of the camera.
         error: (C,) px, as for `associate_lights`.
-        near: standard deviations up to which a blob is in its place.
-        far: standard deviations up to which it is beside it.
+        near: standard deviations within which a blob is in place.
+        far: standard deviations within which it is a near miss.
 
     Returns:
-        How many markers are in the camera's view; the share of these that have a blob in their place, and the share
-        whose nearest blob is beside it, both less what shifted places have by chance.
+        Number of markers in the camera's view; the share with a blob in place, and the share whose nearest blob is a
+        near miss, both less the chance level at shifted places.
     """
     blobs = sort_blobs(detections, rig)
     one, focal = rig.select([camera]), float(rig.focal_length[camera].mean())
@@ -337,13 +338,13 @@ def predicted_misses(
     share = counts / total
     chance = share[1:].mean(0)
     found = (share[0, 0] - chance[0]) / max(1 - chance[0], 1e-9)
-    # Only where no blob is in its place may one be beside it.
+    # A near miss counts only if no blob is in place.
     beside = share[0, 1] - chance[1] * (1 - share[0, 0]) / max(1 - chance[0], 1e-9)
     return total, float(found), float(beside)
 
 
 def _uncertainty(lights: Lights, rig: CameraRig, camera: int) -> Array:
-    """Variance of the predicted images (R,), in units of that of a blob, roughly: the larger of both axes."""
+    """Approximate variance of predicted images (R,), relative to that of a blob: the larger of both axes."""
     position = rig.positions.double().numpy()
     ray = lights.point[:, None] - position  # (R, C, 3)
     away = np.linalg.norm(ray, axis=-1, keepdims=True)

@@ -1,7 +1,7 @@
-"""Blobs that may be several markers in one: a wand seen end-on, two fiducials behind each other.
+"""Blobs that may be several merged markers: a wand seen end-on, or two fiducials behind each other.
 
-Such a blob is round and bright like any other, and claims the sigma of one marker. But the labels show it: one
-fiducial has a blob, and another one, whose image should touch it, has none.
+Such a blob is round and bright like any other, and has the sigma of a single marker. The labels reveal it: one fiducial
+has a blob, and another one, whose image should touch it, has none.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from imgcal.geometry import RigidTransform
 from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections
 
 BLUR = 2.0
-"""Pixels between the edges of two discs, up to which their images may merge: blur, and errors of the prediction."""
+"""Maximum gap (px) between the edges of two discs whose images may merge: blur, and errors of the prediction."""
 MOST_REACH = 8.0
-"""Pixels between the centres of markers that may merge, where blobs have no radius and no two blobs were closer."""
+"""Maximum distance (px) of markers that may merge, if blobs have no radius and no two blobs were closer."""
 
 
 def drop_merged(labelled: Associations, poses: RigidTransform, rig: CameraRig, obj: CalibrationObject) -> Associations:
-    """Take the labels off blobs that may be several fiducials in one, and flag these.
+    """Remove the labels of blobs that may be several merged fiducials, and flag these blobs.
 
     Args:
         labelled: S used snapshots.
-        poses: (S,) rig_from_object, roughly.
-        rig: roughly, without batch axes.
+        poses: (S,) approximate rig_from_object.
+        rig: approximate rig, without batch axes.
         obj: N fiducials.
 
     Returns:
-        The same with fewer labels; snapshots that have none left are refused.
+        The same with fewer labels; snapshots without any label left are refused.
 
     Raises:
         RefusedError: no snapshot is left.
@@ -62,12 +62,12 @@ def drop_merged(labelled: Associations, poses: RigidTransform, rig: CameraRig, o
 def find_merged(
     blobs: Detections, seen: NDArray[np.bool_], uv: NDArray[np.float64], visible: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Find fiducials of one snapshot whose blobs may be several fiducials in one.
+    """Find fiducials of one snapshot whose blobs may be several merged fiducials.
 
     Args:
         blobs: labelled.
         seen: (C, N) fiducials that have a blob.
-        uv: (C, N, 2) pixels, where all of them should be.
+        uv: (C, N, 2) pixels, predictions of all of them.
         visible: (C, N) whether they are in view.
 
     Returns:
@@ -90,8 +90,8 @@ def find_merged(
 def merging_distance(labelled: Associations, rows: NDArray[np.int64]) -> NDArray[np.float64]:
     """Distance (px) between two markers below which a blob may be both of them, for M blobs: (M,).
 
-    Markers merge where their discs touch. Where a blob's radius is not known, the capture says how close two labelled
-    blobs of its camera can be.
+    Markers merge when their discs touch. If a blob's radius is unknown, the smallest distance of two labelled blobs of
+    its camera is used.
     """
     detections = labelled.detections
     reach, camera = 2 * detections.radius[rows] + BLUR, detections.camera[rows]
@@ -103,7 +103,7 @@ def merging_distance(labelled: Associations, rows: NDArray[np.int64]) -> NDArray
 
 
 def _closest(uv: NDArray[np.float64], snapshot: NDArray[np.int64]) -> float:
-    """Distance (px) of the two of some blobs (M, 2) that are closest in one snapshot (M,), at most `MOST_REACH`."""
+    """Smallest distance (px) of two of some blobs (M, 2) in one snapshot (M,), at most `MOST_REACH`."""
     if len(uv) < 2:
         return MOST_REACH
     apart = 2 * MOST_REACH * (snapshot - snapshot.min())  # snapshots side by side

@@ -1,4 +1,4 @@
-"""One camera, hardly more blobs than a pose needs: no label is told by the others, but all labellings are compared."""
+"""Label hardly more blobs than a pose needs, in a single camera, by comparing all labellings."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from imgcal.estimation import State, initial_pose, levenberg_marquardt_cpu
 from imgcal.types import Observations
 
 MOST_LABELLINGS = 400
-FITS = 0.999  # quantile of chi-squared that the right labelling stays below
+FITS = 0.999  # quantile of chi-squared that limits the right labelling
 LEAST_MARGIN = 7.0
-"""Log odds against all other labellings together: all of them are known, and no hypotheses were chosen."""
+"""Log odds against all other labellings together: all of them are known, and no hypotheses were selected."""
 LEAST_CHANCE = 3.0
-"""Log odds against blobs that fit by chance, beyond those of trying all labellings. A pose and a rig as wide as its
-prior fit four blobs of something else about once in 200 images."""
+"""Log odds against blobs that fit by chance, in addition to the number of labellings. A pose and a rig as free as its
+prior fit four foreign blobs about once in 200 images."""
 MOST_RIVALS, FAR = 64, 60.0
-"""Labellings whose evidence is asked: so many at most, with costs larger than the best one's by so much at most."""
+"""Maximum number of labellings whose evidence is computed, and their maximum cost above the best one's."""
 
 
 @dataclass(frozen=True)
 class _Compared:
-    """All labellings of one camera's blobs, each fitted as well as it goes."""
+    """All labellings of one camera's blobs, each with its best fit."""
 
     fits: Fits
     cost: NDArray[np.float64]  # (K,) half of chi-squared
@@ -39,7 +39,7 @@ class _Compared:
 
 
 def has_minimal_blobs(scene: Scene) -> bool:
-    """Tell whether one camera alone has blobs, so few that all labellings can be compared."""
+    """Tell whether only one camera has blobs, and so few that all labellings can be compared."""
     seen, fiducials = scene.blobs.count, scene.obj.num_fiducials
     blobs = int(seen.max(initial=0))
     alone = blobs >= 4 and (seen >= 4).sum() == 1
@@ -47,10 +47,10 @@ def has_minimal_blobs(scene: Scene) -> bool:
 
 
 def compare_labellings(scene: Scene, options: IdentityOptions) -> Identity:
-    """Accept the labelling that fits if all others are improbable, and it is not by chance; see `has_minimal_blobs`.
+    """Accept the best labelling if all others are improbable, and a fit by chance, too; see `has_minimal_blobs`.
 
-    Labellings are weighed by their evidence: one that fits only for a pose or rig that must be exactly right, edge-on
-    or with a camera at the end of its prior, is less probable than its residuals look.
+    Labellings are compared by their evidence: one that needs an exactly tuned pose or rig, edge-on or with a camera at
+    the limit of its prior, is less probable than its residuals suggest.
     """
     found = _compare(scene)
     near = np.argsort(found.cost)[:MOST_RIVALS]
@@ -88,7 +88,7 @@ def compare_labellings(scene: Scene, options: IdentityOptions) -> Identity:
 
 
 def _compare(scene: Scene) -> _Compared:
-    """Fit every labelling from the best pose for it and, of a planar object, from its mirror image."""
+    """Fit every labelling from its best pose and, for a planar object, from its mirror image."""
     camera, fiducials = int(scene.blobs.count.argmax()), scene.obj.num_fiducials
     blobs = int(scene.blobs.count[camera])
     chosen = np.array(list(permutations(range(max(blobs, fiducials)), min(blobs, fiducials))))  # (K, n)
@@ -109,7 +109,7 @@ def _compare(scene: Scene) -> _Compared:
 
 
 def _better(first: _Compared, second: _Compared) -> _Compared:
-    """The better one of two fits of each labelling."""
+    """The better of two fits of each labelling."""
     other = second.cost < first.cost
     a, b, take = first.fits.state, second.fits.state, torch.from_numpy(other)
     state = State(
@@ -122,7 +122,7 @@ def _better(first: _Compared, second: _Compared) -> _Compared:
 
 
 def _minimize(scene: Scene, fits: Fits) -> _Compared:
-    """Fit each labelling with squared errors: what is off must count in full."""
+    """Fit each labelling with squared errors: errors must count in full."""
     problem = make_problem(scene, fits)
     solution = levenberg_marquardt_cpu.minimize(problem, fits.state, "squared", 1.0, 30, 1e-4)
     cost = solution.equations.cost.numpy()
@@ -134,7 +134,7 @@ def _minimize(scene: Scene, fits: Fits) -> _Compared:
 
 
 def _mirror(scene: Scene, poses: Poses, camera: int) -> Poses:
-    """Poses (K,) of a planar object that look almost alike from a camera: turned about the view, depths reversed."""
+    """Poses (K,) of a planar object that look almost alike from a camera: mirrored in depth about the view."""
     points = scene.obj.points.double().numpy()
     centroid = points.mean(0)
     normal = np.linalg.svd(points - centroid)[2][2]

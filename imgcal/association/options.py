@@ -1,4 +1,4 @@
-"""How sure the tool must be before it gives an answer."""
+"""How certain a result must be before it is returned."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject
 
 BOARD_OUTLIER, BOARD_THRESHOLD = 50.0, 20.0
-"""Standard deviations, of a printed board: labels are left out beyond the first, and count less beyond the second."""
+"""Printed boards, in standard deviations: labels beyond the first are left out, those beyond the second count less."""
 
 
 @dataclass(frozen=True)
 class PipelineOptions:
-    """How sure the pipeline must be before it gives an answer.
+    """How certain the pipeline must be before it returns a result.
 
     Examples:
         >>> options = PipelineOptions(blind_cameras=True, most_outliers=0.1)
@@ -26,25 +26,26 @@ class PipelineOptions:
     identity: IdentityOptions = IdentityOptions()
     estimation: EstimationOptions = EstimationOptions()
     identity_error: float = (
-        0.3  # px: what a centre may be off beyond its own sigma (partly hidden markers) while blobs are told apart
+        0.3  # px: error of a centre beyond its own sigma (partly hidden markers) during identification
     )
-    least_fiducials: int = 4  # different fiducials that a snapshot must show, all cameras together
+    least_fiducials: int = 4  # minimum number of different fiducials in a snapshot, over all cameras
     outlier: float = 5.0  # standard deviations beyond which a labelled blob is left out
     most_outliers: float = 0.25  # share of left-out blobs above which the data do not fit the object
     largest_additive_noise: float = 1.0  # px: unexplained residual above which the data do not fit the camera model
-    largest_drift: float = 10.0  # prior standard deviations that one factory value may be off
-    widest_prior: float = 4.0  # factor by which a kind of factory values may have drifted more than the prior says
+    largest_drift: float = 10.0  # maximum change of a single factory value, in prior standard deviations
+    widest_prior: float = 4.0  # maximum factor by which a kind of value may have drifted more than its prior
     blind_cameras: bool = False  # accept cameras that saw nothing; they keep their factory values
-    after_last_move: bool = False  # where a camera moved during the capture, use the snapshots since then
+    after_last_move: bool = False  # if a camera moved during the capture, use the snapshots after that
     start_pose: RigidTransform | None = (
-        None  # rig_from_object of the first snapshot, roughly: decides which way round a symmetric object is
+        None  # approximate rig_from_object of the first snapshot: resolves an object's symmetry
     )
 
     def of_object(self, obj: CalibrationObject) -> PipelineOptions:
-        """What holds for an object: corners of a printed board are labelled by the whole of it.
+        """Options for an object: a printed board's corners are labelled from the whole board.
 
-        What is far off is a lens that its model does not fit, where an image has few of them, and rarely a wrong label:
-        without it, the model is free to be far off there.
+        A large error is then rarely a wrong label. It comes from a lens that the model does not fit, in image regions
+        with few
+        corners: without those, the model would be unconstrained there.
         """
         if obj.board is None:
             return self

@@ -1,4 +1,4 @@
-"""Which way round an object is that can be turned into itself: a pose that was given decides, if it is near one."""
+"""Resolve the orientation of a symmetric object by a given pose, if one is near enough."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from imgcal.geometry import RigidTransform, geodesic_angle
 from imgcal.types import CalibrationObject
 
 CLEAR = 0.5
-"""Part of the second nearest turn's angle that the nearest one must not exceed for a given pose to decide."""
+"""Maximum ratio of the angles of the nearest and the second nearest orientation for a given pose to decide."""
 
 
 def orient(identity: Identity, obj: CalibrationObject, given: RigidTransform) -> Identity:
-    """Choose, of the labellings that the object's symmetry allows, the one whose turn is nearest to a given pose.
+    """Choose, among the labellings that the object's symmetry allows, the one whose orientation is nearest to a given
+    pose.
 
     Args:
         identity: accepted.
         obj: the calibration object.
-        given: rig_from_object of this snapshot, roughly; all these labellings have the same centre, so only its
+        given: approximate rig_from_object of this snapshot; all these labellings have the same centre, so only its
             rotation counts.
 
     Returns:
-        `by_prior` where one is clearly nearest, else as it was: `ambiguous`.
+        `by_prior` if one is clearly nearest, otherwise unchanged: `ambiguous`.
     """
     pose = identity.rig_from_object
     assert pose is not None  # an accepted identity has one

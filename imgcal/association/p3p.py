@@ -15,14 +15,14 @@ FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
 def rotation_towards(rays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Turn cameras towards what they see, as scaled orthography wants them.
+    """Turn cameras towards their points, as scaled orthography requires.
 
     Args:
         rays: (*B, 3, 2) coordinates on the z = 1 plane.
 
     Returns:
-        The same rays on the plane z = 1 of a camera that looks at their mean (*B, 3, 2), and the points there in the
-        axes of the camera as it is (*B, 3, 3).
+        The same rays on the plane z = 1 of a camera that looks at their mean (*B, 3, 2), and those points in the
+        original camera's axes (*B, 3, 3).
     """
     points = np.concatenate((rays, np.ones((*rays.shape[:-1], 1))), axis=-1)
     view = points.mean(-2)
@@ -36,16 +36,16 @@ def rotation_towards(rays: NDArray[np.float64]) -> tuple[NDArray[np.float64], ND
 
 @njit(cache=True, fastmath=FAST)
 def three_point_pose(rays, directions, sides, mirror, rotation_frame, depths):
-    """Find the pose of a triangle of known sides seen along three rays.
+    """Find the pose of a triangle with known sides along three rays.
 
     Scaled orthography has exactly two solutions, mirror images of each other, in closed form; the image is then
-    corrected for the depths found, once. Where perspective P3P has no real solution because the camera is not quite
-    what it is thought to be, this still gives the nearest sensible one. The correction leaves a quarter of a degree
-    where the object's depth is a fifth of its distance, if the camera looks at it: see `rotation_towards`.
+    corrected once for the depths found. If perspective P3P has no real solution because the camera's parameters are
+    inexact, this still gives the nearest sensible one. The correction leaves a quarter of a degree if the object's
+    depth is a fifth of its distance and the camera looks at it: see `rotation_towards`.
 
     Args:
         rays: (3, 2) coordinates on the z = 1 plane of a camera that looks at the triangle.
-        directions: (3, 3) points of that plane, in the axes in which the pose is wanted.
+        directions: (3, 3) points of that plane, in the axes of the desired pose.
         sides: (3,) mm^2, squared distances of the points 0-1, 0-2 and 1-2.
         mirror: +1 or -1: which of the two solutions.
         rotation_frame: (3, 3) filled with the triangle's frame: columns along the first side, in the plane, normal to
@@ -53,7 +53,7 @@ def three_point_pose(rays, directions, sides, mirror, rotation_frame, depths):
         depths: (3,) mm, filled with the depths of the points: they lie at `directions * depths`.
 
     Returns:
-        False where the points of the triangle lie in line, or all rays are one.
+        False if the points of the triangle are collinear, or all rays are equal.
 
     Source: Alter 1994, "3-D Pose from 3 Points Using Weak-Perspective"; the correction is that of POSIT (DeMenthon and
     Davis 1995).
@@ -83,7 +83,7 @@ def three_point_pose(rays, directions, sides, mirror, rotation_frame, depths):
 
 @njit(cache=True, fastmath=FAST)
 def _frame(directions, depths, frame):
-    """Fill the frame of the triangle directions * depths."""
+    """Fill in the frame of the triangle directions * depths."""
     d = directions
     x0, y0, z0 = d[0, 0] * depths[0], d[0, 1] * depths[0], d[0, 2] * depths[0]
     ax, ay, az = d[1, 0] * depths[1] - x0, d[1, 1] * depths[1] - y0, d[1, 2] * depths[1] - z0

@@ -1,7 +1,7 @@
-"""Candidate poses of planar objects with many fiducials, where triples are too many to try.
+"""Candidate poses of planar objects with so many fiducials that not all triples can be tried.
 
 Seen from a distance, a plane's image is an affine image. Whitened (shifted and stretched to zero mean and unit
-covariance) blobs and fiducials therefore differ by a rotation only, and one angle is all there is to search. That
+covariance) blobs and fiducials therefore differ by a rotation only, so one angle is all there is to search. That
 needs nearly all of the plane in view. A lattice is grown from a few neighbours, whatever hides the rest.
 """
 
@@ -19,8 +19,9 @@ from imgcal.association.hypotheses import Poses
 from imgcal.types import CalibrationObject, CameraRig
 
 Floats = NDArray[np.float64]
-ANGLES = 180  # tried; half a step moves the rim of the pattern by 1/60 of its width
-GROWN = 12  # best ones, refined to homographies
+
+ANGLES = 180  # angles to try; half a step moves the rim of the pattern by 1/60 of its width
+GROWN = 12  # number of best angles to refine to homographies
 
 Cells = dict[tuple[int, int], int]
 """Blob by its column and row in a lattice."""
@@ -39,11 +40,11 @@ TURNS = [
 ]
 """Steps of the image in steps of the object: turned, mirrored, or along a diagonal that is foreshortened."""
 CLOSE = 0.9  # of the best placement's fiducials, that another one must show
-MOST_PLACEMENTS = 16
+MOST_PLACEMENTS = 16  # of a lattice, that poses are made of
 
 
 def planar_poses(blobs: PaddedBlobs, rig: CameraRig, camera: int, obj: CalibrationObject) -> Poses:
-    """Find poses under which one camera's blobs look like a planar object, most of which is seen.
+    """Find poses under which one camera's blobs look like a mostly visible planar object.
 
     Args:
         blobs: the snapshot.
@@ -79,7 +80,7 @@ def planar_poses(blobs: PaddedBlobs, rig: CameraRig, camera: int, obj: Calibrati
 
 
 def _ordinary(radius: Floats) -> NDArray[np.bool_]:
-    """Mark blobs of about the usual radius, or of an unknown one."""
+    """Mark blobs of about the usual radius, or of unknown radius."""
     if np.isnan(radius).all():
         return np.ones(len(radius), dtype=bool)
     ratio = radius / np.nanmedian(radius)
@@ -87,7 +88,7 @@ def _ordinary(radius: Floats) -> NDArray[np.bool_]:
 
 
 def _drop_strays(points: Floats) -> Floats:
-    """Leave out points far from the bulk, again and again: a whitened square reaches to the square root of 6."""
+    """Repeatedly remove points far from the bulk: a whitened square extends to the square root of 6."""
     for _ in range(5):
         white = _whiten(points)[0]
         points = points[(white * white).sum(1) < 2.7**2]
@@ -107,7 +108,7 @@ def _rotation(angle: float) -> Floats:
 
 
 def _best_angles(pattern: Floats, seen: Floats) -> Floats:
-    """Angles that bring the whitened pattern nearest to the whitened blobs."""
+    """Angles that best align the whitened pattern with the whitened blobs."""
     angles: Floats = np.linspace(0, 2 * np.pi, ANGLES, endpoint=False, dtype=np.float64)
     turned = np.concatenate([pattern @ _rotation(angle).T for angle in angles])
     distance = cKDTree(seen).query(turned)[0].reshape(ANGLES, -1)
@@ -116,7 +117,7 @@ def _best_angles(pattern: Floats, seen: Floats) -> Floats:
 
 
 def _affinity(pattern: Floats, seen: Floats, angle: float) -> Floats:
-    """The affine map (3, 3) from pattern to blobs for a rotation of the whitened ones."""
+    """The affine map (3, 3) from pattern to blobs, for a rotation of the whitened pattern."""
     _, mean, root = _whiten(pattern)
     _, seen_mean, seen_root = _whiten(seen)
     result = np.eye(3)
@@ -126,7 +127,7 @@ def _affinity(pattern: Floats, seen: Floats, angle: float) -> Floats:
 
 
 def _grow(flat: Floats, tree: cKDTree, homography: Floats) -> Floats | None:
-    """Pair each fiducial with the nearest blob and fit again; None where most find none of their own."""
+    """Pair each fiducial with the nearest blob and fit again; None if most have no blob of their own."""
     spacing = float(np.median(tree.query(tree.data, k=2)[0][:, 1]))
     for reach in (1.0, 0.8, 0.6, 0.5, 0.4, 0.3, 0.3, 0.3):
         image = np.c_[flat, np.ones(len(flat))] @ homography.T

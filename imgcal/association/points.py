@@ -1,8 +1,8 @@
-"""Identity of a single light: no pattern tells it, but cameras that agree on a place do.
+"""Identify a single light: it has no pattern, but cameras can agree on its position.
 
-Any two blobs of different cameras that may be one point give a place. It counts by the evidence of all cameras: a blob
-near its image against a false one there, no blob against a hidden marker. What is chosen must beat the best different
-choice by the odds that every identity must have.
+Any two blobs of different cameras that may show the same point define a candidate position. Its evidence comes from all
+cameras: a blob near its image against a false blob there, no blob against a hidden marker. The best one must beat the
+best different choice by the odds required of every identity.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from imgcal.types import CalibrationObject, CameraRig, Detections
 Array = NDArray[np.float64]
 
 REACH = 4.0
-"""Standard deviations of a camera's error within which a blob may be a place's image."""
+"""Maximum distance, in standard deviations of a camera's error, between a blob and a position's image."""
 HIDDEN = 0.3
-"""Chance that a camera in whose view a marker is does not show it."""
+"""Probability that a camera does not show a marker in its view."""
 LEAST_CAMERAS = 3
-"""That must agree on a place: two rays that happen to meet are no witness of each other."""
+"""Minimum number of cameras that agree on a position: two rays may meet by chance."""
 MOST_PLACES, MOST_PAIRS = 60, 20000
-"""That are looked at: the best of them."""
+"""Maximum number of positions and of pairs of blobs: the best ones are kept."""
 ROUNDS = 3
-"""Of choosing blobs near a place and placing it anew."""
+"""Iterations of choosing blobs near a position and triangulating it again."""
 
 
 @dataclass(frozen=True)
 class _Views:
-    """What the cameras saw of one snapshot, in pixels from the principal point without distortion."""
+    """A snapshot's blobs, in pixels from the principal point without distortion."""
 
     blobs: PaddedBlobs
     rotation: Array  # (C, 3, 3) cam_from_rig
     position: Array  # (C, 3) mm
     focal: Array  # (C, 2) px
-    error: Array  # (C,) px, one standard deviation of what rig and blobs may be off
+    error: Array  # (C,) px, one standard deviation of errors of rig and blobs
     half: Array  # (C, 2) px, half the image
-    density: Array  # (C,) false blobs a square pixel
+    density: Array  # (C,) false blobs per square pixel
 
     def project(self, places: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Images (P, C, 2) of places (P, 3), and whether they are in view (P, C)."""
@@ -61,14 +61,14 @@ class _Views:
 
 @dataclass(frozen=True)
 class _Places:
-    """Points in space that cameras may agree on."""
+    """Candidate positions in space."""
 
     at: Array  # (P, 3) mm
     chosen: NDArray[np.int64]  # (P, C) blob, -1 = none
     odds: Array  # (P,) log odds against false blobs
 
     def best(self, count: int) -> _Places:
-        """Keep the best of each choice of blobs."""
+        """Keep the best position for each choice of blobs."""
         _, first = np.unique(self.chosen, axis=0, return_index=True)
         first = first[(self.chosen[first] >= 0).sum(1) >= LEAST_CAMERAS]
         rows = first[np.argsort(-self.odds[first], kind="stable")][:count]
@@ -118,7 +118,7 @@ def _views(detections: Detections, rig: CameraRig, std: Tensor) -> _Views:
 
 
 def _places(views: _Views) -> _Places:
-    """Find all places where the rays of two cameras nearly meet, and what all cameras say of them."""
+    """Find all positions where the rays of two cameras nearly meet, and their evidence in all cameras."""
     rays, valid = views.rays(), views.blobs.row >= 0
     camera, blob = np.nonzero(valid)
     a, b = np.nonzero(np.triu(np.ones((len(camera), len(camera)), dtype=bool), 1) & (camera[:, None] != camera))
@@ -146,7 +146,7 @@ def _places(views: _Views) -> _Places:
 
 
 def _find_nearest(views: _Views, at: Array) -> tuple[NDArray[np.int64], Array]:
-    """Nearest blobs (P, C) to the images of places, -1 = none within reach, and the places' log odds (P,)."""
+    """Nearest blobs (P, C) to the images of positions, -1 = none within reach, and the positions' log odds (P,)."""
     uv, inside = views.project(at)
     squared = np.square(uv[:, :, None] - views.blobs.ideal).sum(-1)  # (P, C, M)
     nearest = squared.argmin(-1)
@@ -158,7 +158,7 @@ def _find_nearest(views: _Views, at: Array) -> tuple[NDArray[np.int64], Array]:
 
 
 def _triangulate(views: _Views, rays: Array, at: Array, chosen: NDArray[np.int64]) -> Array:
-    """Places (P, 3) nearest to the rays of their blobs."""
+    """Positions (P, 3) nearest to the rays of their blobs."""
     cameras = np.arange(len(rays))
     ray = rays[cameras, np.maximum(chosen, 0)]  # (P, C, 3)
     away = np.square(at[:, None] - views.position).sum(-1)
@@ -171,17 +171,17 @@ def _triangulate(views: _Views, rays: Array, at: Array, chosen: NDArray[np.int64
 
 
 def _margin(places: _Places, least: float) -> float:
-    """By how much the best place beats the best of other blobs, log odds."""
+    """Log odds of the best position against the best one of other blobs."""
     shared = ((places.chosen == places.chosen[0]) & (places.chosen[0] >= 0)).sum(1)
-    # The same point with another blob of a camera or two is settled camera by camera: see `_certain`.
+    # The same point with another blob in a camera or two is decided camera by camera: see `_certain`.
     rivals = places.odds[shared < 2]
     rival = max(float(rivals.max(initial=0.0)), 0.0)
-    # A second place that is as sure as a light must be is a light, too: which of them is meant cannot be told.
+    # A second position with the evidence of a light is a light, too, and it is unknown which of them is meant.
     return float(places.odds[0]) - rival if rival < least else 0.0
 
 
 def _certain(views: _Views, at: Array, labels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Leave out blobs (C, N) beside which another one may be the marker as well."""
+    """Remove blobs (C, N) if a blob nearby may equally be the marker."""
     uv, _ = views.project(at)
     squared = np.square(uv[:, :, None] - views.blobs.ideal).sum(-1) / views.error[:, None] ** 2  # (N, C, M)
     near = (squared < REACH**2).sum(-1).T

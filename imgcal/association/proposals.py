@@ -1,8 +1,8 @@
-"""Labels that come from the images themselves, where blobs fail: a proposer says where it sees each fiducial.
+"""Labels from the images themselves, for frames in which blob detection fails: a proposer locates each fiducial.
 
-A proposal is never believed by itself. What it measured becomes blobs beside those of the detector, its labels are
-forgotten, and identity decides anew at its pose, against all that it always asks: symmetric turns, shifts of a lattice,
-false blobs, chance. What identity labels otherwise than the proposer is dropped.
+A proposal alone is never accepted. Its measurements become blobs beside the detector's, its labels are dropped, and
+identification is run at its pose with all the usual tests: symmetric orientations, shifts of a lattice, false blobs,
+chance. Labels on which identification and the proposer differ are removed.
 """
 
 from __future__ import annotations
@@ -23,59 +23,59 @@ from imgcal.geometry import RigidTransform
 from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections
 
 SAME_BLOB = 1.5
-"""Pixels within which a blob of the detector and a proposed fiducial are one, beyond three standard deviations."""
-FARTHEST = 6.0  # px: the same at most, so that no proposal hides blobs that contradict it
+"""Maximum distance (px), beyond three standard deviations, between a detector's blob and the same proposed fiducial."""
+FARTHEST = 6.0  # px: upper limit of the same, so that no proposal hides blobs that contradict it
 DOUBTED = 1.0
-"""Pixels: as large a proposed sigma says that part of the marker may be hidden, which a blob of the rest cannot say."""
+"""Pixels: so large a proposed sigma suggests a partly hidden marker; a blob of the visible part does not show that."""
 AGREED = 0.1
-"""Pixels, beyond its own three sigma, by which a blob may differ from a proposal and be as well measured as it says."""
+"""Difference (px), beyond its own three sigma, between a blob and a proposal that leaves the blob's sigma unchanged."""
 LEAST_SHARE = 0.3
-"""Explained part of what could be seen: less than of blobs alone, since false blobs stand for those that are hidden,
-and the proposal's margin has told the object from chance already."""
+"""Minimum explained share of the visible fiducials: lower than for blobs alone, since false blobs stand for the hidden
+ones, and the proposal's margin already excludes chance."""
 LEAST_AGREEMENT = 0.8
-"""Share of the labels that identity gives near the proposed pose which the proposer must have given, too."""
+"""Minimum share of the labels found by identification near the proposed pose that the proposer also gave."""
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What a proposer may look at."""
+    """Input of a proposer."""
 
     frames: Mapping[str, Frame | None]  # camera name -> (H, W); None or absent = the camera has no frame
-    blobs: Detections  # what the detector found, cameras as in the rig; may be empty
-    rig: CameraRig  # the best that is known, float64, without batch axes
+    blobs: Detections  # the detector's blobs, cameras as in the rig; may be empty
+    rig: CameraRig  # the best known rig, float64, without batch axes
     obj: CalibrationObject
-    prior_std: Tensor  # (C, K) how far the rig's values may be off
-    candidates: tuple[RigidTransform, ...] = ()  # rig_from_object that may hold, roughly, the likeliest first
+    prior_std: Tensor  # (C, K) standard deviations of the rig's values
+    candidates: tuple[RigidTransform, ...] = ()  # approximate candidates of rig_from_object, most probable first
     detection: DetectionOptions = DetectionOptions()  # polarity, bit depth
-    masks: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)  # camera -> (H, W), where not to look
+    masks: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)  # camera -> (H, W), True = ignore
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """Where a proposer sees the fiducials of one snapshot; one that declines says why."""
+    """A proposer's fiducials in one snapshot, or its reason to decline."""
 
     detections: Detections  # of this snapshot, cameras as in the rig; each row with its fiducial and sigma
     rig_from_object: RigidTransform | None
-    margin: float  # natural log of the odds against the best distinct labelling (other pose, turn, shift, or chance)
-    reason: str = ""  # why it declines; empty = it does not
-    otherwise: Callable[[], Proposal] | None = None  # what another proposer says, asked where this one is refused
-    found_by: str = ""  # who proposes, where that is another one than was asked
+    margin: float  # log odds against the best distinct labelling (other pose, rotation, shift, or chance)
+    reason: str = ""  # reason to decline; empty = a proposal
+    otherwise: Callable[[], Proposal] | None = None  # the next proposal, to judge where this one is refused
+    found_by: str = ""  # the proposer, where it is another one than was asked
 
     @classmethod
     def decline(cls, snapshot: Snapshot, reason: str, margin: float = 0.0) -> Proposal:
-        """Say that nothing can be proposed."""
+        """Make a proposal without fiducials, for a reason."""
         return cls(snapshot.blobs.select(np.zeros(len(snapshot.blobs), dtype=bool)), None, margin, reason)
 
 
 class Proposer(Protocol):
-    """Something that finds fiducials in frames: a matched filter, a network."""
+    """Finds fiducials in frames, for example a matched filter or a network."""
 
     @property
     def name(self) -> str:
-        """What results call it."""
+        """Name in results."""
 
     def propose(self, snapshot: Snapshot) -> Proposal:
-        """Look at one snapshot."""
+        """Process one snapshot."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Sight:
 
     proposer: Proposer
     frames: Callable[[int], Mapping[str, Frame | None]]  # number of a snapshot -> camera name -> frame
-    where_blobs_fail: bool  # asked only for snapshots of which blobs decide nothing
+    where_blobs_fail: bool  # use it only for snapshots that blobs do not decide
     detection: DetectionOptions = DetectionOptions()
     masks: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
 
@@ -97,17 +97,17 @@ def judge(
     error: float,
     pose_known: bool,
 ) -> tuple[Identity, Detections]:
-    """Decide about a proposal by the rules that hold for blobs.
+    """Judge a proposal by the rules for blobs.
 
     Args:
-        proposal: where fiducials are said to be.
-        snapshot: what was looked at; its blobs count for and against.
-        options: how sure to be.
-        error: px, what a centre may be off beyond its own sigma.
-        pose_known: the proposed pose is that of an earlier snapshot, or nearly.
+        proposal: the proposed fiducials.
+        snapshot: its input; the blobs in it count for and against.
+        options: how certain the result must be.
+        error: px, error of a centre beyond its own sigma.
+        pose_known: the proposed pose is, at least nearly, that of an earlier snapshot.
 
     Returns:
-        The decision, and the blobs that its labels are of: the detector's, and those that were proposed.
+        The decision, and the blobs that its labels refer to: the detector's, and the proposed ones.
     """
     blobs, proposed = merge_proposal(proposal.detections, snapshot.blobs)
     nothing = np.full(len(blobs), -1, dtype=np.int64)
@@ -135,10 +135,10 @@ def judge(
 
 
 def merge_proposal(proposed: Detections, blobs: Detections) -> tuple[Detections, NDArray[np.int64]]:
-    """Put proposed fiducials among the detector's blobs; where both are at one place, the better measured one stays.
+    """Merge proposed fiducials with the detector's blobs; if both are at one place, keep the more accurate one.
 
     Returns:
-        Blobs (M,) of one snapshot without labels, and the fiducial that was proposed for each (M,), -1 = none.
+        Blobs (M,) of one snapshot without labels, and the fiducial proposed for each (M,), -1 = none.
     """
     keep_blob, keep_ours = np.ones(len(blobs), dtype=bool), np.ones(len(proposed), dtype=bool)
     sigma = blobs.sigma.copy()
@@ -155,7 +155,7 @@ def merge_proposal(proposed: Detections, blobs: Detections) -> tuple[Detections,
         # A merged blob near two fiducials is neither of them.
         alone = np.bincount(rows[one], minlength=len(blobs))[rows] == 1
         taken = one & better & alone
-        # Where the two disagree, part of the marker may be hidden: neither is known better than by what they differ.
+        # If they disagree, part of the marker may be hidden: increase the sigma by their difference.
         apart = taken & (distance > AGREED + 3 * blobs.sigma[rows])
         sigma[rows[apart]] = np.hypot(sigma[rows[apart]], distance[apart])
         keep_ours[ours[taken]] = False
@@ -180,7 +180,7 @@ def proposal_rows(
     Args:
         uv: (C, N, 2) pixels.
         sigma: (C, N) pixels, one standard deviation of each axis.
-        seen: (C, N) what is proposed.
+        seen: (C, N) which fiducials are proposed.
         radius: (C, N) pixels, nan = unknown.
         like: blobs of the same snapshot.
     """

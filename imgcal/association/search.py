@@ -1,4 +1,4 @@
-"""The search for a pose of which nothing is known: hypotheses of single cameras, on which the whole rig votes."""
+"""Search for an unknown pose: single cameras make hypotheses, and the whole rig votes on them."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from imgcal.association.verification import Fits, Scene, refine, start
 from imgcal.association.voting import match, predict_ideal, vote
 from imgcal.types import CalibrationObject
 
-TRIPLES = 10  # of blobs in a round, over all cameras
-KEPT = 8  # poses of each
-PLANAR_EFFORT = 50_000  # hypotheses that take the time of a camera's poses of a planar object
-VOTES_A_HYPOTHESIS = 500  # likewise: comparisons of a fiducial with a blob
-MANY = 40  # fiducials of a planar object, above which triples are too many
-VERIFIED = 2  # different labellings that are fitted, the best of a round
+TRIPLES = 10  # blob triples per round, over all cameras
+KEPT = 8  # poses kept per triple
+PLANAR_EFFORT = 50_000  # hypotheses that take as long as a camera's poses of a planar object
+VOTES_A_HYPOTHESIS = 500  # comparisons of a fiducial with a blob that take as long as a hypothesis
+MANY = 40  # fiducials of a planar object above which there are too many triples
+VERIFIED = 2  # number of best different labellings to fit per round
 
 
 @dataclass
 class Search:
-    """Poses that hypotheses from single cameras suggest, for the whole rig to vote on."""
+    """Hypotheses of poses from single cameras, on which the whole rig votes."""
 
     scene: Scene
-    likely: Mapping[int, NDArray[np.int64]]  # blobs to draw from, of each camera that is worth it
+    likely: Mapping[int, NDArray[np.int64]]  # blobs to draw from, for each useful camera
     triples: FiducialTriples
     bounds: tuple[float, float]  # see `_bounds`
-    hypotheses: int = 0  # so far; of planar objects, as many as would have taken their time
-    planar: dict[int, Poses] = field(default_factory=dict)  # of cameras that were looked at: no draw is in them
+    hypotheses: int = 0  # number so far; for planar objects, the equivalent in time
+    planar: dict[int, Poses] = field(default_factory=dict)  # by camera: they are the same in every round
 
     def run_round(self, hypotheses: int, generator: np.random.Generator) -> Fits | None:
-        """Make so many hypotheses, let the rig vote within the bounds, fit the best; None = there is none."""
+        """Make hypotheses, let the rig vote within the bounds, and fit the best ones; None = no result."""
         scene, (tolerance, gate) = self.scene, self.bounds
         cameras = np.array(list(self.likely))
         if scene.obj.planar and scene.obj.num_fiducials > MANY:
@@ -73,7 +73,7 @@ class Search:
 def distinct(
     obj: CalibrationObject, rows: NDArray[np.int64], labels: NDArray[np.int64], most: int = VERIFIED
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Keep the fullest of labellings (K, C, N) that differ in most labels, so many at most."""
+    """Keep at most `most` of the fullest labellings (K, C, N) that differ in most labels."""
     order = np.argsort(-(labels >= 0).sum((1, 2)), kind="stable")
     kept: list[int] = []
     for k in order:

@@ -1,4 +1,4 @@
-"""Which blob is which fiducial, snapshot by snapshot: each accepted one helps with the next."""
+"""Match blobs to fiducials snapshot by snapshot: each accepted snapshot helps with the next."""
 
 from __future__ import annotations
 
@@ -21,10 +21,12 @@ from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 
 NOT_TRIED = "not tried: nothing could be decided in many snapshots before"
 MOST_IN_VAIN = 8_000_000
-"""Hypotheses without any success, after which only a choice of the other snapshots is tried: as many once more."""
+"""Number of hypotheses without success after which only a subset of the other snapshots is tried, at the same cost."""
 
 MOST_LOOKS_IN_VAIN = 8
-"""Snapshots in which a proposer finds nothing, after which it looks at no more: as often again for each success."""
+"""Number of snapshots without a proposal after which the proposer stops; each success allows as many more."""
+PATTERN = 3
+"""Blobs of one camera that are likely to show the object, not only stray lights."""
 LEAST_CERTAIN_FIRST = ("ambiguous", "by_prior", "unique", "coded", "by_tracking")
 
 Progress = Callable[[Iterable[int], int], Iterable[int]]
@@ -32,13 +34,13 @@ Progress = Callable[[Iterable[int], int], Iterable[int]]
 
 @dataclass(frozen=True)
 class Associations:
-    """Detections with a fiducial for every blob that has one, and how that was decided."""
+    """Detections with a fiducial for every identified blob, and how each snapshot was decided."""
 
     detections: Detections  # `fiducial` filled in, -1 = not used
     snapshots: tuple[SnapshotIdentity, ...]  # S
 
     def __repr__(self) -> str:
-        """Say how much was decided, and how."""
+        """Summarize how much was decided, and how."""
         return f"Associations({len(self.used)} of {len(self.snapshots)} snapshots {self.identity}, {self.detections!r})"
 
     @property
@@ -48,22 +50,22 @@ class Associations:
 
     @property
     def moments(self) -> NDArray[np.int64]:
-        """Number of the input's snapshot that each row is of, ascending: (S,).
+        """Number of the input snapshot that each row belongs to, ascending: (S,).
 
         With one object, rows are snapshots. With several objects or unknown markers, a row is one of them in a
-        snapshot, and a snapshot in which there are none is one row that was refused.
+        snapshot, and a snapshot with none of them is a single refused row.
         """
         return np.array([row if s.moment < 0 else s.moment for row, s in enumerate(self.snapshots)], dtype=np.int64)
 
     @property
     def moment_counts(self) -> tuple[int, int]:
-        """Number of the input's snapshots of which some row is used, and of all."""
+        """Number of the input's snapshots with a used row, and of all."""
         moments = self.moments
         return len(np.unique(moments[self.used])), len(np.unique(moments))
 
     @property
     def part_of_rows(self) -> NDArray[np.int64]:
-        """Number of the object that each of the used rows shows: (U,)."""
+        """Number of the object in each used row: (U,)."""
         return np.array([self.snapshots[row].part for row in self.used], dtype=np.int64)
 
     def columns(self, obj: CalibrationObject) -> NDArray[np.bool_]:
@@ -72,9 +74,9 @@ class Associations:
 
     @property
     def before_rows(self) -> NDArray[np.int64]:
-        """Of each used row, the used row of the same object one snapshot earlier, -1 = there is none: (U,).
+        """For each used row, the used row of the same object one snapshot earlier, -1 = there is none: (U,).
 
-        Of several unknown markers nobody knows which one is which in another snapshot.
+        With several unknown markers, the correspondence between snapshots is unknown.
         """
         keys = list(zip(self.moments[self.used].tolist(), self.part_of_rows.tolist(), strict=True))
         count = Counter(keys)
@@ -93,7 +95,7 @@ class Associations:
         )
 
     def repeated(self) -> Detections:
-        """The detections in which blobs without a label belong to every row of their snapshot."""
+        """The detections, with unlabelled blobs repeated in every row of their snapshot."""
         detections, moments = self.detections, self.moments
         count = np.bincount(moments)
         left = np.flatnonzero((detections.fiducial < 0) & (count[moments] > 1)[detections.snapshot])
@@ -108,9 +110,9 @@ class Associations:
 
     @property
     def identity(self) -> str:
-        """How identity was decided as a whole: as the least certain snapshot was.
+        """How identity was decided as a whole: as in the least certain snapshot.
 
-        Snapshots that were followed from another are as certain as that one.
+        Snapshots that were tracked from another one are as certain as that one.
         """
         found = {snapshot.status for snapshot in self.snapshots}
         return next((status for status in LEAST_CERTAIN_FIRST if status in found), "refused")
@@ -124,22 +126,22 @@ def associate(
     progress: Progress | None = None,
     sight: Sight | None = None,
 ) -> Associations:
-    """Decide which blob is which fiducial, snapshot by snapshot.
+    """Match blobs to fiducials, snapshot by snapshot.
 
-    Each accepted snapshot predicts the next one. What the accepted ones say about the rig narrows the search in the
-    following; refused ones are tried once more at the end, with the rig that all the others gave.
+    Each accepted snapshot predicts the next one. The information of accepted snapshots about the rig narrows the search
+    in the following; refused ones are tried again at the end, with the rig estimated from all others.
 
     Args:
-        detections: blobs of all snapshots, cameras as in the rig; snapshots that come with labels keep them.
+        detections: blobs of all snapshots, cameras as in the rig; given labels are kept.
         rig: the factory calibration.
         obj: the calibration object.
-        options: how sure each snapshot must be.
+        options: how certain each snapshot must be.
         progress: wraps the loop over snapshots.
-        sight: the frames, and who looks at them: at all, or where blobs decide nothing. What it measures is in the
+        sight: a proposer with frames, used always or only if blobs are not sufficient. Its measurements are part of the
             result's detections.
 
     Raises:
-        RefusedError: no snapshot could be decided.
+        RefusedError: no snapshot could be identified.
 
     Examples:
         >>> import torch, imgcal
@@ -153,7 +155,7 @@ def associate(
         ('unique', True)
     """
     if obj.parts:
-        from imgcal.association.several import associate_several  # it builds on this module
+        from imgcal.association.several import associate_several  # it imports this module
 
         labelled = associate_several(detections, rig, obj, options, progress)
         if not labelled.used:
@@ -161,7 +163,7 @@ def associate(
         return labelled
     count = len(detections.snapshot_names)
     if obj.pose_rank < 6:
-        sight = None  # it looks for patterns, and these objects have none
+        sight = None  # it finds patterns, and these objects have none
     series = _Series(detections, Tracker(rig, obj, options), sight)
     order: Iterable[int] = range(count)
     series.decide_each(progress(order, count) if progress else order)
@@ -178,7 +180,7 @@ def associate(
 
 
 class _Series:
-    """What was decided so far about the snapshots of some detections."""
+    """Decisions so far about the snapshots of some detections."""
 
     def __init__(self, detections: Detections, tracker: Tracker, sight: Sight | None) -> None:
         self.detections, self.tracker, self.sight = detections, tracker, sight
@@ -186,7 +188,8 @@ class _Series:
         self.coded = _coded_snapshots(detections, self.count)
         self.rows = _rows_by_snapshot(detections, self.count)
         self.results: dict[int, tuple[SnapshotIdentity, NDArray[np.int64]]] = {}
-        self.looked: dict[int, Detections] = {}  # what was measured in the frames instead of blobs
+        self.looked: dict[int, Detections] = {}  # measurements in the frames that replace blobs
+        self.rigs: dict[int, CameraRig] = {}  # the rig with which each snapshot was decided
 
     @property
     def accepted(self) -> NDArray[np.int64]:
@@ -194,7 +197,7 @@ class _Series:
         return np.array([s for s in range(self.count) if self.results[s][0].status != "refused"], dtype=np.int64)
 
     def decide_each(self, order: Iterable[int]) -> None:
-        """Decide about each snapshot, as long as there is hope."""
+        """Decide each snapshot, as long as this is promising."""
         patience = Patience(self.count)
         for number, s in enumerate(order):
             if self.coded[s] or patience.tries(number, self.tracker.in_vain):
@@ -203,29 +206,35 @@ class _Series:
                 self._not_tried(s)
 
     def retry_incomplete(self, accepted: NDArray[np.int64]) -> None:
-        """Try what is incomplete once more, with the rig that the accepted ones gave."""
+        """Try incomplete snapshots again, with the rig estimated from the accepted ones."""
         incomplete = [s for s in range(self.count) if not self.coded[s] and self._incomplete(s)]
         patience, tracker = Patience(len(incomplete)), self.tracker
         tracker.in_vain, tracker.looks_in_vain = 0, 0
-        # Those nearest to where the object was seen first: they are the likeliest to show it.
+        # Start with those nearest to accepted snapshots: they most probably show the object.
         for number, s in enumerate(sorted(incomplete, key=lambda s: _gap(s, accepted))):
             first = self.results[s][0]
             if patience.tries(number, tracker.in_vain):
+                tracker.pose = self._nearest_pose(s, accepted) or tracker.pose
                 self.decide(s)
             found, labels = self.results[s]
             if first.status != "refused" and found.status != "refused":
-                # The rig that it helped to find labels more of it, but says nothing new of how sure it is.
+                # It helped to estimate the rig, so more labels with this rig do not make it more certain.
                 self.results[s] = replace(found, status=first.status, alternatives=first.alternatives), labels
 
+    def _nearest_pose(self, s: int, accepted: NDArray[np.int64]) -> RigidTransform | None:
+        """Pose of the nearest of the accepted snapshots, which may be the snapshot itself."""
+        return self.results[int(accepted[np.abs(accepted - s).argmin()])][0].rig_from_object
+
     def where_blobs_fail(self, sight: Sight, accepted: NDArray[np.int64]) -> None:
-        """Look at the frames of what is refused."""
+        """Search the frames of refused snapshots."""
         refused = [s for s in range(self.count) if self.results[s][0].status == "refused"]
         for s in sorted(refused, key=lambda s: _gap(s, accepted) if len(accepted) else s):
             self.look(s, sight)
 
     def decide(self, s: int) -> None:
-        """Decide about one snapshot, by the labels it has, its frames or its blobs."""
+        """Decide one snapshot by its given labels, its frames or its blobs."""
         name = self.detections.snapshot_names[s]
+        self.rigs[s] = self.tracker.rig
         if self.coded[s]:
             self.results[s] = self.tracker.accept(name, self.detections.fiducial[self.rows[s]])
         elif self.sight is not None and not self.sight.where_blobs_fail:
@@ -234,7 +243,7 @@ class _Series:
             self.results[s] = self.tracker.decide(self.detections.select(self.rows[s]), name)
 
     def look(self, s: int, sight: Sight) -> None:
-        """Decide about one snapshot by its frames, as long as looks are worth it."""
+        """Decide one snapshot by its frames, as long as this is promising."""
         name, blobs = self.detections.snapshot_names[s], self.detections.select(self.rows[s])
         if self.tracker.looks_in_vain >= MOST_LOOKS_IN_VAIN:
             if sight.where_blobs_fail:
@@ -251,14 +260,22 @@ class _Series:
         self.results[s] = SnapshotIdentity(name, "refused", NOT_TRIED, 0, None), np.full_like(self.rows[s], -1)
 
     def _incomplete(self, s: int) -> bool:
-        """Tell whether another try may help: the snapshot was refused, or no blob of some camera has a label."""
+        """Tell whether another try may help.
+
+        It may where the snapshot was refused, where a camera has as many blobs as a pattern and no label, and where a
+        camera has any blob and no label, but the rig is better known by now.
+        """
         snapshot, labels = self.results[s]
+        if snapshot.status == "refused":
+            return True
         camera = self.looked[s].camera if s in self.looked else self.detections.camera[self.rows[s]]
-        return snapshot.status == "refused" or not np.isin(camera, camera[labels >= 0]).all()
+        blobs, labelled = np.bincount(camera), np.bincount(camera[labels >= 0], minlength=camera.max() + 1)
+        least = PATTERN if self.rigs.get(s) is self.tracker.rig else 1
+        return bool((blobs[labelled == 0] >= least).any())
 
 
 def _why(snapshots: Sequence[SnapshotIdentity]) -> str:
-    """Say why nothing could be decided: what was said most often."""
+    """Say why no snapshot could be decided: the most frequent reason."""
     if not snapshots:
         return "found no snapshot"
     reasons = Counter(snapshot.reason for snapshot in snapshots if snapshot.reason != NOT_TRIED)
@@ -270,10 +287,10 @@ def _why(snapshots: Sequence[SnapshotIdentity]) -> str:
 
 
 def drop_snapshots(labelled: Associations, rows: Sequence[int]) -> Associations:
-    """Refuse snapshots (numbers among the used ones) whose labels lie on one line.
+    """Refuse snapshots (numbers among the used ones) whose labels are collinear.
 
     Raises:
-        RefusedError: none is left.
+        RefusedError: no snapshot is left.
     """
     numbers, snapshots = [labelled.used[row] for row in rows], list(labelled.snapshots)
     for number in numbers:
@@ -287,21 +304,21 @@ def drop_snapshots(labelled: Associations, rows: Sequence[int]) -> Associations:
 
 
 def _gap(snapshot: int, accepted: NDArray[np.int64]) -> int:
-    """Snapshots to the nearest of the accepted ones, which are in ascending order."""
+    """Distance, in snapshots, to the nearest accepted one; `accepted` is ascending."""
     near = int(np.searchsorted(accepted, snapshot))
     return int(np.abs(accepted[max(near - 1, 0) : near + 1] - snapshot).min())
 
 
 @dataclass
 class Patience:
-    """Bounds the effort for snapshots in which nothing is found, however many: a wrong object, clutter alone."""
+    """Limits the effort for snapshots without a result: a wrong object, or clutter alone."""
 
-    count: int  # snapshots
+    count: int  # number of snapshots
     first_left_out: int = -1
     stride: int = 1
 
     def tries(self, number: int, in_vain: int) -> bool:
-        """Tell whether the next snapshot is worth the effort, after so many hypotheses without any success."""
+        """Tell whether to try the next snapshot after `in_vain` hypotheses without success."""
         if in_vain <= MOST_IN_VAIN:
             self.first_left_out = -1
             return True
@@ -315,7 +332,7 @@ def match_to_rig(detections: Detections, rig: CameraRig) -> Detections:
     """Renumber the cameras of detections in the order of the rig.
 
     Raises:
-        InputError: a camera that the rig does not have.
+        InputError: the rig does not have one of the cameras.
     """
     unknown = [name for name in detections.camera_names if name not in rig.camera_names]
     if unknown:
@@ -331,7 +348,7 @@ def match_to_rig(detections: Detections, rig: CameraRig) -> Detections:
 def accepted_observations(
     labelled: Associations, rig: CameraRig, obj: CalibrationObject
 ) -> tuple[Observations, RigidTransform | None]:
-    """Observations of the accepted snapshots, and their poses where identity found all of them."""
+    """Observations of the accepted snapshots, and their poses if all are known."""
     used = labelled.used
     detections = labelled.detections
     rows = detections.fiducial >= 0
@@ -349,7 +366,7 @@ def _label_blobs(
     results: dict[int, tuple[SnapshotIdentity, NDArray[np.int64]]],
     looked: dict[int, Detections],
 ) -> Detections:
-    """Give the usable blobs of each snapshot their labels; those that were looked at have other blobs there."""
+    """Label the usable blobs of each snapshot; measurements in frames replace the blobs there."""
     fiducial, kept, parts = np.full(len(detections), -1, dtype=np.int64), np.ones(len(detections), dtype=bool), []
     for s, (snapshot, labels) in results.items():
         if snapshot.status == "refused":

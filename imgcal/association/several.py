@@ -1,9 +1,9 @@
-"""Several known objects in one capture: which blob is which fiducial of which object, snapshot by snapshot.
+"""Several known objects in one capture: match blobs to the fiducials of each object, snapshot by snapshot.
 
-Each object is looked for by itself, on the blobs that no other object has taken. The one with the most evidence goes
-first. Objects of the same make are looked for one after the other; which of them is which does not matter to the rig.
-What two objects explain nearly as well is left out, and so is an object whose place could be another one that nothing
-else explains.
+Each object is searched for independently among the blobs not taken by others. The one with the most evidence comes
+first. Objects of the same make are found one by one; their order does not matter for the rig. Blobs that two objects
+explain about equally well are left out, and so is an object that could equally be at another place that nothing else
+explains.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from imgcal.errors import InputError
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
 CLAIMED = 0.5
-"""Share of a rival's blobs that other objects must have, for it to be one of them."""
+"""Minimum share of a rival's blobs that belong to other objects, for it to be one of these."""
 AROUND = 3.0
-"""Pixels around the images of an object that was found, within which blobs are its own."""
+"""Distance (px) around a found object's images within which blobs are its own."""
 
 Bools = NDArray[np.bool_]
-Row = tuple[SnapshotIdentity, NDArray[np.int64]]  # labels are of all blobs of the snapshot, counted over all objects
+Row = tuple[SnapshotIdentity, NDArray[np.int64]]  # labels of all blobs of the snapshot, numbered over all objects
 
 
 def associate_several(
@@ -38,17 +38,17 @@ def associate_several(
     options: PipelineOptions,
     progress: Progress | None = None,
 ) -> Associations:
-    """Do what `associate` does for several objects: a row of the result is an object found in a snapshot.
+    """Do what `associate` does, for several objects: each row of the result is an object found in a snapshot.
 
     Args:
-        detections: blobs of all snapshots, cameras as in the rig; snapshots that come with labels keep them.
+        detections: blobs of all snapshots, cameras as in the rig; given labels are kept.
         rig: the factory calibration.
         obj: several objects, see `CalibrationObject.of_several`.
-        options: how sure each row must be.
+        options: how certain each row must be.
         progress: wraps the loop over snapshots.
 
     Raises:
-        InputError: the options give a pose of the first snapshot, and do not say of which object.
+        InputError: the options give a pose of the first snapshot, but not of which object.
     """
     if options.start_pose is not None:
         raise InputError("start pose: found one beside several objects, expected a single object with it")
@@ -63,7 +63,7 @@ def associate_several(
     order: Iterable[int] = range(count)
     scene.decide(progress(order, count) if progress else order, count)
     incomplete = [s for s in range(count) if not scene.coded[s] and len(scene.found[s]) < len(trackers)]
-    if len(incomplete) < count:  # what the others have taught may help
+    if len(incomplete) < count:  # the rig learnt from the others may help
         for tracker in trackers:
             tracker.in_vain = 0
         scene.decide(incomplete, len(incomplete))
@@ -71,7 +71,7 @@ def associate_several(
 
 
 class _Capture:
-    """What was decided so far about the snapshots of a capture."""
+    """Decisions so far about the snapshots of a capture."""
 
     def __init__(self, detections: Detections, trackers: Sequence[Tracker], obj: CalibrationObject) -> None:
         self.detections, self.trackers, self.obj = detections, trackers, obj
@@ -85,7 +85,7 @@ class _Capture:
         self.reasons = [""] * count
 
     def decide(self, order: Iterable[int], count: int) -> None:
-        """Decide about each snapshot, as long as there is hope; of two decisions the one with more objects stays."""
+        """Decide each snapshot, as long as this is promising; of two decisions, keep the one with more objects."""
         patience = [Patience(count) for _ in self.trackers]
         for number, s in enumerate(order):
             found: list[Row] = []
@@ -100,7 +100,7 @@ class _Capture:
                 self.found[s], self.reasons[s] = found, reason
 
     def _given(self, s: int) -> tuple[list[Row], str]:
-        """Take the labels that came with a snapshot."""
+        """Take a snapshot's given labels."""
         name, given, found, reason = self.detections.snapshot_names[s], self.detections.fiducial[self.rows[s]], [], ""
         for part, tracker in enumerate(self.trackers):
             own = np.where((given >= 0) & (self.obj.part_of[given] == part), given, -1)
@@ -112,7 +112,7 @@ class _Capture:
         return found, reason
 
     def associations(self) -> Associations:
-        """Number blobs by rows; those without a label go with the first row of their snapshot."""
+        """Number blobs by rows; unlabelled ones go into the first row of their snapshot."""
         detections, snapshots, names = self.detections, list[SnapshotIdentity](), list[str]()
         row_of = np.zeros(len(detections), dtype=np.int64)
         fiducial = np.full(len(detections), -1, dtype=np.int64)
@@ -138,24 +138,24 @@ class _Placed:
     """An object that was found."""
 
     tracker: int
-    identity: Identity  # its labels are of all blobs of the snapshot
+    identity: Identity  # with labels of all blobs of the snapshot
     own: Bools  # (M,) blobs that belong to it, labelled or not
 
 
 def place_objects(
     trackers: Sequence[Tracker], asked: Sequence[int], blobs: Detections, name: str, moment: int
 ) -> tuple[list[Row], str]:
-    """Find out which objects are in view of one snapshot, and label their blobs.
+    """Find the objects in view of one snapshot, and label their blobs.
 
     Args:
-        trackers: one for each object, with what they have learnt.
-        asked: numbers of the objects to look for.
+        trackers: one per object, with its state.
+        asked: numbers of the objects to search for.
         blobs: usable blobs of the snapshot.
         name: of the snapshot.
         moment: its number.
 
     Returns:
-        The rows that were accepted, and why others were not.
+        The accepted rows, and why others were not accepted.
     """
     placed, reason = _placed(trackers, asked, blobs)
     found: list[Row] = []
@@ -172,11 +172,11 @@ def place_objects(
 def _placed(
     trackers: Sequence[Tracker], asked: Sequence[int], blobs: Detections
 ) -> tuple[list[tuple[int, Identity]], str]:
-    """Place one object after the other, the most certain first; then leave out what is not certain after all."""
+    """Place objects one by one, the most certain first; then remove those that are uncertain after all."""
     free, placed, left = np.ones(len(blobs), dtype=bool), list[_Placed](), list(asked)
     proposals: dict[int, Identity] = {}
     reason = ""
-    # A stick may be made of the markers of an object that is in view, and was not identified.
+    # A false stick may consist of markers of another object in view that was not identified.
     doubtful = any(t.obj.pose_rank == 6 and part not in left for part, t in enumerate(trackers))
     while left:
         solid = max(trackers[part].obj.pose_rank for part in left)
@@ -219,7 +219,7 @@ def _placed(
 
 
 def _propose(tracker: Tracker, blobs: Detections, free: Bools) -> Identity:
-    """Look for an object among the free blobs; labels are of all blobs."""
+    """Search for an object among the free blobs; the labels cover all blobs."""
     rows = np.flatnonzero(free)
     found = tracker.propose(blobs.select(rows))
 
@@ -235,9 +235,9 @@ def _propose(tracker: Tracker, blobs: Detections, free: Bools) -> Identity:
 def _same_blobs(
     best: int, accepted: Sequence[int], proposals: dict[int, Identity], trackers: Sequence[Tracker]
 ) -> int | None:
-    """Name another object that explains the blobs of the best one nearly as well; None = none does.
+    """Return another object that explains the best one's blobs about equally well; None = there is none.
 
-    Objects of the same make do not count: which of them it is does not matter.
+    Objects of the same make do not count: they are interchangeable.
     """
     mine, least = proposals[best], trackers[best].options.identity.least_margin
     for part in accepted:
@@ -252,7 +252,7 @@ def _same_blobs(
 
 
 def _own_blobs(identity: Identity, tracker: Tracker, blobs: Detections) -> Bools:
-    """Mark the blobs (M,) that belong to an object: its labels, and what else lies where its fiducials are seen."""
+    """Mark the blobs (M,) of an object: its labelled ones, and others near its fiducials' images."""
     own: Bools = identity.labels >= 0
     if identity.rig is None or identity.rig_from_object is None:
         return own
@@ -262,7 +262,7 @@ def _own_blobs(identity: Identity, tracker: Tracker, blobs: Detections) -> Bools
 
 
 def _has_rival(one: _Placed, placed: Sequence[_Placed]) -> bool:
-    """Tell whether an object might as well be where nothing else is."""
+    """Tell whether an object could equally be at a place where no other object is."""
     rival = one.identity.rival
     if rival is None:
         return False

@@ -1,7 +1,7 @@
-"""Labels of single images of a flat object with few fiducials, a wand: by its shape alone, hundreds of images at once.
+"""Label single images of a small flat object, such as a wand, by its shape alone; hundreds of images at once.
 
-Seen from a distance, a plane's image is an affine image: three blobs taken for three fiducials say where the others
-must be. What passes is posed, and must fit far better than any other labelling of the image.
+Seen from a distance, a plane's image is an affine image: three blobs matched to three fiducials predict the others.
+Candidates that pass get a pose, and must fit far better than any other labelling of the image.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from imgcal.estimation import initial_pose
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
 MOST_FLAT = 6
-"""Fiducials of an object that is labelled here."""
+"""Maximum number of fiducials of an object to label here."""
 MOST_ALONE = 12
-"""Blobs in an image that is looked at."""
+"""Maximum number of blobs in an image."""
 AFFINE = 0.15
-"""How far a blob may be from where an affine image has its fiducial, in parts of the object's image."""
+"""Maximum distance of a blob from the affine prediction, as a share of the object's image."""
 FITS = 0.015
-"""RMS residual of a labelling with a pose, in the same parts: noise, and what the lens bends."""
+"""Maximum RMS residual of a labelling with a pose, in the same unit: noise, and lens distortion."""
 CLEARLY, RIVAL = 3.0, 0.01
-"""Times the residual, and the residual, which every other labelling must have at least."""
+"""Minimum ratio to the best residual, and minimum residual, of every other labelling."""
 FOCAL_FACTORS = (0.85, 0.92, 1.0, 1.08, 1.17)
-"""Focal lengths that are tried, in parts of the one given."""
+"""Focal lengths to try, relative to the given one."""
 LEAST_USUAL, USUAL_SIZE = 3, 2.5
-"""Images that say how large the object looks, and the factor to either side that is as usual."""
+"""Number of images that define the object's usual apparent size, and the maximum factor of deviation from it."""
 SAME_SIZE = 1.25
-"""Ratio of the radii of two markers of one object in one image, at most."""
+"""Maximum ratio of the radii of two markers of one object in an image."""
 LEAST_RATIO = 0.1
-"""Of the breadth of an image of the object to its length: narrower ones say too little."""
+"""Minimum ratio of breadth to length of an object's image: narrower ones are not informative."""
 
 Floats = NDArray[np.float64]
 
 
 def is_small_planar(obj: CalibrationObject) -> bool:
-    """Tell whether an object is one for `label_by_shape`."""
+    """Tell whether `label_by_shape` can handle an object."""
     return obj.num_fiducials <= MOST_FLAT and obj.planar
 
 
@@ -51,12 +51,12 @@ def label_by_shape(
 
     Args:
         images: blobs of each, (M, 2) pixels.
-        camera: a rig of one camera; the focal length may be off by some ten percent.
-        obj: flat, few fiducials, all of which an image must show.
-        radii: (M,) pixels, of the blobs of each image, nan where unknown: those of one object are alike.
+        camera: a rig of one camera; the focal length may be off by about ten percent.
+        obj: flat, with few fiducials; an image must show all of them.
+        radii: (M,) pixels, of the blobs of each image, nan = unknown: those of one object are alike.
 
     Returns:
-        For each image the fiducial of each blob, (M,), -1 = none; None where the image does not say.
+        For each image, the fiducial of each blob, (M,), -1 = none; None if the image is ambiguous.
 
     Examples:
         >>> import imgcal
@@ -84,7 +84,7 @@ def label_by_shape(
     size = (uv - uv.mean(2, keepdim=True)).square().sum(-1).mean((1, 2)).sqrt().numpy()
     residual = np.min([_misfit(uv, camera, factor, obj) for factor in FOCAL_FACTORS], axis=0) / size
     chosen = _decide(residual, image)
-    if len(chosen) >= LEAST_USUAL:  # what is found says how large the object looks, and what else is no rival
+    if len(chosen) >= LEAST_USUAL:  # these define the object's usual size; other sizes are not rivals
         usual = np.abs(np.log(size / np.median(size[chosen]))) < np.log(USUAL_SIZE)
         chosen = _decide(np.where(usual, residual, np.inf), image)
     for row in chosen.tolist():
@@ -95,7 +95,7 @@ def label_by_shape(
 
 
 def _decide(residual: Floats, image: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Choose for each image (K,) the labelling with the smallest residual (K,), if no other comes near: their rows."""
+    """Rows of the labellings (K,) with an image's smallest residual, for images without a close rival."""
     chosen = []
     for number in np.unique(image):
         mine = np.flatnonzero(image == number)
@@ -125,7 +125,7 @@ def _plane_coordinates(obj: CalibrationObject) -> tuple[Floats, tuple[int, int, 
 
 
 def _candidates(xy: Floats, flat: Floats, base: tuple[int, int, int]) -> NDArray[np.int64]:
-    """Labellings (K, N) under which blobs (M, 2) look like an affine image of the object: the blob of each fiducial."""
+    """Labellings (K, N), the blob of each fiducial, under which blobs (M, 2) are an affine image of the object."""
     triples = np.array(list(permutations(range(len(xy)), 3)))
     corners = xy[triples]  # (T, 3, 2)
     away = np.linalg.norm(corners - corners.mean(1, keepdims=True), axis=-1).mean(1)

@@ -1,7 +1,7 @@
-"""Candidate poses of markers on one line: two blobs of one camera against two of another, at the right distance.
+"""Candidate poses of collinear markers: two blobs of one camera matched to two of another, at the right distance.
 
-No single camera knows the pose of a line. Two cameras do, roughly: a factory calibration that is off moves both ends of
-a stick alike, and changes its length little. The whole rig votes on these poses as on those of any other object.
+No single camera knows the pose of a line. Two cameras know it roughly: an inaccurate factory calibration moves both
+ends of a stick alike, and hardly changes its length. The whole rig votes on these poses as for any other object.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from imgcal.association.voting import match, predict_ideal, vote
 Array = NDArray[np.float64]
 
 REACH = 4.0
-"""Standard deviations of the cameras' errors within which two rays meet, and a length is that of the stick."""
+"""Maximum distance of rays that meet, and error of a stick's length, in standard deviations of the cameras."""
 LEAST_LENGTH_ERROR = 0.03
-"""Relative: rays that are off differently at the two ends."""
+"""Relative: errors of rays that differ between the two ends."""
 MOST_POSES = 20_000
-"""That the rig votes on."""
+"""Maximum number of poses for the vote."""
 MOST_VOTED = 200
-"""Of these, the best that are labelled."""
+"""Number of the best of these to label."""
 FITTED = 6
-"""Different labellings that are fitted: the best one and its rivals."""
+"""Number of different labellings to fit: the best one and its rivals."""
 BEND = 0.02
-"""Radians, what poses from two cameras are off by, even for perfect ones."""
+"""Radians, error of poses from two cameras, even for perfect ones."""
 
 
 @dataclass(frozen=True)
 class _Eyes:
-    """Where blobs are seen, and how far off that may be."""
+    """Rays to blobs, and their errors."""
 
     rays: Array  # (C, M, 3) unit directions in the rig's frame
     position: Array  # (C, 3) mm
@@ -45,11 +45,11 @@ class _Eyes:
 
 
 def fit_sticks(scene: Scene, seed: int) -> Fits | None:
-    """Fit the labellings of a snapshot that look most like markers on a line; None = no two blobs do.
+    """Fit the labellings of a snapshot that look most like collinear markers; None = no two blobs do.
 
     Args:
-        scene: the snapshot, and an object whose fiducials lie on one line.
-        seed: of the random choice where there are too many candidates.
+        scene: the snapshot, with an object of collinear fiducials.
+        seed: of the random choice if there are too many candidates.
     """
     eyes, distance = _eyes(scene)
     poses, away = _candidates(scene, eyes, distance, np.random.default_rng(seed))
@@ -61,7 +61,7 @@ def fit_sticks(scene: Scene, seed: int) -> Fits | None:
     gate = max(10.0, REACH * 2**0.5 * float(pattern.shift.max()))
     predicted = predict_ideal(scene.rig, points, poses)
     votes = vote(scene.blobs, predicted, tolerance, gate)
-    # One blob near a marker's image says nothing: the image of the whole may be shifted there.
+    # One blob near a marker's image is no evidence: the whole image may be shifted there.
     score = np.maximum(votes.count - 1, 0).sum(1)
     best = np.argsort(-score, kind="stable")[:MOST_VOTED]
     labels = match(scene.blobs, predicted[best], votes.shift[best], 1.25 * tolerance)
@@ -87,7 +87,7 @@ def _eyes(scene: Scene) -> tuple[_Eyes, float]:
 
 
 def _candidates(scene: Scene, eyes: _Eyes, distance: float, generator: np.random.Generator) -> tuple[Poses, float]:
-    """Poses from all pairs of cameras, and how far they are from the cameras, usually: mm."""
+    """Poses from all pairs of cameras, and their usual distance from the cameras: mm."""
     points = scene.obj.points.double().numpy()
     pairs = [pair for pair in combinations(range(len(eyes.position)), 2) if eyes.count[list(pair)].min() >= 2]
     symmetric = len(scene.obj.symmetries) > 1
@@ -115,7 +115,7 @@ def _candidates(scene: Scene, eyes: _Eyes, distance: float, generator: np.random
 
 
 def _meetings(eyes: _Eyes, first: int, second: int) -> tuple[Array, NDArray[np.int64], float]:
-    """Where rays of two cameras nearly meet: places (P, 3), the blobs (P, 2), and the relative error of a length."""
+    """Points where rays of two cameras nearly meet: (P, 3), the blobs (P, 2), and the relative error of a length."""
     d1, d2 = eyes.rays[first, : eyes.count[first], None], eyes.rays[second, None, : eyes.count[second]]
     base = eyes.position[second] - eyes.position[first]
     cosine = (d1 * d2).sum(-1)
@@ -135,7 +135,7 @@ def _meetings(eyes: _Eyes, first: int, second: int) -> tuple[Array, NDArray[np.i
 
 
 def _poses(points: Array, a: Array, b: Array) -> Poses:
-    """Lay two points (2, 3) of a line onto places (P, 3) each, by the shortest turn."""
+    """Poses that take two points (2, 3) of a line to pairs of positions (P, 3) by the smallest rotation."""
     along = (points[1] - points[0]) / np.linalg.norm(points[1] - points[0])
     there = (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True)
     middle = along + there

@@ -1,4 +1,4 @@
-"""Snapshot after snapshot: what earlier ones say, the pose and the rig, helps to label the next."""
+"""Use earlier snapshots, by their pose and rig, to label the next one."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from imgcal.geometry import RigidTransform, geodesic_angle
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior, check_object, check_rig
 
 MOST_REMEMBERED = 64
-"""Snapshots that take part in refits of the rig while identity goes on: later ones add little to it."""
+"""Maximum number of snapshots in refits of the rig during identification: later ones add little."""
 
 NEARLY_KNOWN = 0.35
-"""Radians that a proposed pose may be turned against the last one to count as found by tracking."""
+"""Maximum rotation (rad) of a proposed pose against the last one to count as found by tracking."""
 
 
 @dataclass(frozen=True)
 class SnapshotIdentity:
-    """What was decided about one snapshot."""
+    """The decision about one snapshot."""
 
     name: str
     status: str  # coded | unique | by_prior | by_tracking | ambiguous | refused
@@ -36,12 +36,12 @@ class SnapshotIdentity:
     alternatives: int
     rig_from_object: RigidTransform | None
     found_by: str = "classical"  # blobs, or the name of the proposer
-    moment: int = -1  # number of the snapshot of the input, where several objects share one; -1 = its own number
-    part: int = 0  # which of several objects
+    moment: int = -1  # number of the input's snapshot if several rows share one; -1 = its own number
+    part: int = 0  # number of the object, of several
 
 
 class LearntRig:
-    """What accepted snapshots say about the rig; shared by the trackers of several objects."""
+    """The rig estimated from accepted snapshots; shared by the trackers of several objects."""
 
     def __init__(self, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions, remembered: int) -> None:
         self.factory, self.obj, self.options, self.remembered = rig, obj, options, remembered
@@ -56,7 +56,7 @@ class LearntRig:
             return
         self.accepted[name] = blobs, labels, pose
         count = len(self.accepted)
-        # One that was tried again replaces what it said: it is no further witness.
+        # A snapshot that was tried again replaces its earlier result: it is not further evidence.
         if known or count & (count - 1):
             return
         accepted, obj = self.accepted.values(), self.obj
@@ -76,7 +76,7 @@ class LearntRig:
 
 
 class Tracker:
-    """Carries what earlier snapshots say, the pose and the rig, to the next one."""
+    """Carries pose and rig from earlier snapshots to the next one."""
 
     def __init__(
         self,
@@ -87,14 +87,14 @@ class Tracker:
         learnt: LearntRig | None = None,
         first: int = 0,
     ) -> None:
-        """Begin with what is known before.
+        """Start with the prior knowledge.
 
         Args:
             rig: the factory calibration.
-            obj: the object that is followed.
-            options: how sure to be.
-            remembered: snapshots that take part in refits of the rig.
-            learnt: what trackers of other objects share; None = this is the only one.
+            obj: the tracked object.
+            options: how certain the result must be.
+            remembered: maximum number of snapshots in refits of the rig.
+            learnt: state shared with trackers of other objects; None = this is the only one.
             first: number of the object's first fiducial among those of all objects.
         """
         check_rig(rig)
@@ -102,13 +102,13 @@ class Tracker:
         self.obj, self.options, self.first = obj, options, first
         self.learnt = learnt or LearntRig(rig, obj, options, remembered)
         self.pose = None if options.start_pose is None else _check_pose(options.start_pose, rig)
-        self.alternatives = 0  # that the accepted snapshots leave open, 0 = none was accepted yet
-        self.in_vain = 0  # hypotheses that were tried since something was accepted
-        self.looks_in_vain = 0  # snapshots in which a proposer found nothing, less those in which it did
+        self.alternatives = 0  # left by the accepted snapshots, 0 = none accepted yet
+        self.in_vain = 0  # number of hypotheses since the last success
+        self.looks_in_vain = 0  # snapshots without a proposal, less those with one
 
     @property
     def rig(self) -> CameraRig:
-        """The rig as the accepted snapshots have it."""
+        """The rig estimated from the accepted snapshots."""
         return self.learnt.rig
 
     @rig.setter
@@ -117,7 +117,7 @@ class Tracker:
 
     @property
     def prior_std(self) -> Tensor:
-        """How far it may be off: (C, K)."""
+        """Standard deviations of its values: (C, K)."""
         return self.learnt.prior_std
 
     @prior_std.setter
@@ -125,7 +125,7 @@ class Tracker:
         self.learnt.prior_std = prior_std
 
     def accept(self, name: str, labels: NDArray[np.int64]) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
-        """Take over the labels that came with a snapshot."""
+        """Accept the labels that came with a snapshot."""
         few = self._too_few(name, labels)
         return few or SnapshotIdentity(name, "coded", "labelled in the input", 1, None), labels
 
@@ -136,9 +136,9 @@ class Tracker:
     def look(
         self, sight: Sight, number: int, blobs: Detections, name: str
     ) -> tuple[SnapshotIdentity, NDArray[np.int64], Detections]:
-        """Label one snapshot by what a proposer sees in its frames; also gives the blobs that the labels are of.
+        """Label one snapshot by a proposer's view of its frames; also return the blobs that the labels refer to.
 
-        Where it sees nothing, and blobs have not been asked before, these say where to look, or else decide.
+        If it sees nothing, and blobs have not been tried yet, they give a pose to try, or decide themselves.
         """
         known = () if self.pose is None else (self.pose,)
         snapshot = Snapshot(
@@ -160,10 +160,7 @@ class Tracker:
         return replace(concluded, found_by=found_by), labels, found
 
     def _judge(self, sight: Sight, snapshot: Snapshot) -> tuple[Identity, Detections, str]:
-        """Let a proposer look, and decide about what it says; also gives who said it.
-
-        What is refused may have another proposal behind it: that one is decided about by the same rules.
-        """
+        """Run a proposer; judge its proposal, or the one behind it where that is refused, and name who made it."""
         proposal = sight.proposer.propose(snapshot)
         error = float(np.hypot(self.options.identity_error, self._tolerance_px(snapshot.blobs)))
         while True:
@@ -187,7 +184,7 @@ class Tracker:
         return SnapshotIdentity(name, identity.status, identity.reason, identity.alternatives, pose), labels
 
     def _too_few(self, name: str, labels: NDArray[np.int64]) -> SnapshotIdentity | None:
-        """Refuse a snapshot that shows too few fiducials; None = it shows enough."""
+        """Refuse a snapshot with too few fiducials; None = it has enough."""
         shown = len(np.unique(labels[labels >= 0]))
         least = self.options.least_fiducials
         least = least if self.obj.pose_rank == 6 else min(least, self.obj.num_fiducials)
@@ -197,10 +194,10 @@ class Tracker:
         return SnapshotIdentity(name, "refused", reason, 1, None)
 
     def follow(self, pose: RigidTransform) -> tuple[Status, int]:
-        """Take over the pose of a snapshot that was followed from the last one.
+        """Take the pose of a snapshot that was tracked from the last one.
 
         Returns:
-            How sure that one is: status and alternatives, which it inherits.
+            Its certainty, inherited from the last one: status and alternatives.
         """
         self.pose = pose
         return ("ambiguous" if self.alternatives > 1 else "by_tracking"), max(self.alternatives, 1)
@@ -209,20 +206,20 @@ class Tracker:
         return self._adopt(self.propose(blobs))
 
     def propose(self, blobs: Detections) -> Identity:
-        """Label the blobs of one snapshot, without drawing conclusions from it."""
+        """Label the blobs of one snapshot without changing the state."""
         error = np.hypot(self.options.identity_error, self._tolerance_px(blobs))
         blobs = replace(blobs, sigma=np.hypot(blobs.sigma, error))
         known = [] if self.pose is None else [self.pose]
-        # Many captures are taken with the object at the origin of the rig's frame; it costs little to look there first.
+        # In many captures the object is at the origin of the rig's frame; this is cheap to try first.
         guesses = [] if known else [RigidTransform.identity(dtype=self.rig.focal_length.dtype)]
         return identify(blobs, self.rig, self.obj, self.prior_std, known, self.options.identity, guesses)
 
     def conclude(self, proposed: Identity, blobs: Detections, name: str) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
-        """Draw the conclusions from what `propose` found in these blobs."""
+        """Update the state with the result of `propose` for these blobs."""
         return self._conclude(self._adopt(proposed), blobs, name)
 
     def _adopt(self, found: Identity) -> Identity:
-        """See a decision in the light of those before."""
+        """Interpret a decision given the earlier ones."""
         pose = found.rig_from_object
         if not found.accepted or pose is None:
             self.in_vain += found.hypotheses
@@ -236,7 +233,7 @@ class Tracker:
         return found
 
     def _tolerance_px(self, blobs: Detections) -> float:
-        """What the object's tolerances are in the image, roughly."""
+        """Approximate size of the object's tolerances in the image."""
         obj = self.obj
         if obj.exact:
             return 0.0
@@ -253,17 +250,17 @@ class Tracker:
         return tolerance * float(np.median(extents)) / obj.size if extents else 0.0
 
     def _remember(self, name: str, blobs: Detections, labels: NDArray[np.int64], pose: RigidTransform) -> None:
-        """Keep the pose, and let the rig learn from it."""
+        """Keep the pose, and update the rig."""
         self.pose = pose
         labels = np.where(labels >= 0, labels + self.first, -1)
         self.learnt.remember(name if self.first == 0 else f"{name} {self.first}", blobs, labels, pose)
 
 
 def _check_pose(pose: RigidTransform, rig: CameraRig) -> RigidTransform:
-    """Return a pose that a user gave, in the rig's precision.
+    """Convert a user's pose to the rig's precision.
 
     Raises:
-        InputError: it is none.
+        InputError: it is not a pose.
     """
     shapes = tuple(pose.rotation.shape), tuple(pose.translation.shape)
     if shapes != ((3, 3), (3,)):
@@ -276,7 +273,7 @@ def _check_pose(pose: RigidTransform, rig: CameraRig) -> RigidTransform:
 
 
 def to_observations(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Observations:
-    """Arrange labelled blobs densely: (S, C, N). Of two blobs with one label in a camera the last one counts."""
+    """Arrange labelled blobs densely: (S, C, N). If two blobs in a camera have the same label, the last one counts."""
     snapshots = np.unique(detections.snapshot) if len(detections) else np.empty(0, dtype=np.int64)
     shape = (max(len(snapshots), 1), rig.num_cameras, obj.num_fiducials)
     rows = np.flatnonzero(detections.fiducial >= 0)

@@ -1,6 +1,6 @@
-"""From a rough labelling to a certain one: fit rig and pose, predict with uncertainty, label again, finer each time.
+"""Refine a rough labelling to a certain one: fit rig and pose, predict with uncertainty, relabel, repeat more finely.
 
-Only after such a fit can a label be judged: the factory rig alone is off by tens of pixels.
+A label can be judged only after such a fit: the factory rig alone is off by tens of pixels.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig
 
 STAGES = (3.0, 0.7)
-"""Standard deviations (px) that the first fits allow, beyond the blobs' own; the last ones ask the residuals."""
+"""Standard deviations (px), beyond the blobs' own, in the first fits; the last ones use the residuals' level."""
 GATE = 25.0
-"""Squared normalized innovation of a label; two degrees of freedom exceed it once in 270,000."""
+"""Maximum squared normalized innovation of a label; two degrees of freedom exceed it once in 270,000."""
 LEAST_SIZE_SPREAD = 0.05
-"""Relative standard deviation of a blob's radius within its camera, at least: depth, tilt and exposure vary."""
+"""Minimum relative standard deviation of a blob's radius within its camera: depth, tilt and exposure vary."""
 MOST_SIZE_MISFIT = 36.0
-"""Of one blob: a single odd radius decides no more than this."""
+"""Maximum contribution of one blob, so that a single odd radius does not decide more."""
 KNOWN_PLACE = 5.0
-"""Standard deviation (px) of a prediction from which on a single marker of a stick needs no other beside it."""
+"""Standard deviation (px) of a prediction below which a stick's marker needs no other labelled marker beside it."""
 UNDECIDED = 2 * np.log(1e3)
-"""Two pairings whose squared normalized innovations differ by less cannot be told apart."""
+"""Minimum difference of squared normalized innovations between two distinguishable pairings."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What is given: the blobs, the object, the factory rig and how far it may have drifted."""
+    """Input of a fit: the blobs, the object, the factory rig and its prior."""
 
     blobs: PaddedBlobs
     obj: CalibrationObject
@@ -49,7 +49,7 @@ class Scene:
 
     @cached_property
     def problem(self) -> Problem:
-        """Of one labelling, without any label."""
+        """The problem of a single labelling, without labels."""
         points, radius = self.obj.points.double(), self.obj.radius
         centroid, cameras = points.mean(0), self.rig.num_cameras
         return Problem(
@@ -73,12 +73,12 @@ class Fits:
 
     labels: NDArray[np.int64]  # (K, C, N) blob of each fiducial, -1 = none
     state: State
-    sigma: NDArray[np.float64]  # (K,) px, error of a blob centre beyond its own
+    sigma: NDArray[np.float64]  # (K,) px, error of blob centres beyond their own sigmas
     cost: NDArray[np.float64]  # (K,) half of chi2, data and prior
     innovations: Innovations | None = None  # of these labels at this state
 
     def select(self, rows: NDArray[np.int64]) -> Fits:
-        """Keep the given labellings; a single one is not copied."""
+        """Keep the given labellings, without a copy if it is a single one."""
         chosen = one_or_some(rows)
         state = State(self.state.offset[chosen], self.state.rotation[chosen], self.state.centre[chosen])
         found = None if self.innovations is None else self.innovations.select(rows)
@@ -86,10 +86,10 @@ class Fits:
 
 
 def join(parts: Sequence[Fits]) -> Fits:
-    """Put fitted labellings of one snapshot together."""
+    """Concatenate fitted labellings of one snapshot."""
     if len(parts) == 1:
         return parts[0]
-    states, found = [part.state for part in parts], [_fits(part) for part in parts]
+    states, found = [part.state for part in parts], [_require_innovations(part) for part in parts]
     columns = ("offset", "rotation", "centre")
     state = State(*(torch.cat([getattr(state, name) for state in states]) for name in columns))
     innovations = Innovations(
@@ -102,7 +102,7 @@ def join(parts: Sequence[Fits]) -> Fits:
 
 
 def start(scene: Scene, poses: Poses, labels: NDArray[np.int64]) -> Fits:
-    """Put the factory rig at poses (K,) with rough labels (K, C, N)."""
+    """Start with the factory rig at poses (K,) with rough labels (K, C, N)."""
     u, _, vh = np.linalg.svd(poses.rotation)
     rotation = torch.from_numpy(u @ vh)
     centre = torch.from_numpy(np.ascontiguousarray(poses.translation)) + rotation @ scene.obj.points.mean(0).to(
@@ -113,7 +113,7 @@ def start(scene: Scene, poses: Poses, labels: NDArray[np.int64]) -> Fits:
 
 
 def refine(scene: Scene, fits: Fits, stages: tuple[float, ...] = STAGES) -> Fits:
-    """Fit and label again through all stages; the last labels are fitted too."""
+    """Alternate fitting and labelling through all stages; the last labels are fitted, too."""
     for sigma in stages:
         fits = fit(scene, replace(fits, sigma=np.full(len(fits.labels), sigma)))
         fits = replace(fits, sigma=_residual_sigma(scene, fits), labels=_assign(fits))
@@ -121,7 +121,7 @@ def refine(scene: Scene, fits: Fits, stages: tuple[float, ...] = STAGES) -> Fits
 
 
 def settle_labels(scene: Scene, fits: Fits, rounds: int = 4) -> Fits:
-    """Label fitted labellings again, and fit, until the labels stay or for so many rounds."""
+    """Alternate labelling and fitting until the labels are stable, for at most `rounds` rounds."""
     for _ in range(rounds):
         labels = _assign(fits)
         if np.array_equal(labels, fits.labels):
@@ -131,29 +131,29 @@ def settle_labels(scene: Scene, fits: Fits, rounds: int = 4) -> Fits:
 
 
 def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
-    """Drop labels that are not certain: neither a false blob nor another fiducial may explain the blob nearly as well.
+    """Drop uncertain labels: those that a false blob or another fiducial may explain about as well.
 
     Args:
-        scene: what is given.
+        scene: the input.
         fits: refined labellings.
-        odds: odds of a label against a false blob, to be exceeded.
-        least_odds: the same where false blobs are so dense that hardly any label reaches `odds`.
+        odds: minimum odds of a label against a false blob.
+        least_odds: the same if false blobs are so dense that hardly any label reaches `odds`.
     """
-    # How dense false blobs are is asked once: a dropped label must not count as a false blob against the others.
+    # Estimate the density of false blobs once: a dropped label must not count as a false blob against the others.
     surroundings = _detection_odds(scene, fits) - np.log(_clutter(scene, fits))
-    log_odds = _log_density(_fits(fits)) + surroundings
+    log_odds = _log_density(_require_innovations(fits)) + surroundings
     usual = np.median(log_odds[np.isfinite(log_odds)]) if np.isfinite(log_odds).any() else 0.0
     demanded = np.clip(usual - np.log(100), np.log(least_odds), np.log(odds))
-    # Two or three labels of one camera can support each other in the wrong place: most of what it sees must fit.
-    # In a lattice, half of them can, a step away.
+    # Two or three labels of one camera can support each other in the wrong place: most of its view must fit.
+    # In a lattice, half of them can, one step away.
     most = 0.7 if lattice_shifts(scene.obj) else 0.5
     whole, stick = np.minimum(scene.blobs.count, scene.obj.num_fiducials), scene.obj.pose_rank == 5
     enough = np.maximum(2 if stick else 3, most * whole)
     for _ in range(4):
-        found = _fits(fits)
+        found = _require_innovations(fits)
         log_odds = _log_density(found) + surroundings
         good = (found.own < GATE) & (log_odds > demanded) & ~find_contested(fits.labels, found, UNDECIDED)
-        # What a stick shows of itself is little; where the rig knows the place without it, one label is enough.
+        # A stick shows little of itself; if the rig predicts the place without it, one label is enough.
         known = stick & (found.log_det < 2 * np.log(KNOWN_PLACE**2))
         good &= (good.sum(-1) >= enough)[..., None] | known
         if np.array_equal(good, fits.labels >= 0):
@@ -163,49 +163,49 @@ def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
 
 
 def evidence(scene: Scene, fits: Fits) -> NDArray[np.float64]:
-    """Log of the odds of each labelling against "all blobs are clutter" (Laplace's approximation): (K,)."""
+    """Log odds of each labelling against "all blobs are clutter" (Laplace's approximation): (K,)."""
     labelled = fits.labels >= 0
     noise = _blob_noise(scene, fits) + fits.sigma[:, None, None] ** 2
-    found = _fits(fits)
+    found = _require_innovations(fits)
     gain = -np.log(2 * np.pi * noise) - np.log(_clutter(scene, fits)) + _detection_odds(scene, fits)
     sizes = _size_misfit(scene, fits)
     return np.where(labelled, gain, 0).sum((1, 2)) - fits.cost - 0.5 * (found.complexity + sizes)
 
 
 def predictions(fits: Fits) -> NDArray[np.float64]:
-    """Pixels of all fiducials under the first labelling: (C, N, 2)."""
-    return _fits(fits).uv[0]
+    """Predicted pixels of all fiducials under the first labelling: (C, N, 2)."""
+    return _require_innovations(fits).uv[0]
 
 
 def rig_and_pose(scene: Scene, fits: Fits, row: int) -> tuple[CameraRig, RigidTransform]:
-    """Give the rig and rig_from_object of one labelling, without batch axes."""
+    """Return the rig and rig_from_object of one labelling, without batch axes."""
     return levenberg_marquardt_cpu.rig_at(scene.problem, fits.state.offset[row : row + 1])[0], select_pose(
         scene, fits, row
     )
 
 
 def select_pose(scene: Scene, fits: Fits, row: int) -> RigidTransform:
-    """Give rig_from_object of one labelling, without batch axes."""
+    """Return rig_from_object of one labelling, without batch axes."""
     return pose_at(scene.problem, fits.state)[row, 0]
 
 
-def _fits(fits: Fits) -> Innovations:
+def _require_innovations(fits: Fits) -> Innovations:
     if fits.innovations is None:
         raise RuntimeError("labellings were not fitted")
     return fits.innovations
 
 
 def _assign(fits: Fits) -> NDArray[np.int64]:
-    return assign(_fits(fits).squared, GATE)
+    return assign(_require_innovations(fits).squared, GATE)
 
 
 def _blob_noise(scene: Scene, fits: Fits) -> NDArray[np.float64]:
-    """Variance of each label's blob by its own account: (K, C, N) px^2."""
+    """Variance of each label's blob by its own sigma: (K, C, N) px^2."""
     return scene.blobs.sigma[np.arange(fits.labels.shape[1])[:, None], np.maximum(fits.labels, 0)] ** 2
 
 
 def make_problem(scene: Scene, fits: Fits) -> Problem:
-    """Put labellings into the form that estimation knows."""
+    """Convert labellings into an estimation problem."""
     count, cameras, _ = fits.labels.shape
     seen = fits.labels >= 0
     uv = np.where(seen[..., None], scene.blobs.uv[np.arange(cameras)[:, None], np.maximum(fits.labels, 0)], 0.0)
@@ -221,8 +221,8 @@ def make_problem(scene: Scene, fits: Fits) -> Problem:
 
 
 def fit(scene: Scene, fits: Fits) -> Fits:
-    """Fit labellings as they are."""
-    # One after the other: starting threads for a few small fits takes longer than the fits on a busy machine.
+    """Fit labellings without relabelling."""
+    # Sequentially: on a busy machine, starting threads takes longer than a few small fits.
     problem = make_problem(scene, fits)
     if len(fits.labels) == 1:
         solution = _minimize(problem, fits.state)
@@ -239,10 +239,10 @@ def _minimize(problem: Problem, state: State) -> Solution:
 
 
 def _stack_solutions(solutions: Sequence[Solution]) -> Solution:
-    """Solutions of several labellings as one, with a batch axis."""
+    """Stack the solutions of several labellings along a batch axis."""
 
     def cat(parts: Sequence[Any]) -> Any:
-        """Put records of tensors together, field by field."""
+        """Concatenate records of tensors, field by field."""
         names = [field.name for field in fields(parts[0])]
         columns = {name: [getattr(part, name) for part in parts] for name in names}
         return type(parts[0])(**{k: None if v[0] is None else torch.cat(v) for k, v in columns.items()})
@@ -253,8 +253,8 @@ def _stack_solutions(solutions: Sequence[Solution]) -> Solution:
 
 
 def _residual_sigma(scene: Scene, fits: Fits) -> NDArray[np.float64]:
-    """Error of blob centres beyond their own, as far as the residuals show it: (K,) px."""
-    found = _fits(fits)
+    """Error of blob centres beyond their own sigmas, from the residuals: (K,) px."""
+    found = _require_innovations(fits)
     inlier = (fits.labels >= 0) & (found.own < GATE)
     freedom = np.where(inlier, found.freedom, 0).sum((1, 2))
     variance = np.where(inlier, found.residual, 0).sum((1, 2)) / np.maximum(freedom, 1e-3)
@@ -263,7 +263,7 @@ def _residual_sigma(scene: Scene, fits: Fits) -> NDArray[np.float64]:
 
 
 def _size_misfit(scene: Scene, fits: Fits) -> NDArray[np.float64]:
-    """Chi2 of the blobs' radii where fiducials differ in theirs: (K,). One unknown factor a camera takes the rest."""
+    """Chi2 of the blobs' radii if fiducials differ in theirs: (K,), with one unknown factor per camera."""
     radius = scene.obj.radius
     if radius is None or not bool((radius > 1.05 * radius.min()).any()):
         return np.zeros(len(fits.labels))
@@ -277,8 +277,8 @@ def _size_misfit(scene: Scene, fits: Fits) -> NDArray[np.float64]:
 
 
 def _clutter(scene: Scene, fits: Fits) -> NDArray[np.float64]:
-    """False blobs per square pixel, near the object's image or overall, whichever is more: (K, 1, 1)."""
-    uv = _fits(fits).uv
+    """False blobs per square pixel, near the object's image or overall, whichever is larger: (K, 1, 1)."""
+    uv = _require_innovations(fits).uv
     low, high = uv.min(2), uv.max(2)
     middle, half = (low + high) / 2, 0.75 * (high - low) + 10
     inside = (np.abs(scene.blobs.uv[None] - middle[:, :, None]) < half[:, :, None]).all(-1).sum((1, 2))
@@ -289,13 +289,13 @@ def _clutter(scene: Scene, fits: Fits) -> NDArray[np.float64]:
 
 
 def _detection_odds(scene: Scene, fits: Fits) -> NDArray[np.float64]:
-    """Log odds that a fiducial in view gives a blob: (K, 1, 1)."""
-    uv = _fits(fits).uv
+    """Log odds that a visible fiducial is detected: (K, 1, 1)."""
+    uv = _require_innovations(fits).uv
     in_view = ((uv > 0) & (uv < scene.rig.image_size.numpy()[:, None])).all(-1).sum((1, 2))
     share = np.clip(((fits.labels >= 0).sum((1, 2)) + 1) / (in_view + 2), 0.05, 0.95)
     return np.log(share / (1 - share))[:, None, None]
 
 
 def _log_density(found: Innovations) -> NDArray[np.float64]:
-    """Log density (per px^2) of each label's blob where it is (K, C, N); -inf = no label."""
+    """Log density (per px^2) of each label's blob at its place (K, C, N); -inf = no label."""
     return -np.log(2 * np.pi) - 0.5 * found.log_det - 0.5 * found.own

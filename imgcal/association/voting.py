@@ -1,7 +1,7 @@
-"""The whole rig votes: how many blobs a pose explains when each camera's image may be shifted as a whole.
+"""The whole rig votes: count the blobs that a pose explains if each camera's image may be shifted as a whole.
 
-Drift of a few percent moves a camera's pattern by tens of pixels but bends it by few, so the shift is free within the
-prior's bounds and everything else is not.
+Drift of a few percent moves a camera's pattern by tens of pixels but deforms it only by a few. The shift is therefore
+free within the prior's bounds, and nothing else is.
 """
 
 # Compiled functions take their types from their arguments.
@@ -22,12 +22,12 @@ from imgcal.association.hypotheses import Poses
 from imgcal.types import CameraRig
 from renderers.compiling import njit
 
-MOST_BINS = 200  # across a camera's range of shifts; the tolerance grows where it asks for more
+MOST_BINS = 200  # across a camera's range of shifts; the tolerance grows if it needs more
 
 
 @dataclass(frozen=True)
 class Votes:
-    """Explained fiducials of K poses, and where each camera's image was found."""
+    """Number of explained fiducials of K poses, and the shift of each camera's image."""
 
     count: NDArray[np.int64]  # (K, C)
     shift: NDArray[np.float64]  # (K, C, 2) pixels, blob minus prediction
@@ -68,22 +68,22 @@ def _predict(rotation, translation, focal, points, turn, offset, uv):
 
 
 def vote(blobs: PaddedBlobs, predicted: NDArray[np.float64], tolerance: float, gate: float) -> Votes:
-    """Find each camera's most popular shift.
+    """Find each camera's most frequent shift.
 
     Args:
         blobs: the snapshot.
         predicted: (K, C, N, 2) from `predict_ideal`.
-        tolerance: pixels, how far a fiducial may be from its place in the pattern.
-        gate: pixels, the largest shift.
+        tolerance: pixels, error of a fiducial within the pattern.
+        gate: pixels, maximum shift.
 
     Returns:
-        The votes; counts stop at N.
+        The votes; counts are limited to N.
     """
     width = max(tolerance, 2 * gate / MOST_BINS)
     count = np.zeros(predicted.shape[:2], dtype=np.int64)
     shift = np.zeros((*predicted.shape[:2], 2))
     bins = math.ceil(2 * gate / width)
-    # Every vote counts in two by two overlapping windows, so that no peak is split by a border.
+    # Every vote counts in two by two overlapping windows, so that no border splits a peak.
     windows = np.zeros((bins + 1, bins + 1), dtype=np.int32)
     _vote(predicted, blobs.ideal, blobs.count, width, gate, windows, count, shift)
     return Votes(count, shift)
@@ -97,30 +97,44 @@ def _vote(predicted, ideal, number, width, gate, windows, count, shift):
 
 @njit(cache=True)
 def _vote_one(predicted, ideal, number, width, gate, windows, count, shift):
+    """Find the fullest window of each camera, the first of equals row by row; `windows` are zero before and after."""
+    fiducials = predicted.shape[1]
     for c in range(len(predicted)):
-        windows[:] = 0
-        for n in range(predicted.shape[1]):
+        most, best_i, best_j = 0, 0, 0
+        for n in range(fiducials):
             for m in range(number[c]):
                 u, v = ideal[c, m, 0] - predicted[c, n, 0] + gate, ideal[c, m, 1] - predicted[c, n, 1] + gate
                 if u >= 0 and v >= 0 and u < 2 * gate and v < 2 * gate:
                     i, j = int(u / width), int(v / width)
-                    windows[i, j] += 1
-                    windows[i + 1, j] += 1
-                    windows[i, j + 1] += 1
-                    windows[i + 1, j + 1] += 1
-        most, best_i, best_j = 0, 0, 0
-        for i in range(windows.shape[0]):
-            for j in range(windows.shape[1]):
-                if windows[i, j] > most:
-                    most, best_i, best_j = windows[i, j], i, j
-        count[c] = min(most, predicted.shape[1])
+                    for a in range(i, i + 2):
+                        for b in range(j, j + 2):
+                            votes = windows[a, b] + 1
+                            windows[a, b] = votes
+                            if votes > most or (votes == most and (a < best_i or (a == best_i and b < best_j))):
+                                most, best_i, best_j = votes, a, b
+        count[c] = min(most, fiducials)
         shift[c, 0], shift[c, 1] = best_i * width - gate, best_j * width - gate
+        _clear(windows, predicted[c], ideal[c], number[c], width, gate)
+
+
+@njit(cache=True)
+def _clear(windows, predicted, ideal, number, width, gate):
+    """Set windows to zero: all of them, or only those with votes where these are few."""
+    if 4 * len(predicted) * number > windows.size:
+        windows[:] = 0
+        return
+    for n in range(len(predicted)):
+        for m in range(number):
+            u, v = ideal[m, 0] - predicted[n, 0] + gate, ideal[m, 1] - predicted[n, 1] + gate
+            if u >= 0 and v >= 0 and u < 2 * gate and v < 2 * gate:
+                i, j = int(u / width), int(v / width)
+                windows[i, j] = windows[i + 1, j] = windows[i, j + 1] = windows[i + 1, j + 1] = 0
 
 
 def match(
     blobs: PaddedBlobs, predicted: NDArray[np.float64], shift: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.int64]:
-    """Pair fiducials with blobs under given shifts, which are refined on the way.
+    """Pair fiducials with blobs under given shifts, and refine these.
 
     Args:
         blobs: the snapshot.
@@ -149,7 +163,7 @@ def _match(predicted, ideal, number, shifts, tolerance, labels):
 
 @njit(cache=True)
 def _mean_residual(places, blobs, shift, reach_squared):
-    """Mean distance to the nearest blobs, the nearer the more it counts: (2,)."""
+    """Mean residual to the nearest blobs, weighted by nearness: (2,)."""
     total, step = 0.0, np.zeros(2)
     for n in range(len(places)):
         least, nearest_u, nearest_v = reach_squared, 0.0, 0.0

@@ -1,4 +1,4 @@
-"""Follow a rig over time: a sequential filter, and the diagnosis of what changes."""
+"""Follow a rig over time: a sequential filter, and the diagnosis of changes."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""Snapshots that want an explanation (`Case`), and what an explanation says of them (`Variant`, `Finding`)."""
+"""Snapshots that need an explanation (`Case`), and what an explanation makes of them (`Variant`, `Finding`)."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
 from imgcal.types import Observations, UnknownLights
 
 EARLY_SNAPSHOTS, EARLY_SECONDS = 12, 1.0
-"""Snapshots before a change, and seconds since the beginning, below both of which a camera that has moved looks like a
-late one: in so little time an object moves steadily, and both shift an image alike."""
+"""Number of earlier snapshots, and seconds since the start. Below both, a moved camera cannot be told from a late one:
+in so short a time an object moves steadily, so a move and a delay shift the image alike."""
 OBJECT_MOTION = 5.0
-"""Standard deviations of a blob by which the blobs of an object that moves go along an axis, in the median."""
+"""Median shift of a moving object's blobs along an axis, in standard deviations of a blob."""
 
 SHAPE = -1
-"""In place of a fiducial's number: all fiducials are elsewhere."""
+"""Stands for a fiducial's number when all fiducials have moved."""
 
 Snapshot = tuple[Observations, RigidTransform]
 """Observations (1, C, N), and the object's pose (1,)."""
@@ -34,12 +34,12 @@ Snapshot = tuple[Observations, RigidTransform]
 
 @dataclass(frozen=True)
 class ClockSlip:
-    """A camera that exposes at another time than before."""
+    """A camera whose exposure time has shifted."""
 
     camera: int
-    since: int  # number of the first snapshot, counted from 0, that saw it so
-    seconds: float  # by which it exposes later
-    sigma: float  # one standard deviation of it
+    since: int  # number of the first snapshot, counted from 0, that shows the slip
+    seconds: float  # delay of its exposures
+    sigma: float  # one standard deviation of the delay
     odds: float  # log odds against the next best explanation
 
 
@@ -47,56 +47,56 @@ class ClockSlip:
 class ObjectChange:
     """What happened to the object."""
 
-    fiducial: int | None  # the one that is elsewhere, `SHAPE` = all; None = another scale: it is another object
-    since: int  # number of the first snapshot, counted from 0, that saw it so
-    size: float  # mm that the fiducial went (RMS of all), or the relative change of scale
-    sigma: float  # one standard deviation of it
+    fiducial: int | None  # the one that moved; `SHAPE` = all; None = another scale: a different object
+    since: int  # number of the first snapshot, counted from 0, that shows the change
+    size: float  # mm that the fiducial moved (RMS over all), or the relative change of scale
+    sigma: float  # one standard deviation of the size
     odds: float  # log odds against the next best explanation
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What follows from an explanation, besides what is believed of the rig."""
+    """What follows from an explanation besides the belief about the rig."""
 
     slips: tuple[ClockSlip, ...] = ()
-    unsynchronized: tuple[int, ...] = ()  # cameras of which nothing can be learnt yet
-    shake: Tensor | None = None  # (C,) px, by which cameras shake
+    unsynchronized: tuple[int, ...] = ()  # cameras excluded from learning for now
+    shake: Tensor | None = None  # (C,) px, how much each camera shakes
     object_change: ObjectChange | None = None
 
 
 @dataclass(frozen=True)
 class Start:
-    """What was believed before some of a case's latest snapshots."""
+    """The belief before some of a case's latest snapshots."""
 
     before: RigBelief
     snapshots: Sequence[Snapshot]
-    log_prior: float = 0.0  # to be added where these are more than the case is about
+    log_prior: float = 0.0  # add this where they are more snapshots than the case covers
 
 
 @dataclass(frozen=True)
 class Case:
-    """Snapshots that want an explanation."""
+    """Snapshots that need an explanation."""
 
-    before: RigBelief  # what was believed before them
-    snapshots: Sequence[Snapshot]  # the last `count` want an explanation; earlier ones say how the object moves
+    before: RigBelief  # the belief before them
+    snapshots: Sequence[Snapshot]  # explain the last `count`; earlier ones show how the object moves
     pauses: Sequence[float]  # s before each
     count: int
     options: EstimationOptions = EstimationOptions()
-    cameras: tuple[int, ...] = ()  # suspected, the surest first; none = no camera in particular
-    uncertain: bool = False  # it is hardly known where these cameras are
-    quarantined: bool = False  # nothing has been learnt of these cameras since
-    lasting: Tensor | None = None  # (C,) px, one standard deviation of shifts of an image that last; None = none do
-    beginning: RigBelief | None = None  # what was believed before all snapshots, where that is what the factory says
-    excluded: Mapping[str, str] = field(default_factory=dict)  # explanations that need not be weighed, and why
+    cameras: tuple[int, ...] = ()  # suspects, the most likely first; empty = no particular camera
+    uncertain: bool = False  # the poses of these cameras are hardly known
+    quarantined: bool = False  # these cameras are excluded from learning since then
+    lasting: Tensor | None = None  # (C,) px, standard deviation of persistent image shifts; None = there are none
+    beginning: RigBelief | None = None  # the belief before all snapshots, if it is the factory's
+    excluded: Mapping[str, str] = field(default_factory=dict)  # explanations not to weigh, and why
 
     @property
     def latest(self) -> Sequence[Snapshot]:
-        """The snapshots that want an explanation."""
+        """The snapshots that need an explanation."""
         return self.snapshots[-self.count :]
 
     @cached_property
     def starts(self) -> tuple[Start, ...]:
-        """Since when something may have been so: the first of the latest snapshots, or from the very beginning."""
+        """When the change may have happened: before the first of the latest snapshots, or before all snapshots."""
         since = Start(self.before, self.latest)
         if self.beginning is None or self.count >= len(self.snapshots):
             return (since,)
@@ -108,7 +108,7 @@ class Case:
 
     @property
     def camera_sets(self) -> tuple[tuple[int, ...], ...]:
-        """The surest camera alone, and all that are suspected.
+        """Return the most likely camera alone, and all suspected cameras.
 
         Raises:
             RefusedError: no camera is suspected.
@@ -118,23 +118,23 @@ class Case:
         return tuple(dict.fromkeys((self.cameras[:1], self.cameras)))
 
     def require_body(self) -> None:
-        """Refuse what only fiducials that keep their distances can tell.
+        """Refuse a case that cannot be decided without an object of fixed shape.
 
         Raises:
-            RefusedError: lights are seen.
+            RefusedError: the points are lights.
         """
         if isinstance(self.before.obj, UnknownLights):
-            raise RefusedError("each light goes its own way")
+            raise RefusedError("lights have no fixed shape")
 
     @property
     def too_early(self) -> bool:
-        """Tell whether too little was seen before, of an object that moves, to tell a move from a late clock."""
+        """Tell whether too few snapshots of a moving object came before to tell a move from a late clock."""
         few = self.beginning is not None and len(self.snapshots) - self.count < EARLY_SNAPSHOTS
         return few and sum(self.pauses) < EARLY_SECONDS and self._object_moves
 
     @property
     def _object_moves(self) -> bool:
-        """Tell whether blobs went elsewhere in the snapshots before."""
+        """Tell whether blobs moved in the earlier snapshots."""
         seen = [(one.seen[0], one.uv[0], one.sigma[0]) for one, _ in self.snapshots[: -self.count]]
         if not seen:
             return True
@@ -147,28 +147,28 @@ class Case:
 
 @dataclass(frozen=True)
 class Variant:
-    """One way in which an explanation may hold: a belief, and the snapshots as they would have been."""
+    """One form of an explanation: a belief, and the snapshots as they would have been under it."""
 
     before: RigBelief
     snapshots: Sequence[Snapshot]
-    log_prior: float = 0.0  # of this variant, where it stands for a range of values; see `Start`
-    more: Callable[[MeasurementUpdate], float] | None = None  # log probability of what these snapshots leave out
-    find: Callable[[MeasurementUpdate], Finding] = lambda _: Finding()  # may refuse: it is not what it seems
+    log_prior: float = 0.0  # of this variant where it stands for a range of values; see `Start`
+    more: Callable[[MeasurementUpdate], float] | None = None  # log probability of data left out of `snapshots`
+    find: Callable[[MeasurementUpdate], Finding] = lambda _: Finding()  # may refuse the explanation after all
 
 
 @dataclass(frozen=True)
 class Explained:
-    """A case as an explanation has it: its most probable variant."""
+    """A case and an explanation of it: the most probable variant."""
 
     explanation: Explanation
     evidence: float  # log probability of the snapshots, averaged over all variants, times the prior probability
     before: RigBelief
-    snapshots: list[Snapshot]  # as they would have been, with the poses that were found
+    snapshots: list[Snapshot]  # under this explanation, with the estimated poses
     finding: Finding = Finding()
 
     @property
     def name(self) -> str:
-        """Of the explanation."""
+        """Name of the explanation."""
         return self.explanation.name
 
 
@@ -177,21 +177,21 @@ class Explanation(ABC):
 
     name: ClassVar[str]
     log_prior: ClassVar[float] = 0.0
-    """Log probability before anything is seen, up to what is the same for all."""
+    """Prior log probability, up to a constant that all explanations share."""
 
     @abstractmethod
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
-        """List the ways in which it may hold, each as probable as the others.
+        """List the forms of this explanation, all equally probable.
 
         Raises:
-            RefusedError: it does not apply to this case; a variant may raise it, too.
+            RefusedError: the explanation does not apply to this case; a variant may raise it, too.
         """
 
     def premature(self, case: Case, found: Explained) -> str | None:
-        """Say why more snapshots are needed before it is believed, though it is most probable; None = they are not."""
+        """Say why the most probable explanation needs more snapshots before it is believed; None = it does not."""
         return None
 
 
 def mean_evidence(evidences: Sequence[float], count: int) -> float:
-    """Log probability of snapshots, averaged over `count` variants as probable as each other; others failed."""
+    """Average the evidence over `count` equally probable variants; those that failed are not in `evidences`."""
     return float(torch.logsumexp(torch.tensor(evidences, dtype=torch.float64), 0)) - math.log(count)

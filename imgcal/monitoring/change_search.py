@@ -1,4 +1,4 @@
-"""Which camera has changed, and before how many of the latest snapshots?"""
+"""Find the camera that has changed, and the snapshot since which it has."""
 
 from __future__ import annotations
 
@@ -16,34 +16,35 @@ from imgcal.monitoring.recent_snapshots import SCREENED_AGES, RecentSnapshots
 from imgcal.monitoring.rig_belief import RigBelief
 from imgcal.types import Observations
 
-# Chi-squared of a change of a camera, all of two or three degrees of freedom.
+# Chi-squared of a change of a camera, with two or three degrees of freedom.
 ALARM_CHI2 = 60.0
-"""That a camera which stands still exceeds once in 10^12 tests."""
+"""A camera that stands still exceeds this once in 10^12 tests."""
 SCREEN_CHI2 = 20.0
-"""Of the quick test (`screen`), from which on the exact one is made: it finds a third where half of the rest is new."""
+"""Score of the quick test (`screen`) that triggers the exact one. The quick score may be a third of the exact one when
+half of the information is new."""
 REMAINING_CHI2 = 20.0
-"""What is left without the episode that speaks most for a change: a wrong label, or an error that passes, is none."""
+"""Minimum score without the episode that supports the change most; wrong labels or passing errors leave nothing."""
 
 # Numbers of snapshots.
 SLOW_TESTS = {16: 16, 64: 32}
-"""Numbers of snapshots that are tested without a suspicion, and after how many each: where little was known before."""
+"""Numbers of snapshots to test without a suspicion, each with the interval between its tests: for young rigs."""
 NEARBY_SNAPSHOTS = 4
-"""Snapshots around the most significant one among which the first one after a change is looked for."""
+"""Half width, in snapshots, of the search for the first snapshot after a change."""
 
 FIT_CHI2_PER_DOF = 4.0
-"""Chi-squared per degree of freedom up to which a snapshot fits that is else refused."""
+"""Largest chi-squared per degree of freedom of a snapshot that fits, where it would otherwise be refused."""
 
 
 def find_alarm(
     recent: RecentSnapshots, count: int, episode: Callable[[int, float], int], least_shifts: Sequence[float]
 ) -> int | None:
-    """Find the number of latest snapshots before which some camera has surely changed; None = none has.
+    """Find the number of latest snapshots before which some camera has surely changed; None = no change.
 
     Args:
         recent: the latest snapshots.
-        count: of all snapshots so far.
-        episode: successive snapshots that a passing error may last, by the camera and the pixels that it is off.
-        least_shifts: for each camera the pixels by which a change must shift its image.
+        count: number of snapshots so far.
+        episode: number of successive snapshots that a passing error may last, given the camera and the shift in pixels.
+        least_shifts: smallest image shift, in pixels, that counts as a change; one for each camera.
     """
     ages = {age for age, every in SLOW_TESTS.items() if age <= len(recent) and count % every == 0}
     screened = recent.screen()
@@ -63,7 +64,7 @@ def find_alarm(
 
 
 def likeliest_age(recent: RecentSnapshots, camera: int, age: int) -> int:
-    """Number of snapshots since a camera most probably changed; `age` is tried first."""
+    """Most probable number of snapshots since a camera changed; the search starts with `age`."""
     found: dict[int, float] = {}
 
     def ask(candidates: set[int]) -> int:
@@ -82,7 +83,7 @@ def likeliest_age(recent: RecentSnapshots, camera: int, age: int) -> int:
 
 
 def likeliest_camera(test: ChangeTest, known: Collection[int] = ()) -> int:
-    """The camera whose change, of any kind, is most probable; of those that are not known to have changed."""
+    """The camera that most probably changed in any way, out of those not in `known`."""
     odds = {camera: test.odds({camera: None}) for camera in range(len(test.pixels)) if camera not in known}
     return max(odds, key=lambda camera: odds[camera])
 
@@ -90,15 +91,15 @@ def likeliest_camera(test: ChangeTest, known: Collection[int] = ()) -> int:
 def changed_cameras(
     test: ChangeTest, known: dict[int, str | None], least_shifts: Sequence[float] | None = None
 ) -> tuple[dict[int, str | None], dict[int, float]]:
-    """Let cameras free that have changed, the likeliest first, until what has been seen since then is explained.
+    """Free the cameras that have changed, most likely first, until the later snapshots are explained.
 
     Args:
-        test: what has been seen since then.
-        known: cameras that are known to have changed already, and how.
-        least_shifts: for each camera the pixels by which a change must shift its image, of all but the first.
+        test: of the later snapshots.
+        known: cameras already known to have changed, and how.
+        least_shifts: smallest image shift, in pixels, that counts as a change; applies to all but the first camera.
 
     Returns:
-        Cameras that have changed, at least one, and how (None = in any way); and the chi-squared of each new one.
+        The changed cameras, at least one, and how each changed (None = in any way); the chi-squared of each new one.
     """
     least = least_shifts or [0.0] * len(test.pixels)
     free, evidence = dict(known), dict[int, float]()
@@ -119,7 +120,7 @@ def changed_cameras(
 
 
 def _largest_shift(test: ChangeTest, camera: int) -> float:
-    """Pixels by which a change of some kind would shift the image of a camera, were there no other."""
+    """Largest image shift (px) by a change of a single kind, if no other camera changed."""
     kinds = (test.jump(camera, kind)[0] / test.pixels[camera, part] for kind, part in CHANGES.items())
     return max(float(shift.norm()) for shift in kinds)
 
@@ -127,10 +128,10 @@ def _largest_shift(test: ChangeTest, camera: int) -> float:
 def contradicting_camera(
     belief: RigBelief, observations: Observations, rig_from_object: RigidTransform, options: EstimationOptions
 ) -> int | None:
-    """The camera that may have moved where a snapshot is refused; None = no single one.
+    """Find the camera whose move would explain why a snapshot is refused; None = no single camera.
 
     Args:
-        belief: what is known.
+        belief: the current belief.
         observations: (1, C, N) of the snapshot.
         rig_from_object: (1,) first guess of the object's pose.
         options: how to minimize.

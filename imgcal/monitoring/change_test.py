@@ -1,13 +1,13 @@
-"""Has a camera changed? What later snapshots say is compared with what was known before, kind of change by kind.
+"""Test whether a camera has changed, by comparing later snapshots with earlier knowledge, for each kind of change.
 
-Let P be the covariance of what was known, A the information that the later snapshots brought and g their pull at what
-was known before. If nothing changed, the pull that is left once both have been put together, r = g - A S^-1 g with
-S = P^-1 + A, has the covariance G = A - A S^-1 A. A jump d of a camera's parameters adds G d. The score test of each
-kind of change of each camera asks whether that is there (a generalized likelihood ratio with the jump estimated), and
-the same r and G tell how probable any jump is of which only the spread is known.
+Let P be the covariance of the earlier knowledge, A the information in the later snapshots and g the gradient of
+their log likelihood at the earlier estimate. If nothing changed, the gradient left over after both have been combined,
+r = g - A S^-1 g with S = P^-1 + A, has the covariance G = A - A S^-1 A. A jump d of a camera's parameters adds G d to
+it. The score test looks for each kind of change of each camera (a generalized likelihood ratio with the jump
+estimated). The same r and G give the probability of any jump with a known spread.
 
 A camera model is never exact, and an object that hardly moves shows the same error in every snapshot. A jump that
-moves the image by less than `MODEL_ERROR` is therefore taken to be there always.
+moves the image by less than `MODEL_ERROR` is therefore always assumed.
 
 Source: Willsky and Jones, "A Generalized Likelihood Ratio Approach to the Detection and Estimation of Jumps in Linear
 Systems", 1976; Hausman, "Specification Tests in Econometrics", 1978.
@@ -32,29 +32,29 @@ CHANGES: Mapping[str, slice] = {
     "focal_length": slice(6, 8),
     "principal_point": slice(8, 10),
 }
-"""Kinds of change, and where they stand among a camera's parameters."""
+"""Kinds of change, and the camera parameters that each one covers."""
 JUMPS = (0.6, 6.0, 60.0, 600.0)
-"""Pixels, standard deviations of a change, before anything is known of it, each as probable as the others: by how much
-it moves the image, whatever its kind, so that no kind is preferred."""
+"""Pixels: prior standard deviations of a change, all equally probable. They are image shifts, whatever the kind of
+change, so that no kind is preferred."""
 LARGE = 60.0
-"""Pixels, the same of a camera that has moved, as far as that is learnt from what it still labels ..."""
+"""Pixels: the same for a camera that has moved, judged by the labels that it still has ..."""
 LENS = 60.0
-"""... and the most of focal length, principal point and distortion, which no push changes by more."""
+"""... and the upper limit for focal length, principal point and distortion: no push changes them by more."""
 DISTORTED = 2e-4
-"""Standard deviation of the distortion for each such pixel, where the kind of change is not known."""
+"""Standard deviation of the distortion for each such pixel if the kind of change is unknown."""
 LEAST_LEARNT = 1e-6
-"""Directions of which less was learnt than this share of the most of their kind do not take part."""
+"""Minimum share of the best-known direction's information; directions below it are left out."""
 LEAST_VARIANCE = 1e-3
-"""Share of a variance that is left where one is taken away: rounding."""
+"""Minimum share of a variance that remains after a subtraction: guards against rounding."""
 MODEL_ERROR = 0.02
-"""Pixels, one standard deviation of each axis: by how much a camera's image may be off in a way that changes slowly."""
+"""Pixels, one standard deviation per axis: slowly varying error of a camera's image."""
 SLOPE = 0.25
-"""Tangent of the angle to the optical axis at which a change of the focal length counts as what it moves there."""
-USUAL_DISTANCE = 1000.0  # mm, of a rig that has no working distance
+"""Tangent of the angle to the optical axis at which a change of focal length is converted to pixels."""
+USUAL_DISTANCE = 1000.0  # mm, for a rig without a working distance
 
 
 def pixel_changes(rig: CameraRig) -> Tensor:
-    """Change of each parameter that moves the image by about a pixel: (C, K)."""
+    """Change of each parameter that moves the image by about one pixel: (C, K)."""
     focal = rig.focal_length.mean(-1, keepdim=True)
     change = torch.ones(rig.num_cameras, rig.num_parameters, dtype=torch.float64)
     change[:, :3] /= focal
@@ -67,10 +67,10 @@ def pixel_changes(rig: CameraRig) -> Tensor:
 
 
 def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = LARGE) -> Tensor:
-    """Standard deviations (C, K) of changes of some kinds by camera, None = of all; zero where nothing changes.
+    """Standard deviations (C, K) of changes, by camera and kind (None = all kinds); zero where nothing changes.
 
     Args:
-        changes: kinds by camera.
+        changes: kind of change of each camera that changed.
         pixels: (C, K) see `pixel_changes`.
         jump: pixels.
     """
@@ -83,18 +83,18 @@ def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = 
 
 
 def camera_change_errors(rig: CameraRig, unit: Tensor) -> Tensor:
-    """Error in units by a change of a camera's own parameters: (C, K, K); a turn about its centre shifts nothing."""
+    """Derivative of errors in units by a camera's own parameters: (C, K, K); a turn about its centre shifts nothing."""
     return torch.linalg.inv(step_by_error(rig)) / unit[:, :, None]
 
 
 @dataclass(frozen=True)
 class ChangeTest:
-    """What is left of the pull on every camera's own parameters: the two numbers r and G of every test."""
+    """The gradient left over for every camera's own parameters: r and G, which all tests use."""
 
     pull: Tensor  # (K C,)
-    learnt: Tensor  # (K C, K C) its covariance where nothing has changed
+    learnt: Tensor  # (K C, K C) its covariance if nothing has changed
     pixels: Tensor  # (C, K) see `pixel_changes`
-    lasting: Tensor | float = MODEL_ERROR  # px, (C,): errors of each image that may last where nothing has changed
+    lasting: Tensor | float = MODEL_ERROR  # (C,) px: persistent error of each image without any change
 
     @classmethod
     def of(
@@ -109,21 +109,21 @@ class ChangeTest:
         """Prepare the tests.
 
         Args:
-            information: (D, D) of what was known before, aged to the time of the later snapshots.
+            information: (D, D) of the earlier knowledge, aged to the time of the later snapshots.
             brought: (D, D) information of the later snapshots.
-            pull: (D,) of the later snapshots, where what was known before put the rig.
+            pull: (D,) gradient of the later snapshots at the earlier estimate of the rig.
             change: (C, K, K) see `camera_change_errors`.
             pixels: (C, K) see `pixel_changes`.
             lasting: (C,) px, see `NoiseCorrelation.model_error`.
 
         Raises:
-            RefusedError: nothing is known of the rig.
+            RefusedError: nothing is known about the rig.
         """
         cameras = len(change)
         wide = pixels.numel()
         factor, failed = torch.linalg.cholesky_ex(information + brought)
         if bool(failed):
-            raise RefusedError("estimation: these observations leave a rig that nothing is known of")
+            raise RefusedError("estimation: these observations do not determine the rig")
         half = torch.linalg.solve_triangular(factor, torch.cat((brought[:, :wide], pull[:, None]), 1), upper=False)
         left = torch.cat((brought[:wide, :wide], pull[:wide, None]), 1) - half[:, :wide].mT @ half
         own = torch.einsum("cij,cik->cjk", change, left.unflatten(0, (cameras, -1)))  # (C, K, K C + 1)
@@ -132,9 +132,10 @@ class ChangeTest:
         return cls(own[..., -1].flatten(), 0.5 * (learnt + learnt.mT), pixels, lasting)
 
     def scores(self) -> dict[str, Tensor]:
-        """Test each camera for each kind of change: for each of `CHANGES` (C,).
+        """Test each camera for each kind of change: (C,) for each of `CHANGES`.
 
-        Chi-squared, where nothing has changed, with at most as many degrees of freedom as the kind has parameters.
+        If nothing has changed, a score is chi-squared with at most as many degrees of freedom as the kind has
+        parameters.
         """
         cameras = len(self.pixels)
         pull = self.pull.unflatten(0, (cameras, -1))
@@ -146,18 +147,18 @@ class ChangeTest:
         }
 
     def model_error(self, kind: str) -> Tensor:
-        """Change of a kind with k numbers of each camera that an error of its model may feign: (C, k)."""
+        """Change in a kind with k parameters that a camera model error may imitate: (C, k) for each camera."""
         return torch.as_tensor(self.lasting, dtype=self.pixels.dtype)[..., None] * self.pixels[:, CHANGES[kind]]
 
     def change(self, kind: str, variance: Tensor) -> tuple[Tensor, Tensor]:
-        """What is learnt of a change of each camera of a kind with k numbers, where these wander besides.
+        """Estimate a change of each camera in a kind with k parameters that also take a random walk.
 
         Args:
             kind: of `CHANGES`.
-            variance: (C, k) by which they do, beyond what was taken for granted; less than nothing is possible.
+            variance: (C, k) of the random walk beyond the assumed rate; negative values are possible.
 
         Returns:
-            Its information (C, k, k), and its pull (C, k).
+            Its information (C, k, k) and its gradient (C, k).
         """
         cameras, part = len(self.pixels), CHANGES[kind]
         pull = self.pull.unflatten(0, (cameras, -1))[:, part]
@@ -165,7 +166,7 @@ class ChangeTest:
         return _Own.of(pull, learnt.diagonal(dim1=0, dim2=2).movedim(-1, 0)[:, part, part]).change(variance)
 
     def odds(self, changes: Mapping[int, str | None]) -> float:
-        """Log odds that cameras have changed in some ways, None = in any, against that nothing has."""
+        """Log odds of the given changes (None = of any kind) against no change."""
         found = []
         for jump in JUMPS:
             _, factor, pull = self._free(changes, jump)
@@ -173,24 +174,24 @@ class ChangeTest:
         return float(torch.logsumexp(torch.stack(found), 0))
 
     def condition_on(self, changes: Mapping[int, str | None]) -> ChangeTest:
-        """Test for others where some cameras may have changed."""
+        """Test the other cameras, given that these may have changed."""
         scaled, factor, pull = self._free(changes, LARGE)
         taken = torch.linalg.solve_triangular(factor, scaled, upper=False)
         return ChangeTest(self.pull - taken.mT @ pull, self.learnt - taken.mT @ taken, self.pixels, self.lasting)
 
     def jump(self, camera: int, kind: str) -> tuple[Tensor, Tensor]:
-        """Estimate a change of a camera of a kind with K numbers, were there no other: (K,) and covariance (K, K)."""
+        """Estimate a camera's change in a kind with K parameters, if no other changed: (K,) and covariance (K, K)."""
         first = camera * self.pixels.shape[1]
         part = slice(first + CHANGES[kind].start, first + CHANGES[kind].stop)
         covariance = torch.linalg.pinv(self.learnt[part, part], hermitian=True)
         return covariance @ self.pull[part], covariance
 
     def _free(self, changes: Mapping[int, str | None], jump: float) -> tuple[Tensor, Tensor, Tensor]:
-        """What R parameters that may have changed do, in units of their standard deviations.
+        """Describe the effect of R parameters that may have changed, in units of their standard deviations.
 
         Returns:
-            Covariance with all pulls (R, K C), Cholesky factor (R, R) of their own, the jump included, and the
-            whitened pull (R,).
+            Covariance with all gradients (R, K C), Cholesky factor (R, R) of the covariance of their own, jump
+            included, and the whitened gradient (R,).
         """
         std = change_std(changes, self.pixels, jump).flatten()
         rows = std.nonzero()[:, 0]
@@ -203,14 +204,14 @@ class ChangeTest:
 
 @dataclass(frozen=True)
 class _Own:
-    """What is left of the pull on a few parameters of each camera, along directions of which something was learnt."""
+    """The gradient left over for a few parameters of each camera, along directions that have been observed."""
 
-    along: Tensor  # (C, k) in standard deviations where nothing has changed; zero where nothing was learnt
-    spread: Tensor  # (C, k, k) by which a change of each parameter moves it
+    along: Tensor  # (C, k) in standard deviations without a change; zero in unobserved directions
+    spread: Tensor  # (C, k, k) its derivative by a change of each parameter
 
     @classmethod
     def of(cls, pull: Tensor, learnt: Tensor) -> _Own:
-        """Take pulls (C, k) and their covariance (C, k, k)."""
+        """Take gradients (C, k) and their covariance (C, k, k)."""
         scale = learnt.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30).sqrt()
         values, vectors = torch.linalg.eigh(learnt / (scale[:, :, None] * scale[:, None, :]))
         known = values > LEAST_LEARNT
@@ -219,18 +220,18 @@ class _Own:
         return cls(along, scale[:, :, None] * vectors * torch.where(known, root, 0.0)[:, None, :])
 
     def score(self, variance: Tensor) -> Tensor:
-        """Squares (C,) in units of the covariance, to which changes of a variance (C, k) are added."""
+        """Squared norms (C,), whitened by a covariance that includes changes of a variance (C, k)."""
         values, vectors = self._with(variance)
         return ((vectors.mT @ self.along[..., None])[..., 0].square() / values).sum(-1)
 
     def change(self, variance: Tensor) -> tuple[Tensor, Tensor]:
-        """Information (C, k, k) and pull (C, k) of a change, besides changes of a variance (C, k)."""
+        """Information (C, k, k) and gradient (C, k) of a change, in addition to changes of a variance (C, k)."""
         values, vectors = self._with(variance)
         spread = self.spread @ vectors / values.sqrt()[:, None, :]
         along = (vectors.mT @ self.along[..., None])[..., 0] / values.sqrt()
         return spread @ spread.mT, (spread @ along[..., None])[..., 0]
 
     def _with(self, variance: Tensor) -> tuple[Tensor, Tensor]:
-        """Variances (C, k) where changes are added, and their directions (C, k, k)."""
+        """Variances (C, k) with changes added, and their directions (C, k, k)."""
         values, vectors = torch.linalg.eigh(self.spread.mT @ (variance[:, :, None] * self.spread))
         return (1 + values).clamp_min(LEAST_VARIANCE), vectors

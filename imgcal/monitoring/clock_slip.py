@@ -1,7 +1,7 @@
-"""Does a camera expose at another time, or has it moved? A late camera sees an object that moves somewhere else, too.
+"""Tell a camera whose clock has slipped from one that has moved; both see a moving object in the wrong place.
 
-What a move and what a slip of its clock make of the snapshots since are compared by how probable they are: a move
-shifts the image alike wherever the object goes, a slip along its motion, and not at all where it stands still.
+Both explanations are compared by the evidence of the snapshots since. A move shifts the image alike wherever the object
+goes. A slip shifts it along the object's motion, and not at all while the object stands still.
 """
 
 from __future__ import annotations
@@ -24,54 +24,54 @@ from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
 from imgcal.monitoring.unsynchronized_cameras import drop_cameras
 from imgcal.types import Observations
 
-# What is known of a slip before anything is seen.
+# Prior of a slip.
 SLIP_SECONDS = 0.03
-"""One standard deviation: a frame or two ..."""
+"""One standard deviation: one or two frames ..."""
 MOST_SLIP_SECONDS = 0.15
-"""... and the most: over a longer time the motion of an object is not known."""
-# How a slip is found.
+"""... and the upper limit: the object's motion cannot be extrapolated further."""
+# Search for a slip.
 SEARCH_ROUNDS = 4
-"""In which a slip is found of a camera that is where it was; each leaves a hundredth of what was left."""
+"""Iterations when the camera's pose is known; each reduces the remaining error to a hundredth."""
 SEARCH_STEPS = (8e-3, 1e-3)
-"""Seconds around a slip at which its evidence is taken, the camera's place being learnt with it; the first only where
-nothing is known of that place."""
+"""Seconds around a slip at which its evidence is computed while the camera's pose is estimated, too. The first step is
+used only if nothing is known about that pose."""
 VELOCITY_SECONDS = 1e-3
-"""Seconds over which the velocity of an image is taken."""
+"""Time step for the velocity of an image."""
 INEXACT = 0.03
-"""Share of the way that a camera is behind by which blobs may be off that are put where they were in time."""
+"""Error of a blob that is moved to its place in time, as a share of the distance moved."""
 
 
 VAGUE_SLIP_SECONDS = 5e-4
-"""Seconds, one standard deviation, above which a slip is not believed of a camera of which hardly anything is known."""
+"""Largest standard deviation (s) of a slip that is believed of a camera whose pose is hardly known."""
 
 
 class ClockSlipExplanation(Explanation):
-    """The clocks of the suspected cameras, or of the surest alone, have slipped."""
+    """The clocks of all suspected cameras, or of the most likely one alone, have slipped."""
 
     name = "clock slip"
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
-        """Put the blobs of the cameras where they would have been in time."""
+        """Move the blobs of the cameras to where they would have been without the slip."""
         case.require_body()
         return [partial(_slip, case, start, cameras) for start in case.starts for cameras in case.camera_sets]
 
     def premature(self, case: Case, found: Explained) -> str | None:
-        """Wait where the slip of a camera that is hardly known is itself hardly known."""
+        """Wait while neither the camera's pose nor its slip is well known."""
         uncertain = case.uncertain or len(found.snapshots) > case.count
         vague = uncertain and any(slip.sigma > VAGUE_SLIP_SECONDS for slip in found.finding.slips)
         return "the slip is hardly known" if vague else None
 
 
 def _slip(case: Case, start: Start, cameras: Sequence[int]) -> Variant:
-    """Find the most probable slips of clocks.
+    """Find the most probable clock slips.
 
     Args:
-        case: its earlier snapshots say how the object moves, too.
-        start: since when clocks may have slipped.
-        cameras: whose clocks.
+        case: its earlier snapshots help to show how the object moves.
+        start: since when the clocks may have slipped.
+        cameras: the cameras whose clocks may have slipped.
 
     Raises:
-        RefusedError: the other cameras do not see enough of the object, it is not known how it moves, or no slip is
+        RefusedError: the other cameras do not see enough of the object, its motion is unknown, or no slip is
             more probable than others.
     """
     count, uncertain = len(start.snapshots), case.uncertain or start is not case.starts[0]
@@ -81,7 +81,7 @@ def _slip(case: Case, start: Start, cameras: Sequence[int]) -> Variant:
     way = [*(pose for _, pose in case.snapshots[:-count]), there.rig_from_object]
     motion = ObjectMotion.of(RigidTransform.cat(way), seconds)
     if not bool(motion.known[-count:].all()):
-        raise RefusedError("it is not known how the object moves")
+        raise RefusedError("the object's motion is unknown")
     cases = _Late(start.before, given, there, motion, seconds[-count:], case.options)
     late = dict.fromkeys(cameras, 0.0) if uncertain else {camera: cases.rough_slip(camera) for camera in cameras}
     sigma = dict.fromkeys(cameras, math.nan)
@@ -96,35 +96,35 @@ def _slip(case: Case, start: Start, cameras: Sequence[int]) -> Variant:
             if not abs(late[camera]) < MOST_SLIP_SECONDS:
                 raise RefusedError(f"the slip would be longer than {MOST_SLIP_SECONDS:g} s")
     corrected, log_prior = cases.correct(late)
-    log_prior += sum(math.log(spread / SLIP_SECONDS) for spread in sigma.values())  # of all slips, not the best alone
+    log_prior += sum(math.log(spread / SLIP_SECONDS) for spread in sigma.values())  # over all slips, not only the best
     spreads = {camera: math.hypot(sigma[camera], INEXACT * late[camera]) for camera in cameras}
     slips = tuple(ClockSlip(camera, 0, late[camera], spreads[camera], math.nan) for camera in cameras)
     return Variant(start.before, corrected, start.log_prior + log_prior, find=lambda _: Finding(slips=slips))
 
 
 def project_fiducials(belief: RigBelief, rig_from_object: RigidTransform, camera: int) -> Tensor:
-    """Where a camera sees the fiducials of an object in poses (S,): (S, N, 2) pixels."""
+    """Project the fiducials of an object in poses (S,) into a camera: (S, N, 2) pixels."""
     alone = belief.rig.select([camera]).expand(len(rig_from_object.translation))
     return alone.project_values(belief.points_at(rig_from_object), belief.obj.radius).uv[:, 0]
 
 
 @dataclass(frozen=True)
 class _Late:
-    """Snapshots (S,) of which some cameras may have exposed later."""
+    """Snapshots (S,) in which some cameras may have exposed later."""
 
     before: RigBelief
     given: Observations
-    there: MeasurementUpdate  # where the other cameras say that the object was
+    there: MeasurementUpdate  # the object's poses according to the other cameras
     motion: ObjectMotion
-    seconds: Tensor  # (S,) when those exposed
+    seconds: Tensor  # (S,) exposure times of the other cameras
     options: EstimationOptions
 
     def image(self, camera: int, late: float) -> Tensor:
-        """Where a camera sees the fiducials, so much later: (S, N, 2) pixels."""
+        """Project the fiducials into a camera that exposes `late` seconds later: (S, N, 2) pixels."""
         return project_fiducials(self.there.belief, self.motion.interpolate(self.seconds + late), camera)
 
     def rough_slip(self, camera: int) -> float:
-        """How late (s) a camera exposes if it is where it was."""
+        """Estimate the delay (s) of a camera that has not moved."""
         given, late = self.given, 0.0
         seen = given.seen[:, camera]
         weight = torch.where(seen, given.sigma[:, camera].square().reciprocal(), 0.0)[..., None]
@@ -139,7 +139,7 @@ class _Late:
         return late
 
     def correct(self, late: Mapping[int, float]) -> tuple[list[Snapshot], float]:
-        """Put blobs where they would have been in time, less surely; and the log probability of these slips."""
+        """Move blobs to where they belong without the delay, with more noise; also return the slips' log prior."""
         uv, sigma, seen = self.given.uv.clone(), self.given.sigma.clone(), self.given.seen
         for camera, seconds in late.items():
             behind = self.image(camera, seconds) - self.image(camera, 0.0)

@@ -1,4 +1,4 @@
-"""Page's cumulative sum: the quickest test for a mean that has risen, with a stated rate of false alarms.
+"""Page's cumulative sum: the quickest test for an increased mean at a given false alarm rate.
 
 Source: Page, "Continuous Inspection Schemes", 1954; Siegmund, "Sequential Analysis", 1985, equation 2.56.
 """
@@ -15,15 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
 OVERSHOOT = 1.166
-"""Standard deviations by which a sum passes its threshold, as if that were so much higher."""
+"""Average overshoot of a sum at its threshold, in standard deviations; it acts like a threshold that much higher."""
 
 
 def cusum_threshold(reference: float, run_length: float) -> float:
-    """Threshold (standard deviations) that is passed once in `run_length` steps on average while nothing rises.
+    """Threshold (standard deviations) that is crossed once in `run_length` steps on average while the mean is normal.
 
     Args:
-        reference: half of the rise (standard deviations) that is to be found most quickly.
-        run_length: steps of independent normal values.
+        reference: half of the increase (standard deviations) to be found most quickly.
+        run_length: number of steps, each an independent normal value.
 
     Examples:
         >>> round(cusum_threshold(0.5, 336.0), 1)  # Montgomery, "Statistical Quality Control", has 4.0
@@ -38,7 +38,7 @@ def cusum_threshold(reference: float, run_length: float) -> float:
 
 
 class Cusum:
-    """Sums of several values; each is zero again where it would fall below, and after an alarm.
+    """Cumulative sums of several values; each restarts at zero when it would become negative, and after an alarm.
 
     Examples:
         >>> test = Cusum(2, reference=0.5, run_length=1e6)
@@ -54,14 +54,14 @@ class Cusum:
     }
 
     def __init__(self, count: int, reference: float, run_length: float) -> None:
-        """Begin with zero; see `cusum_threshold`."""
+        """Start at zero; see `cusum_threshold`."""
         self.reference, self.threshold = reference, cusum_threshold(reference, run_length)
         self.value = np.zeros(count)
-        self.age = np.zeros(count, dtype=np.int64)  # steps since the sum was zero: since when the mean has risen
-        self.found = np.zeros(count, dtype=np.int64)  # the same of the last alarm of each
+        self.age = np.zeros(count, dtype=np.int64)  # steps since the sum was zero: how long the mean has been high
+        self.found = np.zeros(count, dtype=np.int64)  # the same at the last alarm of each
 
     def update(self, standardized: ArrayLike) -> NDArray[np.bool_]:
-        """Add a step, in standard deviations from the mean; nan where there is none. Tell which have risen."""
+        """Add a step, in standard deviations from the mean (nan = no value). Return which means have increased."""
         step = np.asarray(standardized, dtype=np.float64) - self.reference
         step[np.isnan(step)] = 0.0
         self.value = np.maximum(self.value + step, 0.0)
@@ -73,7 +73,7 @@ class Cusum:
 
 
 class RunningMedian:
-    """Median of the latest numbers.
+    """Median of the most recent numbers.
 
     Examples:
         >>> median = RunningMedian(3)
@@ -86,18 +86,18 @@ class RunningMedian:
     STATE: ClassVar = {"latest": ("_latest", deque[float])}
 
     def __init__(self, most: int) -> None:
-        """Begin with none; `most` are kept."""
+        """Start empty, and keep at most `most` numbers."""
         self._latest, self._sorted = deque[float](maxlen=most), list[float]()
 
     def __len__(self) -> int:
         return len(self._latest)
 
     def resume(self) -> None:
-        """Sort what has been read."""
+        """Sort the numbers after a state has been read."""
         self._sorted = sorted(self._latest)
 
     def append(self, number: float) -> None:
-        """Take a number; the oldest goes where there are too many."""
+        """Add a number, and drop the oldest if there are too many."""
         if len(self._latest) == self._latest.maxlen:
             del self._sorted[bisect.bisect_left(self._sorted, self._latest[0])]
         self._latest.append(number)
@@ -105,6 +105,6 @@ class RunningMedian:
 
     @property
     def value(self) -> float:
-        """The median; nan of none."""
+        """The median; nan if empty."""
         count = len(self._sorted)
         return 0.5 * (self._sorted[(count - 1) // 2] + self._sorted[count // 2]) if count else math.nan

@@ -1,12 +1,11 @@
-"""Does a camera drift faster than is taken for granted? What stretch after stretch leaves unexplained tells.
+"""Test whether a camera drifts faster than assumed, by what each stretch of snapshots leaves unexplained.
 
-A filter that trusts a rate of drift which is too low follows too slowly, and does not know that it does. What a stretch
-of snapshots says against what was known before (`ChangeTest`) is independent from stretch to stretch while that rate
-holds; a camera that creeps adds the same to each. So the latest stretches, one, two, ... sixteen of them, are asked
-together whether each kind of value of each camera went steadily in some direction, at one of several speeds (a
-generalized likelihood ratio of a ramp). The variance that is believed is a mean, each speed as probable as that says: a
-random walk that goes as far as the ramp in the time in which a filter learns. A creep is known within minutes, and
-forgotten as soon.
+A filter that assumes too low a drift rate lags behind without knowing it. While the rate is right, what successive
+stretches leave unexplained (`ChangeTest`) is independent; a camera that creeps adds the same to each. The latest one,
+two, ... sixteen stretches are therefore tested together: did a value of a camera drift steadily in one direction, at
+one of several speeds (a generalized likelihood ratio of a ramp)? The variance to believe is a mean over the speeds,
+weighted by their probabilities: a random walk that goes as far as the ramp within the filter's learning time. A creep
+is found within minutes, and forgotten as quickly.
 
 Source: Willsky and Jones, see `change_test.py`; Magill, "Optimal Adaptive Estimation of Sampled Stochastic Processes",
 1965.
@@ -28,33 +27,32 @@ from imgcal.monitoring.rig_filter import RigFilter
 from imgcal.types import DriftRate
 
 STRETCH_SECONDS = 20.0
-"""Time of a stretch."""
+"""Duration of a stretch."""
 WINDOWS = (1, 2, 3, 4, 6, 8, 12, 16)
-"""Numbers of latest stretches that are asked together."""
+"""Numbers of latest stretches that are tested together."""
 SPEEDS = torch.tensor((1.0, 2.0, 4.0, 8.0), dtype=torch.float64)
-"""Standard deviations of a stretch's random walk, at the rate that is taken for granted, by which a value may go in
-each stretch instead."""
+"""Drift of a value in each stretch, in standard deviations of a stretch's random walk at the assumed rate."""
 PACE_DOUBT = 6.0
-"""Log odds against each of them, before anything is seen."""
+"""Prior log odds against each speed."""
 LEARNING_SECONDS = 133.0
-"""Seconds in which a random walk goes as far as the ramp that it stands for."""
+"""Time in which a random walk goes as far as the ramp that it replaces."""
 ADDED_TOGETHER = 32
-"""Snapshots whose information is added up at once."""
+"""Snapshots whose information is summed in one go."""
 
 
 @dataclass
 class Stretch:
-    """What some snapshots say about what was believed before them."""
+    """What some snapshots say about the belief before them."""
 
     before: RigBelief
     brought: Tensor  # (D, D) information
-    pull: Tensor  # (D,) where `before` puts the rig
+    pull: Tensor  # (D,) gradient at the rig of `before`
     seconds: float = 0.0
     lasting: Tensor | float = MODEL_ERROR  # (C,) px, see `NoiseCorrelation.model_error`
 
     @classmethod
     def after(cls, before: RigBelief, seconds: float = 0.0, lasting: Tensor | float = MODEL_ERROR) -> Stretch:
-        """Begin with none; `seconds` of its time have passed."""
+        """Start without snapshots; `seconds` of the stretch have passed already."""
         none = before.factor.new_zeros(len(before.factor))
         return cls(before, torch.zeros_like(before.factor), none, seconds, lasting)
 
@@ -62,16 +60,16 @@ class Stretch:
         """Add snapshots.
 
         Args:
-            belief: at any time.
-            brought: (D, D) their information.
-            pull: (D,) theirs, where that belief puts the rig.
+            belief: the current belief.
+            brought: (D, D) information of the snapshots.
+            pull: (D,) their gradient at the rig of `belief`.
         """
         error = (error_between(belief.rig, self.before.rig) / self.before.unit).flatten()
         distance = torch.cat((error, belief.object_offset - self.before.object_offset))
         self.brought, self.pull = self.brought + brought, self.pull + pull + brought @ distance
 
     def test(self, rate: DriftRate | Tensor) -> ChangeTest:
-        """Test for changes meanwhile; what the rig wandered, at a rate, is none."""
+        """Test for changes during the stretch, beyond a random walk at the given rate."""
         before = self.before
         known = age_belief(before, self.seconds, rate).information
         change = camera_change_errors(before.rig, before.unit)
@@ -79,7 +77,7 @@ class Stretch:
 
 
 class DriftPaces:
-    """By how many times each kind of value of each camera drifts faster than is taken for granted.
+    """How many times faster than assumed each kind of value of each camera drifts.
 
     Examples:
         >>> paces = DriftPaces(4)
@@ -90,14 +88,14 @@ class DriftPaces:
     STATE: ClassVar = {name: (name, Tensor) for name in ("information", "pull", "squared")}
 
     def __init__(self, cameras: int) -> None:
-        """Begin with what is taken for granted."""
+        """Start with the assumed rate."""
         shape = (WINDOWS[-1], cameras, len(CHANGES))
-        self.information = torch.zeros(*shape, 3, 3, dtype=torch.float64)  # of speeds, by the latest stretches, ...
-        self.pull = torch.zeros(*shape, 3, dtype=torch.float64)  # ... the last one first
+        self.information = torch.zeros(*shape, 3, 3, dtype=torch.float64)  # about speeds, latest stretches, ...
+        self.pull = torch.zeros(*shape, 3, dtype=torch.float64)  # ... most recent first
         self.squared = torch.ones(shape[1:], dtype=torch.float64)  # (C, kinds) paces
 
     def of_parameters(self, width: int) -> Tensor:
-        """The paces of every parameter: (C, K)."""
+        """The paces of all parameters: (C, K)."""
         pace = torch.ones(len(self.squared), width, dtype=torch.float64)
         for number, part in enumerate(CHANGES.values()):
             pace[:, part] = self.squared[:, number, None].sqrt()
@@ -107,21 +105,21 @@ class DriftPaces:
         """Learn from a stretch.
 
         Args:
-            stretch: what was seen.
-            walk: (C, K) standard deviation of an hour's drift as it is taken for granted.
+            stretch: the snapshots.
+            walk: (C, K) standard deviation of an hour's drift at the assumed rate.
 
         Returns:
-            (C, K) the variance that what is believed at its end lacks: what became known has gone on for some time.
+            (C, K) variance to add to the belief at its end: a drift found now has been going on for some time.
         """
         test = stretch.test(walk * self.of_parameters(walk.shape[1]))
         for kept in (self.information, self.pull):
             kept[1:] = kept[:-1].clone()
-        self.information[0], self.pull[0] = self._of(test, walk, stretch.seconds)
+        self.information[0], self.pull[0] = self._measure_drift(test, walk, stretch.seconds)
         model = self._model(test, walk)
         leader = int(self._ratios(model).amax((0, 2, 3)).argmax())
-        rest = self._of(
+        rest = self._measure_drift(
             test.condition_on({leader: None}), walk, stretch.seconds
-        )  # of one that creeps, all others see something
+        )  # a camera that creeps affects all others
         others = torch.arange(len(self.squared)) != leader
         self.information[0, others], self.pull[0, others] = rest[0][others], rest[1][others]
         ratios, was = self._ratios(model), self.squared
@@ -137,8 +135,8 @@ class DriftPaces:
             variance[:, part] = lacking[:, number, None] * walk[:, part].square() * (stretch.seconds / 3600)
         return variance
 
-    def _of(self, test: ChangeTest, walk: Tensor, seconds: float) -> tuple[Tensor, Tensor]:
-        """Information (C, kinds, 3, 3) and pull (C, kinds, 3) of what each value went, in steps of the random walk."""
+    def _measure_drift(self, test: ChangeTest, walk: Tensor, seconds: float) -> tuple[Tensor, Tensor]:
+        """Information (C, kinds, 3, 3) and gradient (C, kinds, 3) of each value's drift, in random walk steps."""
         information, pull = torch.zeros_like(self.information[0]), torch.zeros_like(self.pull[0])
         for number, (kind, part) in enumerate(CHANGES.items()):
             size = part.stop - part.start
@@ -150,7 +148,7 @@ class DriftPaces:
         return information, pull
 
     def _model(self, test: ChangeTest, walk: Tensor) -> Tensor:
-        """Variance (C, kinds, 3) of errors of camera models, in steps of the walk; zero where nothing wanders."""
+        """Variance (C, kinds, 3) of camera model errors, in steps of the walk; zero where nothing wanders."""
         variance = torch.zeros_like(self.pull[0])
         for number, (kind, part) in enumerate(CHANGES.items()):
             step = walk[:, part] * (STRETCH_SECONDS / 3600) ** 0.5
@@ -159,33 +157,33 @@ class DriftPaces:
         return variance
 
     def _ratios(self, model: Tensor) -> Tensor:
-        """Log likelihood ratio (windows, C, kinds, speeds) of a ramp against the rate that is taken for granted.
+        """Log likelihood ratio (windows, C, kinds, speeds) of a ramp against the assumed rate.
 
-        Either way the camera model errs by a variance (C, kinds, 3), once in a window.
+        Under both, the camera model has an error of variance (C, kinds, 3), constant within a window.
         """
         last = torch.tensor(WINDOWS)
         information, pull = self.information.cumsum(0)[last - 1], self.pull.cumsum(0)[last - 1]
-        error = (model / last.square()[:, None, None, None])[..., None, :]  # of a speed
+        error = (model / last.square()[:, None, None, None])[..., None, :]  # in terms of a speed
         steady = _log_evidence(information, pull, error)
         return _log_evidence(information, pull, error + SPEEDS.square()[:, None]) - steady
 
 
 @dataclass
 class DriftLearning:
-    """Learns how fast a filter's cameras drift while nothing else is the matter; it knows less of those that do."""
+    """Learns how fast a filter's cameras drift during quiet times, and lowers its confidence in those that do."""
 
     paces: DriftPaces
-    stretch: Stretch | None = None  # of snapshots ...
-    waiting: int = 0  # ... and the latest of them, which are not added yet
+    stretch: Stretch | None = None  # the snapshots so far ...
+    waiting: int = 0  # ... and how many of the latest are not added yet
 
     def update(self, follows: RigFilter, recent: RecentSnapshots, seconds: float, quiet: bool) -> None:
-        """Take the latest snapshot, and change what the filter believes.
+        """Take the latest snapshot, and update the filter's belief.
 
         Args:
-            follows: the filter that has learnt from it.
+            follows: the filter, which has absorbed this snapshot.
             recent: the latest snapshots, this one included.
-            seconds: since the one before.
-            quiet: no camera has changed of late.
+            seconds: since the previous snapshot.
+            quiet: no camera has changed recently.
         """
         if follows.young or not quiet:
             self.stretch = None
@@ -209,7 +207,7 @@ class DriftLearning:
 
 
 def _log_evidence(information: Tensor, pull: Tensor, variance: Tensor) -> Tensor:
-    """Log probability (*B, V) of what was learnt (*B, k, k) and (*B, k) of numbers of some variances (*B, V, k)."""
+    """Log probability (*B, V) of measurements (*B, k, k) and (*B, k) of values with given variances (*B, V, k)."""
     std = variance.sqrt()
     covariance = (
         torch.eye(pull.shape[-1], dtype=pull.dtype) + std[..., None] * information[..., None, :, :] * std[..., None, :]

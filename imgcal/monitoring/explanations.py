@@ -1,8 +1,8 @@
-"""What has happened? All explanations stand in one table, and are weighed in one place.
+"""Weigh all explanations of what has happened: one table, one place.
 
-Each states its prior probability and its variants: a belief, and the snapshots as they would have been. The evidence of
-an explanation is the mean over its variants, so that one with many of them has no advantage; values that are estimated
-within a variant pay by their prior spread (Laplace's approximation, as `MeasurementUpdate.evidence` has it).
+Each explanation states its prior probability and its variants: a belief, and the snapshots as they would have been. The
+evidence of an explanation is the mean over its variants, so that many variants are no advantage. Values estimated
+within a variant pay for their prior spread (Laplace's approximation, as in `MeasurementUpdate.evidence`).
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from imgcal.monitoring.shaking import Shaking, shake_cameras
 from imgcal.monitoring.unsynchronized_cameras import LEAST_SNAPSHOTS, Unsynchronized, unsynchronized_evidence
 
 PASSING = (2.0, 5.0)
-"""Times their usual size that errors may have which pass."""
+"""Sizes of passing errors, relative to the usual size of errors."""
 LEAD = 5.0
-"""Log odds against the next best explanation from which one is believed ..."""
+"""Log odds against the next best explanation at which one is believed ..."""
 PATIENCE = 16
-"""... and the cases for which that is waited for, before the most probable one is believed anyway ..."""
+"""... the number of cases to wait for this, before the most probable one is believed anyway ..."""
 HARMLESS_PATIENCE = 4
-"""... or, where it may well be that nothing has happened: after a pause, what was known leaves room for small moves."""
+"""... and the same if possibly nothing has happened: after a pause, the belief allows for small moves."""
 
 
 class Steady(Explanation):
@@ -42,49 +42,49 @@ class Steady(Explanation):
     name = "steady"
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
-        """Believe what was believed."""
+        """Keep the belief."""
         return [partial(Variant, case.before, case.latest)]
 
 
 class Moved(Explanation):
-    """The suspected cameras have changed, it is not known how: by each of `JUMPS`."""
+    """The suspected cameras have changed in an unknown way: by each of `JUMPS`."""
 
     name = "moved"
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
-        """Let the cameras free."""
+        """Free the cameras."""
         if not case.cameras:
             raise RefusedError("no camera is suspected")
         return [partial(self._jump, case, jump) for jump in JUMPS]
 
     @staticmethod
     def _jump(case: Case, jump: float) -> Variant:
-        """Let the cameras free by so many pixels."""
+        """Free the cameras by a jump in pixels."""
         return Variant(free_cameras(case.before, dict.fromkeys(case.cameras), jump), case.latest)
 
     def premature(self, case: Case, found: Explained) -> str | None:
-        """Wait where a clock that was off from the beginning, or any pose of the object, explains as much."""
+        """Wait while a clock that was always off, or some pose of the object, explains as much."""
         if case.quarantined and case.count < LEAST_SNAPSHOTS:
             return "a single snapshot of the camera"
         return "too little was seen before to exclude a late clock" if case.too_early else None
 
 
 class PassingError(Explanation):
-    """Errors of the suspected cameras that pass: each of several times as large as those that usually last."""
+    """The suspected cameras have passing errors, several times as large as their usual persistent errors."""
 
     name = "passing error"
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
-        """Let the images of the cameras be shifted in each snapshot."""
+        """Shift the images of the cameras in each snapshot."""
         if case.lasting is None:
-            raise RefusedError("errors of this rig do not last")
+            raise RefusedError("this rig has no persistent errors")
         cameras = case.camera_sets[-1]
         start, size = Start(case.before, case.latest), max(float(case.lasting[camera]) for camera in cameras)
         return [partial(self._pass, start, cameras, factor * size) for factor in PASSING]
 
     @staticmethod
     def _pass(start: Start, cameras: Sequence[int], size: float) -> Variant:
-        """Let what the cameras see be shifted in each snapshot; it is no shaking that goes on."""
+        """Shift the images of some cameras in each snapshot; this is not reported as shaking."""
         return replace(shake_cameras(start, cameras, size), find=lambda _: Finding())
 
 
@@ -98,14 +98,14 @@ EXPLANATIONS: tuple[Explanation, ...] = (
     PassingError(),
     Warmed(),
 )
-"""All that is weighed. A new one: a class as above, in a module of its own where it is long, and its line here."""
+"""All explanations that are weighed. To add one: a subclass as above, in its own module if long, and a line here."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """How probable the explanations of a case are."""
+    """The probabilities of a case's explanations."""
 
-    explained: Mapping[str, Explained]  # by name, the most probable first; at least one
+    explained: Mapping[str, Explained]  # by name, most probable first; at least one
     reasons: Mapping[str, str]  # why the others could not be weighed
 
     @property
@@ -121,12 +121,12 @@ class Verdict:
 
     @property
     def harmless(self) -> bool:
-        """Tell whether nothing may have happened, and all that is about as probable follows from it or passes."""
+        """Tell whether possibly nothing has happened, and every rival is a consequence of that or passes."""
         near = {name for name, one in self.explained.items() if one.evidence > self.best.evidence - LEAD}
         return Steady.name in near and near <= {Steady.name, Moved.name, Warmed.name, PassingError.name}
 
     def evidence(self, *names: str) -> float:
-        """The largest evidence of some explanations; minus infinity where none could be weighed."""
+        """Largest evidence among the named explanations; minus infinity if none could be weighed."""
         return max((self.explained[name].evidence for name in names if name in self.explained), default=-math.inf)
 
 
@@ -152,7 +152,7 @@ def _explain(case: Case, explanation: Explanation) -> Explained:
     """Average the evidence of an explanation over its variants.
 
     Raises:
-        RefusedError: it is excluded, or no variant holds.
+        RefusedError: the explanation is excluded, or no variant holds.
     """
     if explanation.name in case.excluded:
         raise RefusedError(case.excluded[explanation.name])
@@ -177,20 +177,20 @@ def _explain(case: Case, explanation: Explanation) -> Explained:
 
 @dataclass
 class Diagnosis:
-    """Weighs the cases of a rig, and waits for a while where no explanation leads."""
+    """Weighs the cases of a rig, and waits for a while if no explanation leads."""
 
-    waited: int = 0  # cases in a row in which none led
+    waited: int = 0  # successive cases without a leading explanation
 
     def decide(self, case: Case, patient: bool, explanations: Sequence[Explanation] = EXPLANATIONS) -> Verdict:
         """Weigh a case.
 
         Args:
             case: the snapshots.
-            patient: it may be waited for more of them.
-            explanations: that are weighed.
+            patient: waiting for more snapshots is possible.
+            explanations: the explanations to weigh.
 
         Raises:
-            RefusedError: it cannot be decided yet.
+            RefusedError: the case cannot be decided yet.
         """
         verdict = weigh(case, explanations)
         best = verdict.best
@@ -200,7 +200,7 @@ class Diagnosis:
         if why is None and 0 < self.waited <= patience and patient:
             why = f"no explanation leads by {LEAD:g}"
         if why is not None:
-            raise RefusedError(f"diagnosis: {best.name} cannot be told from the rest yet: {why}")
+            raise RefusedError(f"diagnosis: {best.name} is not certain yet: {why}")
         self.waited = 0
         return verdict
 
@@ -208,17 +208,17 @@ class Diagnosis:
 def doubtful_cameras(
     before: RigBelief, snapshots: Sequence[Snapshot], pauses: Sequence[float], options: EstimationOptions
 ) -> tuple[tuple[int, ...], bool]:
-    """Find the cameras, half of them at most, that explain snapshots which fit nowhere.
+    """Find the cameras, at most half of them, that explain snapshots which fit nowhere.
 
     Args:
-        before: what was believed before them.
-        snapshots: all of them want an explanation.
+        before: the belief before them.
+        snapshots: all of them need an explanation.
         pauses: s before each.
         options: how to minimize.
 
     Returns:
-        Cameras that have moved, or see the object at moments of their own; none where something else is as probable.
-        And whether it is surely moments of their own.
+        Cameras that have moved or are unsynchronized; empty if something else is as probable.
+        And whether they are surely unsynchronized.
     """
     observations, poses = stack_snapshots(snapshots)
     count, found, evidence = observations.seen.shape[1], tuple[int, ...](), -math.inf

@@ -1,7 +1,7 @@
-"""A filter that knows the last N snapshots and nothing older: what is left of a rig when a snapshot is forgotten.
+"""A filter that uses the last N snapshots only: what remains known about a rig when a snapshot is forgotten.
 
-What is known is the factory calibration and the information of those snapshots. A camera that none of them shows keeps
-its last values against the cameras it was last seen with, as surely as they were known then.
+What remains is the factory calibration and the information of those snapshots. A camera that none of them shows keeps
+its last values, relative to the cameras that it was last seen with, with the uncertainty they had then.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ EXTRINSICS = 6
 
 @dataclass(frozen=True)
 class LastSighting:
-    """What was known of a camera when the last snapshot that shows it was forgotten."""
+    """What was known about a camera when the last snapshot that shows it was forgotten."""
 
-    others: tuple[int, ...]  # cameras that it is placed against
-    value: Tensor  # (K,) rad, mm, pixels, 1: its error in the chart of the prior, less the mean error of the others
+    others: tuple[int, ...]  # cameras that its values are relative to
+    value: Tensor  # (K,) rad, mm, pixels, 1: its error in the prior's chart minus the others' mean error
     information: Tensor  # (K, K) of that value
 
 
 @dataclass(frozen=True)
 class Remainder:
-    """What is known without snapshots that are forgotten, or learnt again."""
+    """What is known without the snapshots that are forgotten or will be absorbed again."""
 
     first: RigBelief
-    away: dict[int, LastSighting]  # cameras that no snapshot shows any more
+    away: dict[int, LastSighting]  # cameras that no remaining snapshot shows
 
 
 @dataclass
@@ -47,33 +47,33 @@ class Horizon:
     """
 
     snapshots: int
-    prior: RigBelief  # the factory calibration; cameras that have moved since may be anywhere
+    prior: RigBelief  # the factory calibration; cameras that have moved since are unconstrained
     away: dict[int, LastSighting] = field(default_factory=dict)
 
     @property
     def most(self) -> int:
-        """Snapshots that are kept at most: forgetting costs time, so that several are forgotten at once."""
+        """Maximum number of snapshots to keep; several are forgotten together because forgetting is slow."""
         return 1 if self.snapshots == 1 else self.snapshots + 1 + self.snapshots // 4
 
     def free(self, prior: RigBelief, cameras: Collection[int]) -> None:
-        """Believe another prior, in which some cameras have moved: their last values hold no more."""
+        """Set a prior in which some cameras have moved, and drop their last values."""
         self.prior = prior
         self.away = {camera: last for camera, last in self.away.items() if camera not in cameras}
 
     def without(self, belief: RigBelief, forgotten: Tensor, kept: Tensor, first: RigBelief) -> Remainder:
-        """What is known without any snapshot.
+        """Compute what is known without the snapshots.
 
         Args:
-            belief: with all of them.
-            forgotten: (C,) bool, cameras that the snapshots show which are forgotten now.
-            kept: (C,) bool, those that the others show.
-            first: what was known before all of them; of it the object counts, which has not been forgotten.
+            belief: with all snapshots.
+            forgotten: (C,) bool, cameras shown by the snapshots that are forgotten now.
+            kept: (C,) bool, cameras shown by the other snapshots.
+            first: the belief before all snapshots; its object is used, because the object is not forgotten.
         """
         present = set(kept.nonzero().flatten().tolist())
         away = {camera: last for camera, last in self.away.items() if camera not in present}
         for camera in (forgotten & ~kept).nonzero().flatten().tolist():
             away[camera] = self._last_sighting(belief, camera, tuple(sorted(present)))
-        return Remainder(self._with_object(self._with_away(away), first), away)
+        return Remainder(self._add_object(self._add_absent_cameras(away), first), away)
 
     def _last_sighting(self, belief: RigBelief, camera: int, others: tuple[int, ...]) -> LastSighting:
         relative, wide = self._relative(camera, others), self.prior.unit.numel()
@@ -83,7 +83,7 @@ class Horizon:
         return LastSighting(others, relative @ error, torch.cholesky_inverse(spread))
 
     def _relative(self, camera: int, others: tuple[int, ...]) -> Tensor:
-        """Derivative (K, K C) of a camera's own values, placed against others, by all errors in units."""
+        """Derivative (K, K C) of a camera's values relative to others, by all errors in units."""
         unit = self.prior.unit
         relative = torch.zeros(unit.shape[1], *unit.shape, dtype=unit.dtype)
         relative[:, camera] = unit[camera].diag()
@@ -91,14 +91,14 @@ class Horizon:
             relative[:EXTRINSICS, other, :EXTRINSICS] = -unit[other, :EXTRINSICS].diag() / len(others)
         return relative.flatten(1)
 
-    def _with_away(self, away: dict[int, LastSighting]) -> RigBelief:
-        """The prior, and cameras that are away as they were seen last."""
+    def _add_absent_cameras(self, away: dict[int, LastSighting]) -> RigBelief:
+        """The prior, with absent cameras as they were last seen."""
         prior, width = self.prior, self.prior.unit.shape[1]
         if not away:
             return prior
         information, wide = prior.information.clone(), prior.unit.numel()
         weighted = prior.object_offset.new_zeros(len(information))
-        for camera in away:  # the prior has part in what was known of them
+        for camera in away:  # their last values include the prior already
             own = slice(camera * width, (camera + 1) * width)
             information[own], information[:, own] = 0.0, 0.0
         for camera, last in away.items():
@@ -109,8 +109,8 @@ class Horizon:
         error = torch.cholesky_solve(weighted[:, None], factor)[:wide, 0].view(prior.unit.shape)
         return replace(prior, rig=displace(prior.rig, error * prior.unit), factor=factor)
 
-    def _with_object(self, cameras: RigBelief, first: RigBelief) -> RigBelief:
-        """What is known of cameras by one belief, and of the object by another."""
+    def _add_object(self, cameras: RigBelief, first: RigBelief) -> RigBelief:
+        """Combine the cameras of one belief with the object of another."""
         wide = self.prior.unit.numel()
         if len(first.factor) == wide:
             return cameras

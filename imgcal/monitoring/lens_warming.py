@@ -1,4 +1,4 @@
-"""Have all lenses warmed up? Then every focal length grows, and the object seems to; it has not been exchanged."""
+"""Explain by lenses that warm up together: all focal lengths grow, so the same object seems to grow."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from imgcal.monitoring.change_test import CHANGES
 from imgcal.monitoring.rig_belief import widen_along
 
 PACE, OWN_PACE = 3e-4, 1e-4
-"""Relative change of all focal lengths in a second, one standard deviation, where lenses warm up or cool down, and by
-how much each lens differs from that ..."""
+"""Relative change per second, one standard deviation, of all focal lengths together as lenses warm up or cool down; the
+same of each lens relative to the others ..."""
 LEAST_SECONDS, MOST_SECONDS = 1.0, 16.0
-"""... for so long: what comes at once is no warming, and no lens goes on like that."""
+"""... and how long it may last: a sudden change is not warming, and warming ends."""
 
 
 class Warmed(Explanation):
@@ -24,7 +24,7 @@ class Warmed(Explanation):
     name = "warmed lenses"
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
-        """Let all focal lengths free by as much as they may have changed since."""
+        """Free all focal lengths by as much as they may have changed since."""
         return [partial(_warm, case)]
 
 

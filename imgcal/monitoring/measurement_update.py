@@ -1,10 +1,10 @@
-"""Learn from labelled snapshots of a rig that stood still meanwhile: `absorb`.
+"""Absorb labelled snapshots of a rig that stood still: `absorb`.
 
-The state is every camera's parameters and, where the object has tolerances, the object's; the object's pose is
-eliminated from each snapshot. Several snapshots may be absorbed at once: they are then linearized where they lead
-together, which is what `RigFilter` does with its first ones.
+The state is the parameters of every camera and, if the object has tolerances, of the object. The object's pose is
+eliminated from each snapshot. Snapshots that are absorbed together are linearized at their joint estimate; `RigFilter`
+does so with its first ones.
 
-Each light has a place of its own in each snapshot, which is eliminated; one that a single camera sees says nothing.
+Each light has its own position in each snapshot, which is eliminated; a light seen by one camera adds no information.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ def absorb(
     """Learn from labelled snapshots of a rig that stood still while they were taken.
 
     Args:
-        belief: what was known before.
-        observations: (S, C, N) of the object that the belief is about.
-        rig_from_object: (S,) first guess of the object's poses; (S, N) of lights, see `UnknownLights`.
+        belief: what is known before the snapshots.
+        observations: (S, C, N) of the object of `belief`.
+        rig_from_object: (S,) first guess of the object's poses; (S, N) for lights, see `UnknownLights`.
         options: how to minimize.
-        start: a belief about the same rig and object where the search begins, which saves steps; None = `belief`.
+        start: a belief about the same rig and object at which to start, which saves iterations; None = `belief`.
 
     Raises:
         RefusedError: the observations do not determine the object's pose, or no minimum was found.
-        ValueError: there are not as many poses as snapshots.
+        ValueError: the number of poses differs from the number of snapshots.
     """
     if rig_from_object.translation.shape[0] != observations.seen.shape[0]:
         counts = f"{rig_from_object.translation.shape[0]} poses of {observations.seen.shape[0]} snapshots"
-        raise ValueError(f"rig_from_object: found {counts}, expected one of each")
+        raise ValueError(f"rig_from_object: found {counts}, expected one pose per snapshot")
     constants, unit, shake = belief.constants, belief.unit, observations.shake
     given, shown = rig_from_object, None
     if isinstance(belief.obj, UnknownLights):
@@ -79,13 +79,13 @@ def absorb(
     own, factor = torch.from_numpy(found.own), torch.from_numpy(found.factor)
     now = RigBelief(_make_rig(found.rig, belief.rig), belief.obj, own, factor, unit)
     carried = found.carried
-    if carried.shape[1] < 6:  # of a single light
+    if carried.shape[1] < 6:  # a single light
         carried = np.concatenate((carried, np.zeros((len(carried), 6 - carried.shape[1], carried.shape[2]))), 1)
     brought = SnapshotInformation(
         _make_rig(found.from_rig, belief.rig), torch.from_numpy(found.from_own), unit,
         *(torch.from_numpy(part) for part in (found.camera, found.border, carried, found.pull)),
     )  # fmt: skip
-    # What the properties would make of it, at hand.
+    # Set the cached properties: their values are at hand.
     half_log_determinant = float(np.log(found.factor.diagonal()).sum())
     information = torch.from_numpy(found.information)
     vars(now).update(information=information, arrays=found.rig, constants=constants)
@@ -108,7 +108,7 @@ def absorb(
 
 
 def _make_rig(values: RigArrays, like: CameraRig) -> CameraRig:
-    """The rig that has these values; `replace` would take longer than a projection."""
+    """Make a rig with these values; `replace` would take longer than a projection."""
     translation = -(values.rotation @ values.position[..., None])[..., 0]
     rig = object.__new__(CameraRig)
     vars(rig).update(vars(like))
@@ -122,7 +122,7 @@ def _make_rig(values: RigArrays, like: CameraRig) -> CameraRig:
 
 
 def stack_snapshots(snapshots: Sequence[tuple[Observations, RigidTransform]]) -> tuple[Observations, RigidTransform]:
-    """Put snapshots together: (S, C, N) and (S,)."""
+    """Concatenate snapshots: (S, C, N) and (S,)."""
     observations, poses = zip(*snapshots, strict=True)
     uv, sigma, seen = (torch.cat([getattr(part, name) for part in observations]) for name in ("uv", "sigma", "seen"))
     shake = None
@@ -135,20 +135,20 @@ def stack_snapshots(snapshots: Sequence[tuple[Observations, RigidTransform]]) ->
 
 @dataclass(frozen=True)
 class _Shown:
-    """Which lights of each snapshot are in the equations, and in which column."""
+    """The lights of each snapshot that enter the equations, and their columns."""
 
-    number: Tensor  # (S, M) of the light in a column
+    number: Tensor  # (S, M) number of the light in each column
     used: Tensor  # (S, M) bool: the column is not empty
 
     def places(self, given: RigidTransform, centre: Tensor) -> RigidTransform:
-        """Put places (S, M, 3) in the stead of those that were given, (S, N)."""
+        """Replace the given positions (S, N) by estimated positions (S, M, 3)."""
         places = given.translation.detach().double().clone()
         snapshot, column = self.used.nonzero(as_tuple=True)
         places[snapshot, self.number[snapshot, column]] = centre[snapshot, column]
         return RigidTransform(given.rotation.detach().double(), places)
 
     def of_all(self, residual: Tensor, count: int) -> Tensor:
-        """Put residuals (S, C, M, 2) among those of all lights: (S, C, N, 2)."""
+        """Scatter residuals (S, C, M, 2) to all lights: (S, C, N, 2)."""
         every = residual.new_zeros(*residual.shape[:2], count, 2)
         snapshot, column = self.used.nonzero(as_tuple=True)
         every[snapshot, :, self.number[snapshot, column]] = residual[snapshot, :, column]
@@ -158,7 +158,7 @@ class _Shown:
 def _select_lights(
     observations: Observations, rig_from_object: RigidTransform
 ) -> tuple[Observations, RigidTransform, _Shown]:
-    """Keep the lights that two cameras see: (S, C, M) and (S, M), M as many as the fullest snapshot has.
+    """Keep the lights that two cameras see: (S, C, M) and (S, M), with M the largest number in a snapshot.
 
     Raises:
         RefusedError: there are none.

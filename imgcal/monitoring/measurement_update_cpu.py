@@ -1,11 +1,11 @@
 """`measurement_update.absorb` compiled for CPUs: one call a snapshot, without temporaries.
 
-`measurement_update_in_tensors` says the same in tensors, and is what this is tested against. K parameters a camera, M
-of the object, D = K C + M; S snapshots, each linearized as a rig of its own (`linearization_cpu.linearize_rig`). All
-states and equations have two rows: the best so far, and the one that is tried.
+`measurement_update_in_tensors` does the same in tensors; the tests compare both. Sizes: K parameters per camera, M of
+the object, D = K C + M; S snapshots, each linearized as a rig of its own (`linearization_cpu.linearize_rig`). All
+states and equations have two rows: the best so far, and the trial.
 
-A snapshot's pose has P numbers: six of an object. Of N lights it has 3 N, a place for each, and no rotation
-(`light_linearization_cpu.linearize_lights`); their centres are (S, N, 3) then.
+A snapshot's pose has P numbers: six for an object. N lights have 3 N, a position each and no rotation
+(`light_linearization_cpu.linearize_lights`); their centres are (S, N, 3).
 """
 
 # Compiled functions take their types from their arguments.
@@ -29,43 +29,43 @@ from renderers.compiling import njit
 Array = NDArray[np.float64]
 
 FOUND, NO_POSE, NOTHING_KNOWN, NO_MINIMUM = 0, 1, 2, 3
-"""How it ended: with a minimum; a snapshot does not determine its pose; a factorization failed; no minimum."""
+"""Result: a minimum was found, a snapshot does not determine its pose, a factorization failed, or no minimum."""
 
 WHY_NOT = {
     NO_POSE: "the observations do not determine the object's pose in every snapshot",
-    NOTHING_KNOWN: "these observations leave a rig that nothing is known of: labels may be wrong",
-    NO_MINIMUM: "found no minimum for these observations, expected one: labels may be wrong",
+    NOTHING_KNOWN: "these observations do not determine the rig: labels may be wrong",
+    NO_MINIMUM: "no minimum was found for these observations: labels may be wrong",
 }
 MOST_DAMPING = 1e8
 SLACK = 1e-6
-"""By how much the cost may rise in a step, relative: rounding."""
+"""Relative increase of the cost that a step may have, by rounding."""
 DAMPED, STALLED = 1e-3, 10.0
-"""Damping up to which a step that is as short as the tolerance shows that this is the minimum; the second where lightly
-damped steps have failed: their direction is approximate where the belief is far away."""
+"""Greatest damping at which a step below the tolerance proves the minimum; the second value applies after lightly
+damped steps have failed: far from the belief their direction is only approximate."""
 
 LOOSEN_AFTER, LOOSER = 12, 1.5
-"""Iterations after which, and factor by which in each, the tolerance grows: where snapshots contradict a belief, steps
-are slow to become small."""
+"""After this many iterations the tolerance grows by this factor in each: steps shrink slowly if snapshots contradict
+a belief."""
 
 
 @dataclass(frozen=True)
 class Minimum:
-    """What `absorb` found."""
+    """The result of `absorb`."""
 
     status: int  # FOUND, ...
     rig: RigArrays
     rotation: Array  # (S, 3, 3) rig_from_object
-    centre: Array  # (S, 3) mm, the object's centroid in the rig; (S, N, 3) of lights
+    centre: Array  # (S, 3) mm, the object's centroid in the rig; (S, N, 3) for lights
     own: Array  # (M,) the object's offset
     residual: Array  # (S, C, 2, N) pixels, predicted minus observed
     cost: float
     information: Array  # (D, D)
     factor: Array  # (D, D) its lower Cholesky factor
-    camera: Array  # (S, C, K, K) what each snapshot brought: see `SnapshotInformation`
+    camera: Array  # (S, C, K, K) each snapshot's information: see `SnapshotInformation`
     border: Array  # (S, M, D)
     carried: Array  # (S, P, D)
     pull: Array  # (S, D)
-    from_rig: RigArrays  # where that is linearized
+    from_rig: RigArrays  # the point of linearization
     from_own: Array  # (M,)
 
 
@@ -77,18 +77,18 @@ def absorb(
     options: tuple[int, float, int, float, float, float, float, float],
     start: tuple[RigArrays, Array] | None = None,
 ) -> Minimum:
-    """Find what is most probable after some snapshots.
+    """Find the most probable rig, object and poses after some snapshots.
 
     Args:
-        shared: what `linearization_cpu` is given of all rigs alike: points and squared radii, and so on.
-        seen: pixels (S, C, 2, N), the roots of their weights (S, C, N), and by how much cameras shake (S, C): see
+        shared: what `linearization_cpu` needs for all rigs alike: points, squared radii, and so on.
+        seen: pixels (S, C, 2, N), square roots of their weights (S, C, N), and how much cameras shake (S, C): see
             `linearization_cpu.linearize_rig`.
         known: the rig, units (C, K) of its errors, offset (M,) of the object and its prior standard deviation (M,), and
             the information (D, D) about both.
-        poses: first guess, rotation (S, 3, 3) and centre (S, 3); of lights (S, N, 3).
-        options: code and threshold of the loss, iterations at most, tolerance, by how much the cost may rise,
-            the damping up to which a small step shows the minimum, that once a step has failed, and the greatest one.
-        start: first guess of the rig and of the object's offset (M,); None = what is known.
+        poses: first guess, rotation (S, 3, 3) and centre (S, 3), or (S, N, 3) for lights.
+        options: code and threshold of the loss, most iterations, tolerance, allowed increase of the cost, greatest
+            damping at which a small step proves the minimum, the same after a failed step, and greatest damping.
+        start: first guess of the rig and of the object's offset (M,); None = the known values.
     """
     uv = seen[0]
     rig, unit, own, own_std, information = known
@@ -110,7 +110,7 @@ def absorb(
         shared, seen, rig.parts, (unit, own, own_std, information), rigs, states, blocks,
         (factor, gathered), brought, options,
     )  # fmt: skip
-    last = 1 - best  # where the last step was taken from
+    last = 1 - best  # where the last step started
     return Minimum(
         status=status,
         rig=RigArrays(*(part[best] for part in rigs)),
@@ -132,7 +132,7 @@ def absorb(
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brought, options):
-    """Newton's method with damping where a step fails; see `measurement_update_in_tensors.update_in_tensors`."""
+    """Minimize by Newton's method, damped when a step fails; see `measurement_update_in_tensors.update_in_tensors`."""
     loss, threshold, most, tolerance, slack, light, stalled, most_damping = options
     unit, _, _, prior = known
     factor, gathered = matrices
@@ -188,7 +188,7 @@ def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brou
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _half_square(centre, half):
-    """Half of the squared length of a pose's numbers (P,)."""
+    """Half of the squared norm of a pose's numbers (P,)."""
     gain = 0.0
     if centre.ndim == 3:
         for i in range(6):
@@ -201,7 +201,7 @@ def _half_square(centre, half):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _factorize(matrix, damping, factor):
-    """Write the lower Cholesky factor of a matrix (D, D) whose diagonal grows by a share; False where there is none."""
+    """Write the lower Cholesky factor of a matrix (D, D) whose diagonal is scaled up; return False if there is none."""
     for i in range(len(matrix)):
         for j in range(i + 1):
             factor[i, j] = matrix[i, j]
@@ -211,7 +211,7 @@ def _factorize(matrix, damping, factor):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, b, loss, threshold):
-    """Linearize all snapshots at row b, write the distance from what is known, and return the cost."""
+    """Linearize all snapshots at row b, write the distance from the known values, and return the cost."""
     uv, root_weight, shake = seen
     unit, own0, own_std, prior = known
     rotation, position, focal, principal, distortion = rigs
@@ -222,7 +222,7 @@ def _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, b,
     )  # fmt: skip
     cost = 0.0
     for s in range(len(uv)):
-        given = shared + (  # noqa: RUF005 (numba knows no other way)
+        given = shared + (  # noqa: RUF005 (numba supports no other way)
             uv[s : s + 1], root_weight[s : s + 1], rotation[b], position[b], focal[b], principal[b], distortion[b],
             unit, own_std,
         )  # fmt: skip
@@ -244,7 +244,7 @@ def _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, b,
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _linearize(given, state, centre, blocks, loss, threshold, shake):
-    """Linearize one snapshot, of an object or of lights: the axes of the centre say which, when it is compiled."""
+    """Linearize one snapshot of an object or of lights; the number of axes of `centre` decides at compile time."""
     if centre.ndim == 2:
         return linearize_rig(given, state, blocks, False, loss, threshold, shake)
     (_, radius_squared, lenses, uv, root_weight, rotation, position, focal, principal, distortion, unit, _) = given
@@ -260,9 +260,9 @@ def _linearize(given, state, centre, blocks, loss, threshold, shake):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _gather(unit, known, rigs, states, blocks, gathered, half, pull, b):
-    """Take the poses out of row b, and sum up the information; 1 where a pose is not determined.
+    """Eliminate the poses of row b, and sum the information; return 1 if a pose is not determined.
 
-    What each snapshot brought takes the place of its blocks: `camera`, `border`, and `coupling` (carried).
+    The result for each snapshot overwrites its blocks: `camera`, `border`, and `coupling` (carried).
     """
     _, _, _, prior = known
     rotation, position, _, _, _ = rigs
@@ -316,16 +316,17 @@ def _gather(unit, known, rigs, states, blocks, gathered, half, pull, b):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _take_steps(coupling, at, free, basis):
-    """Multiply a camera's part of the coupling (P, D) of a pose, or of places, by the steps by its errors."""
+    """Multiply a camera's part of the coupling (P, D) of a pose, or of positions, by the steps by its errors."""
     for i in range(len(coupling)):
         times_basis(coupling[i, at : at + free], basis)
 
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _take_out(lower, gradient, carried, half, pull):
-    """Solve by the factor (P, P) of a pose for its gradient (P,) and its coupling (P, D); add what that pulls (D,).
+    """Solve by the factor (P, P) of a pose for its gradient (P,) and its coupling (P, D); add the effect on `pull`
+    (D,).
 
-    Most of the factor of places is zero.
+    Most of the factor of light positions is zero.
     """
     for i in range(len(lower)):
         value, inverse = gradient[i], 1 / lower[i, i]
@@ -342,7 +343,7 @@ def _take_out(lower, gradient, carried, half, pull):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _move(unit, rigs, states, blocks, half, step, poses, b, t):
-    """Write row b plus a step to row t; poses follow."""
+    """Write row b plus a step to row t, and update the poses to match."""
     rotation, position, focal, principal, distortion = rigs
     _, turned, centre, own = states
     _, coupling, pose, _, _, _, _, _ = blocks
@@ -375,7 +376,7 @@ def _move(unit, rigs, states, blocks, half, step, poses, b, t):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _move_poses(centre, turned, coupling, pose, half, step, poses, b, t):
-    """Write the poses of row b, of an object or of lights, to row t as they follow a step (D,)."""
+    """Write the poses of row b, of an object or of lights, to row t, updated for a step (D,)."""
     if centre.ndim == 3:
         turn, left = np.empty((3, 3)), np.empty((3, 3))
         for s in range(len(half)):
@@ -401,7 +402,7 @@ def _move_poses(centre, turned, coupling, pose, half, step, poses, b, t):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _move_places(centre, carried, lower, half, step, places, s, b, t):
-    """Write the places of a snapshot's lights to row t as they follow a step (D,)."""
+    """Write the positions of a snapshot's lights to row t, updated for a step (D,)."""
     if centre.ndim == 4:
         for i in range(len(lower)):
             value = half[i]

@@ -1,10 +1,10 @@
-"""Follow how long the errors of each camera last, so that evidence counts by its effective sample size.
+"""Measure how long the errors of each camera persist, so that evidence counts by its effective sample size.
 
-Errors of real cameras are correlated in time: a marker that is half hidden stays so for some frames, a lens error
-belongs to a place in the image. Snapshots that repeat an error bring no new evidence. With a correlation time of tau
-snapshots, n of them say as much as n / tau independent ones: each is given tau times its variance. A shift of a whole
-image that lasts may also be mistaken for a small move. It is expected to come back, so a change of a camera must move
-the image by clearly more than that.
+Errors of real cameras are correlated in time: a half-hidden marker stays half hidden for some frames, and a lens error
+belongs to a place in the image. Snapshots that repeat an error add no new evidence. With a correlation time of tau
+snapshots, n of them are worth n / tau independent ones, so their variance is multiplied by tau. A persistent shift of a
+whole image may also be mistaken for a small move. Such a shift is expected to go away, so a change of a camera must
+move the image by clearly more than that.
 """
 
 from __future__ import annotations
@@ -25,36 +25,36 @@ from imgcal.monitoring.shaking import shared_shifts
 from imgcal.types import Observations
 
 MEMORY = 1024
-"""Latest snapshots from which correlation times are measured ..."""
+"""Number of latest snapshots used to measure correlation times ..."""
 FIRST, EVERY = (48, 64, 96), 128
-"""... after the first of them, and again after as many more."""
+"""... counts of snapshots at which they are first measured, and the interval after that."""
 USUAL, USUAL_SECONDS, USUAL_SNAPSHOTS = 0.4, 0.1, 256
-"""Autocorrelation of the errors of infrared cameras at short intervals, the time (s) after which it has fallen by a
-factor e, and the snapshots up to which no less is assumed of a rig that has been calibrated: few cannot tell."""
+"""Autocorrelation of the errors of infrared cameras at short intervals, its decay time (s, to 1/e), and the number of
+snapshots until which a calibrated rig is assumed to have no less: fewer snapshots cannot tell."""
 FASTEST, SLOWEST = 1 / 60, 1.0
-"""Seconds between snapshots, before anything is known of their rate; longer ones are pauses."""
+"""Seconds between snapshots while their rate is unknown; the longest interval that is not a pause."""
 SMOOTHING = 0.1
-"""Weight of the latest interval between snapshots in their average."""
+"""Weight of the latest interval in the running mean of intervals."""
 EPISODE, EPISODE_SECONDS = 2.0, 0.4
-"""Correlation times that a passing error may last, and the seconds that it may last at least: a target at the edge of
-an image, behind somebody's arm, or under wrong labels stays there for so long, and may seem to be shifted by pixels."""
+"""How long a passing error may last: correlation times, and at least so many seconds. A target at the edge of an image,
+behind somebody's arm, or with wrong labels stays so for a while, and may seem to be shifted by pixels."""
 LARGEST = 10.0
-"""Times the usual size of lasting errors from which one lasts no longer than that."""
+"""Errors larger than this many times the usual persistent error last no longer than those seconds."""
 LEAST_LASTING = 0.05
-"""Pixels: errors that last are at least so large, by what ten well calibrated infrared cameras show."""
+"""Pixels: least size of persistent errors, as measured on ten well calibrated infrared cameras."""
 LEAST_SHIFT = 6.0
-"""Times the usual size of lasting errors by which a change must shift an image."""
+"""Minimum image shift of a change, relative to the usual size of persistent errors."""
 TAIL, TAIL_SIGMAS = 0.99, 3.03
-"""Part of the shifts that the tail leaves out, and how far it begins where they are normal, in standard deviations."""
+"""Quantile of the shifts that is compared, and its distance from the mean in standard deviations for normal shifts."""
 SETTLING_SNAPSHOTS = 64
-"""After a change of a camera, while it is learnt anew: what it leaves then follows from how little is known of it."""
+"""Snapshots to leave out after a camera has changed: their errors come from how little is known about it."""
 LEAST_POINTS = 2
-"""Labels of a camera from which the shift of its image counts."""
+"""Minimum number of labels of a camera for the shift of its image to count."""
 
 
 @dataclass
 class NoiseCorrelation:
-    """How long the errors of each camera last, measured by the shifts of its image that snapshots leave.
+    """How long the errors of each camera persist, measured by the image shifts that snapshots leave as residuals.
 
     Examples:
         >>> NoiseCorrelation(2).time
@@ -63,48 +63,48 @@ class NoiseCorrelation:
 
     cameras: int
     time: Tensor = field(init=False)  # (C,) correlation time in snapshots; 1 = independent
-    lasting: Tensor = field(init=False)  # (C,) px, one standard deviation of a shift of the image that lasts
+    lasting: Tensor = field(init=False)  # (C,) px, one standard deviation of a persistent image shift
     shifts: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=MEMORY))  # (C, 2) px
     taken: int = 0  # snapshots
-    usual: float = 1.0  # least correlation time as long as too few have been taken
-    interval: float = 0.0  # s between snapshots; 0 = not known
-    settled_at: dict[int, int] = field(default_factory=dict)  # number of snapshots from which changed cameras count
+    usual: float = 1.0  # least correlation time until enough snapshots are taken
+    interval: float = 0.0  # s between snapshots; 0 = unknown
+    settled_at: dict[int, int] = field(default_factory=dict)  # snapshot number from which a changed camera counts again
 
     def __post_init__(self) -> None:
-        """Begin with errors that are independent from snapshot to snapshot."""
+        """Start with errors that are independent from snapshot to snapshot."""
         self.time = torch.ones(self.cameras, dtype=torch.float64)
         self.lasting = torch.zeros(self.cameras, dtype=torch.float64)
 
     def pass_time(self, seconds: float) -> None:
-        """Note how long ago the last snapshot was."""
+        """Note the time since the previous snapshot."""
         if 0 < seconds <= SLOWEST:
             self.interval += (SMOOTHING if self.interval else 1.0) * (seconds - self.interval)
 
     def expect_usual(self) -> None:
-        """Assume the usual correlation of snapshots at this rate, until enough have been taken."""
+        """Assume the usual correlation at this rate until enough snapshots have been taken."""
         self.usual = usual_time(self.interval) if self.taken < USUAL_SNAPSHOTS else 1.0
         if self.taken < FIRST[0]:
             self.time = torch.full_like(self.time, self.usual)
 
     @property
     def model_error(self) -> Tensor:
-        """By how much each camera's image may be off for a while where nothing has moved: (C,) px."""
+        """Persistent error of each camera's image without any change: (C,) px."""
         return torch.where(self.time > 1, self.lasting.clamp_min(LEAST_LASTING), MODEL_ERROR)
 
     def episode(self, camera: int, shift: float) -> int:
-        """Successive snapshots that an error of a camera may last which shifts its image by so many pixels."""
+        """Number of successive snapshots that a camera's error may last that shifts the image so far (px)."""
         usual = self.episodes[camera]
         large = shift > LARGEST * float(self.model_error[camera])
         return min(usual, math.ceil(self._least_episode)) if large else usual
 
     @property
     def correlated(self) -> Tensor | None:
-        """The same of cameras whose errors last: (C,) px; None = the errors of all are independent."""
+        """`model_error`, or None if the errors of all cameras are independent: (C,) px."""
         return self.model_error if bool((self.time > 1).any()) else None
 
     @property
     def episodes(self) -> list[int]:
-        """Successive snapshots of each camera that one passing error may last."""
+        """Number of successive snapshots that a passing error of each camera may last."""
         least = self._least_episode
         return [1 if time <= 1 else math.ceil(max(EPISODE * time, least)) for time in self.time.tolist()]
 
@@ -114,11 +114,11 @@ class NoiseCorrelation:
 
     @property
     def least_shifts(self) -> list[float]:
-        """Pixels by which a change must shift the image of each camera: less may be an error that lasts."""
+        """Minimum image shift (px) of each camera that counts as a change: less may be a persistent error."""
         return torch.where(self.time > 1, LEAST_SHIFT * self.model_error, 0.0).tolist()
 
     def weigh(self, observations: Observations) -> Observations:
-        """Give observations (S, C, N) the variance with which their number is an effective sample size."""
+        """Scale the variance of observations (S, C, N) so that they count by their effective sample size."""
         if not bool((self.time > 1).any()):
             return observations
         root = self.time.sqrt()
@@ -126,11 +126,11 @@ class NoiseCorrelation:
         return replace(observations, sigma=observations.sigma * root[:, None], shake=shake)
 
     def settle(self, cameras: Collection[int]) -> None:
-        """Leave out the next snapshots of cameras that have changed."""
+        """Ignore the next snapshots of cameras that have changed."""
         self.settled_at |= dict.fromkeys(cameras, self.taken + SETTLING_SNAPSHOTS)
 
     def add(self, observations: Observations, residual: Tensor) -> None:
-        """Add what is left of a snapshot in which nothing is wrong.
+        """Add the residuals of a snapshot without suspicion.
 
         Args:
             observations: (1, C, N).
@@ -145,7 +145,7 @@ class NoiseCorrelation:
             self._measure()
 
     def _measure(self) -> None:
-        """Measure each camera by itself, and all together: those of which little was seen are taken to be alike."""
+        """Measure each camera alone and all together: cameras with few snapshots are assumed to be like the others."""
         series = np.stack(self.shifts)
         seen = np.isfinite(series[..., 0])
         variance = np.nansum(np.square(series), axis=(0, 2)) / (2 * np.maximum(seen.sum(0), 1))
@@ -153,7 +153,7 @@ class NoiseCorrelation:
         together = float(correlation_time(whitened[:, None])[0])
         time = np.maximum(correlation_time(series), max(together, self.usual))
         self.time = torch.from_numpy(time)
-        # A passing error is seldom, and large: the tail says more of it than the variance.
+        # A passing error is rare and large: the tail of the distribution shows it better than the variance.
         length = np.where(seen, np.linalg.norm(series, axis=-1), np.nan)
         tail = np.array(
             [np.nanquantile(column, TAIL) if some.any() else 0.0 for column, some in zip(length.T, seen.T, strict=True)]
@@ -162,7 +162,7 @@ class NoiseCorrelation:
 
 
 def usual_time(seconds: float) -> float:
-    """Correlation time, in snapshots, of usual errors in snapshots that are so many seconds apart.
+    """Correlation time, in snapshots, of usual errors for snapshots that are `seconds` apart.
 
     Examples:
         >>> [round(usual_time(seconds), 2) for seconds in (1 / 60, 0.1, 1.0)]

@@ -1,4 +1,4 @@
-"""Has the object changed, not a camera? What is believed, with the object's shape or size let free."""
+"""Test whether the object has changed, not a camera: estimate with the object's shape or size free."""
 
 from __future__ import annotations
 
@@ -18,40 +18,40 @@ from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.pending_change import free_cameras
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, cholesky_factor
 
-# Prior spread, one standard deviation, of what may have changed: before anything is known of it.
+# Prior standard deviations of a change.
 ONE_MM = 3.0
-"""Millimetres of each axis: a fiducial that was bent or put elsewhere."""
+"""Millimetres per axis: one fiducial was bent or moved."""
 ALL_MM = 0.2
-"""The same of all fiducials, of an object that was made or measured less well than is said."""
+"""Millimetres per axis, for all fiducials: the object was made or measured less accurately than stated."""
 SCALE = 0.1
-"""Of the object's scale, relative."""
+"""Relative scale of the object."""
 
-# What is asked of an object, and how surely it must have changed.
+# Which changes of an object are tested, and how significant they must be.
 ASKED_FIDUCIALS = 8
-"""Fiducials that may be elsewhere at most: of more, those whose residuals are the largest."""
+"""Maximum number of fiducials to test: if there are more, those with the largest residuals."""
 PRINT_FIDUCIALS = 64
-"""Fiducials of an object above which it is a print: none of them goes anywhere by itself."""
+"""Objects with more fiducials than this are prints, in which no fiducial moves alone."""
 LEAST_SIGMAS = 3.0
-"""Standard deviations by which it must have changed."""
+"""Minimum significance of a change, in standard deviations."""
 MISFIT_LEAD = 30.0
-"""Log odds against the next best explanation from which the object has changed where no camera is suspected: snapshots
-that fit badly have many causes."""
+"""Log odds against the next best explanation at which a change of the object is believed without a suspected camera:
+a bad fit has many causes."""
 
-# When it is asked: snapshots that fit worse than is usual, or first ones that never fitted.
+# When the object is tested: snapshots fit worse than usual, or the first ones have never fitted.
 SNAPSHOTS_PER_FALSE_ALARM = 1e9
 MOST_STEP = 4.0
-"""Standard deviations by which one snapshot counts at most: a single bad one is no misfit."""
+"""Maximum number of standard deviations that one snapshot counts for: a single bad one is no misfit."""
 LEAST_USUAL = 30
-"""Snapshots from which it is known how well they usually fit."""
+"""Number of snapshots after which their usual fit is known."""
 FIRST_ASKED, FIRST_SIGMAS = (8, 16, 32, 64), 2.0
-"""Numbers of first snapshots, and the standard deviations by which their chi-squared must exceed what is expected."""
+"""Numbers of first snapshots to test, and standard deviations by which chi-squared must exceed its expectation."""
 
 
 def free_object(belief: RigBelief, fiducial: int | None, by: float = ONE_MM) -> RigBelief:
-    """Let a fiducial be off by so many mm (`SHAPE`: all of them), or, where that is None, the scale.
+    """Free a fiducial by a standard deviation in mm (`SHAPE`: all of them), or the scale if `fiducial` is None.
 
     Raises:
-        RefusedError: nothing is known of the rig.
+        RefusedError: nothing is known about the rig.
     """
     obj, known, wide = belief.obj, len(belief.object_offset), belief.unit.numel()
     if not known:
@@ -72,7 +72,7 @@ def free_object(belief: RigBelief, fiducial: int | None, by: float = ONE_MM) -> 
 
 
 def _rows(known: int, fiducial: int | None) -> Tensor:
-    """Which of the numbers of what is known of an object belong to a change of it."""
+    """Indices in the object's offset that belong to a change of it."""
     rows = torch.arange(known)
     if fiducial is None:
         return rows[-1:]
@@ -80,12 +80,12 @@ def _rows(known: int, fiducial: int | None) -> Tensor:
 
 
 class ObjectChanged(Explanation):
-    """A fiducial is elsewhere, all of them are, or the object has another scale; the cameras stand still."""
+    """One fiducial has moved, all have, or the scale of the object differs; the cameras stand still."""
 
     name = "object changed"
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
-        """Let a part of the object free: each question takes as long as all that is known of the object."""
+        """Free one part of the object at a time; each part takes as long as the whole object."""
         case.require_body()
         known: tuple[int | None, float] = (None, ONE_MM)
         if case.before.obj.num_fiducials > PRINT_FIDUCIALS:
@@ -95,7 +95,7 @@ class ObjectChanged(Explanation):
 
 
 def _free_part(case: Case, fiducial: int | None, by: float) -> Variant:
-    """Let a part of the object free: see `free_object`."""
+    """Free a part of the object: see `free_object`."""
 
     def find(result: MeasurementUpdate) -> Finding:
         size, sigma = _measure_change(case.before, result.belief, fiducial)
@@ -107,7 +107,7 @@ def _free_part(case: Case, fiducial: int | None, by: float) -> Variant:
 
 
 def _suspected_fiducials(case: Case) -> list[int]:
-    """Fiducials that may be elsewhere: those that are seen, of many those with the largest residuals.
+    """Select the fiducials that may have moved: all that are seen, or those with the largest residuals.
 
     Raises:
         RefusedError: see `absorb`.
@@ -125,7 +125,7 @@ def _suspected_fiducials(case: Case) -> list[int]:
 
 
 def _measure_change(before: RigBelief, after: RigBelief, fiducial: int | None) -> tuple[float, float]:
-    """Measure how far it went, and the standard deviation: of all fiducials without what is motion or scale."""
+    """Measure the size of a change and its standard deviation, for all fiducials without rigid motion and scale."""
     std = object_prior_std(after.obj)
     rows = _rows(len(std), fiducial)
     was = before.object_offset if len(before.object_offset) else torch.zeros_like(std)
@@ -137,13 +137,13 @@ def _measure_change(before: RigBelief, after: RigBelief, fiducial: int | None) -
         change = change - motions @ (motions.mT @ change)
     size = float(change.norm())
     along = change / max(size, 1e-30)
-    share = (3 / len(rows)) ** 0.5 if fiducial == SHAPE else 1.0  # of one fiducial
+    share = (3 / len(rows)) ** 0.5 if fiducial == SHAPE else 1.0  # per fiducial
     sigma = share * float((along @ covariance @ along).clamp_min(0).sqrt())
     return (float(change[0]) if fiducial is None else share * size), sigma
 
 
 def _similarities(points: Tensor) -> Tensor:
-    """Directions of fiducials (N, 3) in which an object moves, turns or grows and keeps its shape: (3 N, 7)."""
+    """Directions of fiducials (N, 3) in which an object moves, turns or grows without changing its shape: (3 N, 7)."""
     arms = points - points.mean(0)
     shifts, turns = (
         torch.eye(3).to(points).expand(len(points), -1, -1),
@@ -154,7 +154,7 @@ def _similarities(points: Tensor) -> Tensor:
 
 @dataclass
 class Misfit:
-    """Notices that snapshots fit worse than is usual.
+    """Detects snapshots that fit worse than usual.
 
     Examples:
         >>> watch = Misfit()
@@ -166,7 +166,7 @@ class Misfit:
     usual: RunningMedian = field(default_factory=lambda: RunningMedian(256))
 
     def update(self, chi2: float, dof: int) -> int:
-        """Count the snapshots that fit worse than is usual, this one included; 0 = they fit."""
+        """Number of snapshots that fit worse than usual, this one included; 0 = no misfit."""
         ratio = chi2 / max(dof, 1)
         self.usual.append(ratio)
         step = (ratio / self.usual.value - 1) * math.sqrt(max(dof, 1) / 2)
@@ -175,5 +175,5 @@ class Misfit:
 
 
 def has_never_fitted(result: MeasurementUpdate, count: int) -> bool:
-    """Tell whether the first snapshots, absorbed together, fit so badly that the object may never have been as said."""
+    """Tell whether the first snapshots together fit so badly that the object may never have matched its file."""
     return count in FIRST_ASKED and result.chi2 - result.dof >= FIRST_SIGMAS * math.sqrt(2 * result.dof)

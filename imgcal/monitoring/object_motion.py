@@ -1,4 +1,4 @@
-"""How an object moves about a moment, by its poses in the snapshots around it: to second order in time."""
+"""Estimate an object's motion, to second order in time, from its poses in neighbouring snapshots."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from torch import Tensor
 from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_rotation
 
 AROUND = 7
-"""Snapshots by which the motion at one of them is known."""
+"""Number of snapshots used to estimate the motion at one of them."""
 REACH = 0.2
-"""Seconds from it within which they must be: a hand changes its mind within half a second."""
+"""Seconds within which they must be: a hand changes direction within half a second."""
 NOISE = (5e-4,) * 3 + (0.1,) * 3
-"""Standard deviations of a pose (rad, mm) against its neighbours ..."""
+"""Standard deviations of a pose (rad, mm) relative to its neighbours ..."""
 FAST, SUDDEN = (10.0,) * 3 + (5e3,) * 3, (100.0,) * 3 + (2e4,) * 3
-"""... of velocities (rad/s, mm/s), and of accelerations (a second more), before anything is known."""
+"""... and prior standard deviations of velocities (rad/s, mm/s) and accelerations (per second)."""
 
 
 @dataclass(frozen=True)
 class ObjectMotion:
-    """Where an object was at some moments, and how it moved there.
+    """An object's poses and motion at several times.
 
     Examples:
         >>> poses = RigidTransform(torch.eye(3).expand(4, 3, 3), torch.tensor([[0.0, 0.0, 9.0 * s] for s in range(4)]))
@@ -30,15 +30,15 @@ class ObjectMotion:
         tensor([13.5000, 36.0000], dtype=torch.float64)
     """
 
-    seconds: Tensor  # (S,) of the moments, in order
+    seconds: Tensor  # (S,) in ascending order
     rig_from_object: RigidTransform  # (S,)
-    velocity: Tensor  # (S, 6) rad/s of its turn, mm/s of its origin
-    acceleration: Tensor  # (S, 6) a second more
-    known: Tensor  # (S,) bool: there are neighbours that tell
+    velocity: Tensor  # (S, 6) rad/s rotation, mm/s origin
+    acceleration: Tensor  # (S, 6) the same per second
+    known: Tensor  # (S,) bool: has enough neighbours
 
     @classmethod
     def of(cls, rig_from_object: RigidTransform, seconds: Tensor) -> ObjectMotion:
-        """Take it from poses (S,), in the order of their times (S,) s."""
+        """Estimate the motion from poses (S,) at ascending times (S,) s."""
         count = len(seconds)
         wide = min(AROUND, count)
         first = (torch.arange(count) - wide // 2).clamp(0, count - wide)
@@ -59,11 +59,11 @@ class ObjectMotion:
         return cls(seconds.double(), poses, found[..., 1], found[..., 2], weight.sum(1) >= 2)
 
     def nearest(self, seconds: Tensor) -> Tensor:
-        """Numbers (M,) of the moments that are nearest to some times (M,) s."""
+        """Indices (M,) of the times nearest to some times (M,) s."""
         return (seconds.double()[:, None] - self.seconds).abs().argmin(1)
 
     def interpolate(self, seconds: Tensor) -> RigidTransform:
-        """Where the object is at some times (M,) s: (M,), each by the motion at the nearest moment."""
+        """Poses of the object at some times (M,) s: (M,), each from the motion at the nearest known time."""
         near = self.nearest(seconds)
         passed = (seconds.double() - self.seconds[near])[:, None]
         way = self.velocity[near] * passed + self.acceleration[near] * (passed.square() / 2)

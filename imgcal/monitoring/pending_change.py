@@ -1,4 +1,4 @@
-"""Cameras that have changed in a way that is not known yet: what they see since then decides its kind."""
+"""Cameras that have changed in a still unknown way; later snapshots decide the kind of change."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belie
 from imgcal.monitoring.rig_filter import YOUNG_SECONDS
 from imgcal.types import CameraRig
 
-# Log odds from which the kind of a change is believed.
+# Log odds at which the kind of a change is believed.
 KIND_LEAD = 5.0
-"""Of one kind against every other; ..."""
+"""One kind against every other; ..."""
 SINGLE_KIND_LEAD, ALL_KINDS_LEAD = 3.0, 15.0
-"""... against a change of all kinds at once, and of that against each: what is believed wrongly does no harm then."""
+"""... against a change of all kinds together, and the latter against each kind: a wrong belief does no harm then."""
 LENS_KINDS, LENS_LOG_PRIOR = ("focal_length", "principal_point"), -3.0
-"""Changes of a lens alone, and the log odds of one against a turn or a shift where the snapshots cannot tell: what is
-bumped is a camera."""
+"""Changes of the lens alone, and their prior log odds against a rotation or a shift if the snapshots cannot tell: bumps
+hit the camera, not the lens."""
 DECIDE_AFTER = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
-"""Numbers of snapshots since a change at which its kind is decided, if it can be."""
+"""Numbers of snapshots since a change at which its kind is decided if possible."""
 
 
 @dataclass(frozen=True)
@@ -32,36 +32,37 @@ class Change:
     """What happened to a camera."""
 
     camera: int
-    since: int  # number of the first snapshot, counted from 0, that saw it from its new place
-    kind: str  # of `CHANGES`; "unknown" = not decided yet, or none of them alone
-    size: float  # rad, mm or pixels; nan where the kind is not known
-    sigma: float  # one standard deviation of it
-    decided: bool = False  # the last that will be said of it
-    evidence: float = math.nan  # chi-squared of its having stood still; nan = not tested
+    since: int  # number of the first snapshot, counted from 0, taken from its new pose
+    kind: str  # of `CHANGES`; "unknown" = undecided, or more than one kind
+    size: float  # rad, mm or pixels; nan if the kind is unknown
+    sigma: float  # one standard deviation of the size
+    decided: bool = False  # this report is final
+    evidence: float = math.nan  # chi-squared for "it stood still"; nan = not tested
 
 
 @dataclass
 class PendingChange:
-    """What was believed before some cameras changed, and what has been seen since, in one chart."""
+    """The belief before some cameras changed, and the information since, in one chart."""
 
     before: RigBelief
-    origin: RigBelief  # of the chart: rig and object where the later snapshots led, when they were last linearized
+    origin: RigBelief  # of the chart: rig and object at the last linearization of the later snapshots
     brought: Tensor  # (D, D)
-    weighted: Tensor  # (D,) pull at the origin
+    weighted: Tensor  # (D,) gradient at the origin
     count: int  # snapshots
     seconds: float
-    kinds: dict[int, str | None]  # of the cameras that changed; None = not decided
-    most: int = DECIDE_AFTER[-1]  # snapshots after which the kinds are decided
+    kinds: dict[int, str | None]  # by camera that changed; None = undecided
+    most: int = DECIDE_AFTER[-1]  # decide the kinds after so many snapshots
 
     @property
     def overdue(self) -> bool:
-        """Tell whether more snapshots are not worth waiting for."""
+        """Tell whether waiting for more snapshots is pointless."""
         return self.count >= self.most or self.seconds > YOUNG_SECONDS
 
     def distance(self, belief: RigBelief) -> Tensor:
-        """Error (D,) in the chart of what was believed at some time.
+        """Error (D,) of an earlier belief in this chart.
 
-        Cameras that changed are compared by their own parameters, so that a large change of one kind is of no other.
+        Cameras that changed are compared by their own parameters, so that a large change of one kind does not leak into
+        others.
         """
         at = _distance(belief.rig, belief.object_offset, self.origin)
         change, step = camera_change_errors(belief.rig, belief.unit), self.origin.rig.local(belief.rig)
@@ -74,18 +75,18 @@ class PendingChange:
     def of(
         cls, result: MeasurementUpdate, before: RigBelief, seconds: float, kinds: dict[int, str | None]
     ) -> PendingChange:
-        """Begin with the snapshots that were absorbed together after it."""
+        """Start with the first snapshots after the change, absorbed together."""
         brought = result.brought
         origin = replace(result.belief, rig=brought.rig, object_offset=brought.object_offset)
         return cls(before, origin, brought.information(), brought.pull.sum(0), len(brought), seconds, kinds)
 
     @property
     def due(self) -> bool:
-        """Tell whether to decide the kind now, if that can be."""
+        """Tell whether to try to decide the kind now."""
         return self.overdue or self.count in DECIDE_AFTER
 
     def add(self, result: MeasurementUpdate, seconds: float) -> None:
-        """Add what a snapshot has brought."""
+        """Add a snapshot's information."""
         brought = result.brought
         information = brought.information()
         at = _distance(brought.rig, brought.object_offset, self.origin)
@@ -97,7 +98,7 @@ class PendingChange:
         return {other: kind for other, kind in self.kinds.items() if other != camera}
 
     def test(self, walk: Tensor) -> ChangeTest:
-        """What the snapshots since the change say against what was believed before it.
+        """Test the snapshots since the change against the belief before it.
 
         Args:
             walk: (C, K) standard deviation of an hour's drift.
@@ -114,10 +115,11 @@ class PendingChange:
         Args:
             test: see `test`.
             camera: its number.
-            last: it is to be decided now.
+            last: decide now.
 
         Returns:
-            What is believed, None = any kind, and what is reported, None = no kind; None = it cannot be decided yet.
+            The kind to believe (None = any) and the kind to report (None = no single kind); None = cannot be decided
+            yet.
         """
         odds = {kind: test.odds({**self.others(camera), camera: kind}) for kind in (*CHANGES, None)}
         best, second = sorted(odds, key=lambda kind: -odds[kind])[:2]
@@ -126,17 +128,17 @@ class PendingChange:
             return best, best
         if not last:
             return None
-        # Told as what it most probably is, and believed to be anything.
+        # Report the most probable kind, but believe that any is possible.
         likely = {kind: odds[kind] + LENS_LOG_PRIOR * (kind in LENS_KINDS) for kind in CHANGES}
         return None, max(likely, key=lambda kind: likely[kind]) if self.overdue else None
 
     def decide_kinds(
         self, test: ChangeTest, changes: Mapping[int, Change], last: bool
     ) -> tuple[tuple[Change, ...], dict[int, str | None]]:
-        """Decide of which kind open changes are, by camera, where that can be decided, or it is time.
+        """Decide the kinds of pending changes, by camera, where possible or overdue.
 
         Returns:
-            What is reported of them, and what is believed of the cameras that are decided.
+            The decided changes to report, and the kinds to believe for their cameras.
         """
         decided, kinds = [], dict[int, str | None]()
         for camera, change in changes.items():
@@ -151,19 +153,19 @@ class PendingChange:
         return tuple(decided), kinds
 
     def size(self, test: ChangeTest, camera: int, kind: str) -> tuple[float, float]:
-        """How far a camera went, were it of this kind alone, and the standard deviation of that."""
+        """Size of a camera's change, assuming this kind alone, and its standard deviation."""
         change, covariance = test.condition_on(self.others(camera)).jump(camera, kind)
         size = float(change.norm())
         along = change / max(size, 1e-30)
         return size, float((along @ covariance @ along).clamp_min(0).sqrt())
 
     def adopt_kinds(self, test: ChangeTest) -> tuple[RigBelief, RigBelief, Tensor]:
-        """Believe that cameras have changed in the `kinds` only.
+        """Restrict the changes of cameras to the `kinds`.
 
-        What was believed is moved along with them first: a large turn is no small one times a number.
+        The earlier belief is moved along with the cameras first: a large rotation is not linear.
 
         Returns:
-            What was believed before, what is believed now, and its information (D, D), both without any drift since.
+            The belief before, the belief now, and its information (D, D), both without drift since.
         """
         step = torch.zeros_like(self.before.unit)
         for camera, kind in self.kinds.items():
@@ -181,7 +183,7 @@ class PendingChange:
 
 
 def free_cameras(belief: RigBelief, changes: Mapping[int, str | None], jump: float = LARGE) -> RigBelief:
-    """Let cameras have changed in some way, None = in all ways, by so many pixels."""
+    """Let cameras have changed in some way (None = any) by a jump in pixels."""
     return widen(belief, change_std(changes, pixel_changes(belief.rig), jump).square())
 
 

@@ -1,4 +1,4 @@
-"""From a calibration to what a running rig begins with: `make_posterior`, and back to a belief:
+"""Convert a calibration into a running rig's initial knowledge (`make_posterior`), and that back into a belief:
 `belief_from_posterior`.
 """
 
@@ -13,15 +13,15 @@ from imgcal.monitoring.rig_belief import RigBelief, cholesky_factor
 from imgcal.types import CalibrationObject, CameraRig, RigPosterior
 
 NEAR = 1e-3
-"""Millimetres between fiducials that are the same ones, written with rounded digits."""
+"""Millimetres between equal fiducials whose coordinates were rounded in a file."""
 
 
 def make_posterior(estimate: Estimate, obj: CalibrationObject) -> RigPosterior:
-    """Keep all that an estimate knows of a rig and of an object's shape, the poses let free.
+    """Keep everything an estimate knows about a rig and an object's shape, with the poses marginalized.
 
     Args:
         estimate: without batch axes.
-        obj: as it was given; its tolerances are those that the estimate granted.
+        obj: as given; its tolerances are those of the estimate.
 
     Raises:
         RefusedError: the observations do not determine the poses.
@@ -36,7 +36,7 @@ def make_posterior(estimate: Estimate, obj: CalibrationObject) -> RigPosterior:
     unit = RigBelief.of_prior(rig, loose, problem.prior_std[0].detach()).unit
     information = joint_information(estimate).detach().double()
     wide = unit.numel()
-    by_error = torch.eye(len(information), dtype=torch.float64)  # parameters by errors in units
+    by_error = torch.eye(len(information), dtype=torch.float64)  # derivative of parameters by errors in units
     by_error[:wide, :wide] = torch.block_diag(*(step_by_error(rig) * unit[:, None, :]))
     information = by_error.mT @ information @ by_error
     factor = cholesky_factor(0.5 * (information + information.mT))
@@ -45,7 +45,7 @@ def make_posterior(estimate: Estimate, obj: CalibrationObject) -> RigPosterior:
 
 
 def belief_from_posterior(posterior: RigPosterior, obj: CalibrationObject) -> RigBelief:
-    """Believe what a calibration has found; of another object than it saw, only what it says of the cameras.
+    """Take a calibration's result as a belief; of a calibration with another object, take the cameras only.
 
     Args:
         posterior: of the calibration.
@@ -64,7 +64,7 @@ def belief_from_posterior(posterior: RigPosterior, obj: CalibrationObject) -> Ri
 
 
 def _about_cameras(posterior: RigPosterior, obj: CalibrationObject) -> RigBelief:
-    """What it says of the cameras, beside an object of which only its file is known."""
+    """Take the cameras of a posterior, with an object known only from its file."""
     wide = posterior.unit.numel()
     covariance = torch.cholesky_inverse(posterior.factor)[:wide, :wide]
     prior = RigBelief.of_prior(posterior.rig, obj)
@@ -75,10 +75,10 @@ def _about_cameras(posterior: RigPosterior, obj: CalibrationObject) -> RigBelief
 
 
 def calibration_posterior(rig: CameraRig) -> RigPosterior | None:
-    """The posterior of the calibration that made a rig; None = none did, or its values have been changed since.
+    """Load the posterior of the calibration that made a rig; None = there is none, or the rig was changed since.
 
     Raises:
-        InputError: the posterior stands in a file that cannot be used.
+        InputError: the posterior's file cannot be used.
     """
     if rig.posterior is None:
         return None

@@ -1,4 +1,4 @@
-"""Cameras that see the object elsewhere than the others do: nothing is learnt of them until it is known why."""
+"""Cameras that see the object in the wrong place: they are excluded from learning until the reason is known."""
 
 from __future__ import annotations
 
@@ -16,36 +16,36 @@ from imgcal.monitoring.shaking import Shaking
 from imgcal.types import Observations
 
 CASE_SNAPSHOTS, CASE_SNAPSHOTS_UNCERTAIN = 16, 64
-"""Latest snapshots of a case; the second where it is hardly known where the cameras are, which takes more of them."""
+"""Latest snapshots of a case; the second number applies if the cameras' poses are hardly known, which takes more."""
 CASE_AFTER = (1, 2, 3, 4, 6, 8, 12, 16, 20, 24, 28, 32, 48, 64)
 CASE_EVERY = 32
-"""Numbers of snapshots since the quarantine began after which there is a case, and how often later."""
+"""Numbers of snapshots in quarantine after which a case is made, and the interval later."""
 SETTLE_SECONDS, SETTLE_SNAPSHOTS = 2.0, 20
-"""For how long, and how many snapshots at least, an unsynchronized camera may as well be one that is being shaken."""
+"""Seconds and snapshots during which an unsynchronized camera may equally be one that is being shaken."""
 
 
 @dataclass
 class Quarantine:
-    """Cameras of which nothing is learnt, and what they have seen meanwhile."""
+    """Cameras excluded from learning, and what they have seen in the meantime."""
 
     cameras: set[int] = field(default_factory=set)
     seen: deque[Observations] = field(default_factory=lambda: deque(maxlen=CASE_SNAPSHOTS_UNCERTAIN))  # (1, C, N)
-    snapshots: int = 0  # since it began
-    sightings: int = 0  # of those that count, the ones in which these cameras see the object
-    passing: bool = True  # what is wrong with them may still be an error that passes
-    seconds: float = 0.0  # since then
-    uncertain: bool = False  # it is hardly known where they are
-    unsynchronized: bool = False  # they see the object at moments of their own, or are being shaken ...
-    reported: bool = False  # ... and it was reported that it is the former
+    snapshots: int = 0  # since the quarantine began
+    sightings: int = 0  # relevant snapshots in which these cameras see the object
+    passing: bool = True  # the error may still pass
+    seconds: float = 0.0  # since the quarantine began
+    uncertain: bool = False  # the cameras' poses are hardly known
+    unsynchronized: bool = False  # they are unsynchronized or being shaken ...
+    reported: bool = False  # ... and were reported as unsynchronized
     least: int = 0  # sightings before the first case
 
     def add(self, cameras: Collection[int], uncertain: bool) -> None:
-        """Add cameras, and begin anew where one of them is new."""
+        """Add cameras; restart if one of them is new."""
         if not set(cameras) <= self.cameras:
             self._begin(self.cameras | set(cameras), uncertain)
 
     def report_unsynchronized(self) -> tuple[int, ...]:
-        """Report, once, cameras that surely have moments of their own: they would be at rest by now if shaken."""
+        """Report surely unsynchronized cameras once; shaken cameras would be at rest by now."""
         soon = self.seconds < SETTLE_SECONDS or len(self.seen) < SETTLE_SNAPSHOTS
         if not self.unsynchronized or self.reported or soon:
             return ()
@@ -53,13 +53,13 @@ class Quarantine:
         return tuple(sorted(self.cameras))
 
     def observe(self, observations: Observations, seconds: float, episode: int = 1) -> bool:
-        """Keep a snapshot, and tell whether there is a case now.
+        """Keep a snapshot, and tell whether to make a case now.
 
         Args:
             observations: (1, C, N).
-            seconds: since the one before.
-            episode: successive snapshots that one passing error of these cameras may last. There is no case before it
-                is over: what is wrong with them may pass.
+            seconds: since the previous snapshot.
+            episode: successive snapshots that a passing error of these cameras may last. No case is made before that is
+                over, because the error may pass.
         """
         self.seconds += seconds if self.seen else 0.0
         self.snapshots += 1
@@ -77,7 +77,7 @@ class Quarantine:
         return bool(observations.seen[:, list(self.cameras)].any())
 
     def _forget_episode(self) -> None:
-        """Keep of the first episode the last snapshot that shows the object: later ones must agree with it."""
+        """Of the first episode, keep only the last snapshot that shows the object: later ones must agree with it."""
         shown = [number for number, observations in enumerate(self.seen) if self._is_sighting(observations)]
         for _ in range(shown[-2] if len(shown) > 1 else 0):
             self.seen.popleft()
@@ -91,14 +91,14 @@ class Quarantine:
         uncertain: bool,
         least: int = 0,
     ) -> None:
-        """Add cameras that seem to have moments of their own.
+        """Add cameras that seem to be unsynchronized.
 
         Args:
-            snapshots: observations (1, C, N) and the object's pose (1,) of each since then.
+            snapshots: observations (1, C, N) and the object's pose (1,) of each snapshot since then.
             pauses: s before each of them.
-            cameras: those.
-            uncertain: it is hardly known where they are.
-            least: sightings before there is a case.
+            cameras: the cameras to add.
+            uncertain: their poses are hardly known.
+            least: sightings before the first case.
         """
         self.add(cameras, uncertain)
         self.least = max(self.least, least)
@@ -107,10 +107,10 @@ class Quarantine:
         self.unsynchronized = True
 
     def case(self, recent: RecentSnapshots, options: EstimationOptions, lasting: Tensor | None = None) -> Case:
-        """Put together a case of these cameras: the latest snapshots, with what they have seen.
+        """Make a case of these cameras: the latest snapshots, including what the cameras have seen.
 
         Raises:
-            RefusedError: nothing is known of the rig.
+            RefusedError: nothing is known about the rig.
         """
         total = recent.snapshots(len(recent))
         most = CASE_SNAPSHOTS_UNCERTAIN if self.uncertain else CASE_SNAPSHOTS
@@ -119,8 +119,8 @@ class Quarantine:
         snapshots = [*total[:-count], *zip(window, [pose for _, pose in total[-count:]], strict=True)]
         before, pauses = recent.belief_before(count), recent.pauses(len(recent))
         excluded = {
-            Shaking.name: "what shakes is not so far off",
-            ObjectChanged.name: "the other cameras see the object as it was",
+            Shaking.name: "the error is too large for shaking",
+            ObjectChanged.name: "the other cameras see an unchanged object",
         }
         cameras = tuple(sorted(self.cameras))
         return Case(
@@ -132,7 +132,7 @@ class Quarantine:
         self._begin(set(), uncertain=False)
 
     def _begin(self, cameras: set[int], uncertain: bool) -> None:
-        """Begin with cameras of which nothing has been seen yet."""
+        """Start with cameras that have not seen anything yet."""
         self.cameras, self.uncertain = cameras, uncertain
         self.snapshots, self.sightings, self.passing = 0, 0, True
         self.seconds, self.unsynchronized, self.reported, self.least = 0.0, False, False, 0

@@ -1,4 +1,4 @@
-"""Compiled loops of `RecentSnapshots`, which run with every snapshot."""
+"""Compiled loops of `RecentSnapshots`, run for every snapshot."""
 
 # Compiled functions take their types from their arguments.
 # ruff: noqa: ANN001, ANN201, ANN202
@@ -16,24 +16,24 @@ RIDGE = 1e-6
 
 @njit(fastmath=kernels.FAST)
 def screen(ring, totals, number, count, at, change, parts, ages, scores):
-    """Score cameras for changes before each of some numbers of latest snapshots, all else taken to be known.
+    """Score cameras for changes before several numbers of latest snapshots, treating everything else as known.
 
-    The pull of the later snapshots is that at what is believed now; its covariance is taken to be their information,
-    which it does not reach. Where more is known than they brought, the score is at least half of the true one.
+    The later snapshots' gradient is taken at the current belief. Their information stands in for its covariance and is
+    an upper bound. If more is known than they add, the score is at least half of the exact one.
 
     Args:
-        ring: of the K latest snapshots, number k in row k % K, see `SnapshotInformation`: carried (K, P, D), P >= 6, by
-            which the unknown poses take information away; border (K, M, D), information of the object; weighted (K, D),
-            pull at the chart's origin.
-        totals: sums over those before number k, in row k % (K + 1): of the information of each camera, were the poses
-            known, and the same, the poses let free; both (K + 1, C, P, P).
+        ring: of the K latest snapshots, number k in row k % K, see `SnapshotInformation`: carried (K, P, D), P >= 6,
+            the information lost to the unknown poses; border (K, M, D), information about the object; weighted (K, D),
+            gradient at the chart's origin.
+        totals: sums over the snapshots before number k, in row k % (K + 1): information about each camera with known
+            poses, and with free poses; both (K + 1, C, P, P).
         number: of the next snapshot.
-        count: snapshots that there are.
-        at: (D,) error of what is believed now.
+        count: number of snapshots.
+        at: (D,) error of the current belief.
         change: (C, P, P) error by a change of a camera's own parameters.
-        parts: (kinds, 2) first and last of the parameters of each kind.
+        parts: (kinds, 2) first and last parameter of each kind.
         ages: numbers of snapshots, ascending.
-        scores: (ages, C), filled with the largest score of any kind; zero where there are not as many snapshots.
+        scores: (ages, C), filled with the largest score of any kind; zero if there are too few snapshots.
     """
     carried, border, weighted = ring
     camera_total, own_total = totals
@@ -52,7 +52,7 @@ def screen(ring, totals, number, count, at, change, parts, ages, scores):
                 carried[k, 0, i] * free[0] + carried[k, 1, i] * free[1] + carried[k, 2, i] * free[2]
                 + carried[k, 3, i] * free[3] + carried[k, 4, i] * free[4] + carried[k, 5, i] * free[5]
             )  # fmt: skip
-        for q in range(6, len(free)):  # of lights
+        for q in range(6, len(free)):  # lights only
             if free[q] != 0.0:
                 for i in range(wide):
                     sums[i] += carried[k, q, i] * free[q]
@@ -80,9 +80,9 @@ def screen(ring, totals, number, count, at, change, parts, ages, scores):
 
 @njit(fastmath=kernels.FAST)
 def _score(pull, block, change, first, last, work):
-    """Square of the pull on some of a camera's own parameters in units of their information.
+    """Squared gradient by some of a camera's parameters, whitened by their information.
 
-    Most changes of a parameter are a change of one error: zeros are left out. `work`: (3, P, P) is overwritten.
+    Most changes of a parameter are a change of one error, so zeros are skipped. `work` (3, P, P) is overwritten.
     """
     count, size = last - first, len(pull)
     matrix, across, right = work[0], work[1], work[2, 0]
@@ -112,7 +112,7 @@ def _score(pull, block, change, first, last, work):
     for a in range(count):
         matrix[a, a] = 1.0 + RIDGE
     score = 0.0
-    for a in range(count):  # Cholesky's factor, and the whitened pull along with it
+    for a in range(count):  # Cholesky factor, and the whitened gradient along with it
         value = right[a]
         for b in range(a):
             entry = matrix[a, b]
@@ -133,14 +133,14 @@ def _score(pull, block, change, first, last, work):
 
 @njit(fastmath=kernels.FAST)
 def add_error(rig, reference, unit, error):
-    """Add the error in units that takes a rig to another one, like `rig_error.error_between`.
+    """Add the error in units that takes a rig to another, like `rig_error.error_between`.
 
     Args:
         rig: rotation (C, 3, 3) of cam_from_rig, position (C, 3) mm, focal length, principal point and distortion of the
             other rig.
-        reference: of the rig.
+        reference: the same of the first rig.
         unit: (C, P).
-        error: (C, P), added to.
+        error: (C, P), to which the result is added.
     """
     rotation, position, focal, principal, distortion = rig
     rotation0, position0, focal0, principal0, distortion0 = reference
@@ -173,13 +173,13 @@ def add_error(rig, reference, unit, error):
 
 @njit(fastmath=kernels.FAST)
 def put(ring, totals, number, brought, at):
-    """Write what a snapshot brought, linearized at an error, into the ring, and add it to the totals.
+    """Write a snapshot's information, linearized at an error, into the ring, and add it to the totals.
 
     Args:
         ring: see `screen`.
         totals: see `screen`.
         number: of the snapshot.
-        brought: camera (C, P, P), carried (P, D), at least six rows, border (M, D) and pull (D,) of it.
+        brought: camera (C, P, P), carried (P, D) with at least six rows, border (M, D) and gradient (D,).
         at: (D,) error.
     """
     row = number % len(ring[0])
@@ -213,7 +213,7 @@ def put(ring, totals, number, brought, at):
                 if len(new_carried) == 6:
                     for q in range(6):
                         entry -= new_carried[q, first + i] * new_carried[q, first + j]
-                else:  # of lights
+                else:  # lights
                     for q in range(len(new_carried)):
                         entry -= new_carried[q, first + i] * new_carried[q, first + j]
                 own_total[c, i, j] = own_before[c, i, j] + entry
@@ -230,7 +230,7 @@ def put(ring, totals, number, brought, at):
 
 @njit(fastmath=kernels.FAST)
 def add_row(ring, totals, number, information, weighted):
-    """Add the information (D, D) and the weighted error (D,) of a snapshot of the ring to sums; see `screen`."""
+    """Add a snapshot's information (D, D) and weighted error (D,) from the ring to sums; see `screen`."""
     row, rows = number % len(ring[0]), len(totals[0])
     carried, border = ring[0][row], ring[1][row]
     after, before = totals[0][(number + 1) % rows], totals[0][number % rows]
@@ -245,7 +245,7 @@ def add_row(ring, totals, number, information, weighted):
                 a * carried[0, j] + b * carried[1, j] + c * carried[2, j]
                 + d * carried[3, j] + e * carried[4, j] + f * carried[5, j]
             )  # fmt: skip
-    for q in range(6, len(carried)):  # of lights
+    for q in range(6, len(carried)):  # lights only
         for i in range(len(weighted)):
             if carried[q, i] != 0.0:
                 for j in range(len(weighted)):

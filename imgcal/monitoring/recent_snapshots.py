@@ -1,8 +1,8 @@
-"""The latest snapshots that a filter has absorbed, in a form that tells quickly whether a camera has changed since.
+"""The latest snapshots that a filter has absorbed, in a form in which changes of a camera are found quickly.
 
-All of them stand in one chart: errors of the rig in units, whose origin does not matter. What was known before any of
-them is what was known before the first one and what those between brought; when the filter has aged its belief, a new
-such base begins.
+All of them share one chart: errors of the rig in units, with an arbitrary origin. The belief before any snapshot is the
+belief before the first one plus the information of those in between. When the filter ages its belief, a new such base
+is added.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ from imgcal.monitoring.snapshot_information import SnapshotInformation, add_bloc
 from imgcal.types import CameraRig, Observations
 
 KEPT_SNAPSHOTS = 64
-"""Snapshots within which a change must show: one second at 60 a second."""
+"""A change must show within so many snapshots: one second at 60 a second."""
 MOST_BASES = 8
-"""How often the belief may have aged within them."""
+"""Maximum number of times that the belief may have aged within them."""
 SCREENED_AGES = np.array((2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64))
-"""Numbers of snapshots that are screened."""
+"""Numbers of latest snapshots to screen."""
 PRINCIPAL_POINT = CHANGES["principal_point"].start
 PARTS = np.array([(part.start, part.stop) for part in CHANGES.values()])
 
 
 @dataclass
 class _Base:
-    """What was known before a snapshot."""
+    """The knowledge before a snapshot."""
 
-    number: int  # of the snapshot
+    number: int  # number of the snapshot
     information: Tensor  # (D, D)
-    weighted: Tensor  # (D,) information times the error of what was most probable
-    own: bool = False  # no belief shares these numbers
+    weighted: Tensor  # (D,) information times the error of the most probable rig
+    own: bool = False  # no belief shares these arrays
 
 
 @dataclass(frozen=True)
 class _Seen:
     observations: Observations
     rig_from_object: RigidTransform
-    seconds: float  # since the snapshot before
+    seconds: float  # since the previous snapshot
 
 
 class RecentSnapshots:
@@ -77,11 +77,11 @@ class RecentSnapshots:
     }
 
     def __init__(self, belief: RigBelief, walk: Tensor, lasting: Tensor | float = MODEL_ERROR) -> None:
-        """Begin with none.
+        """Start empty.
 
         Args:
-            belief: of the filter.
-            walk: (C, K) standard deviation of every value after an hour, at which it ages.
+            belief: the filter's.
+            walk: (C, K) standard deviation of the drift of every value in an hour.
             lasting: (C,) px, see `NoiseCorrelation.model_error`.
         """
         (cameras, free), wide = belief.unit.shape, len(belief.factor)
@@ -90,31 +90,31 @@ class RecentSnapshots:
         self._unit = belief.unit.numpy()
         self._carried = np.zeros((KEPT_SNAPSHOTS, belief.pose_freedom, wide))
         self._border = np.zeros((KEPT_SNAPSHOTS, wide - cameras * free, wide))
-        self._weighted = np.zeros((KEPT_SNAPSHOTS, wide))  # pull, as it would be at the chart's origin
+        self._weighted = np.zeros((KEPT_SNAPSHOTS, wide))  # gradient, converted to the chart's origin
         self._ring = (self._carried, self._border, self._weighted)
         blocks = (KEPT_SNAPSHOTS + 1, cameras, free, free)
-        self._totals = (np.zeros(blocks), np.zeros(blocks))  # rounded by 10^-7 of a snapshot after a year
+        self._totals = (np.zeros(blocks), np.zeros(blocks))  # rounding error after a year: 10^-7 of a snapshot
         self._pixels = pixel_changes(belief.rig)
         self._begin(belief.rig, belief.object_offset)
 
     def _begin(self, rig: CameraRig, object_offset: Tensor) -> None:
-        """Begin with none, the chart's origin at a rig."""
+        """Start empty, with the chart's origin at a rig."""
         self._seen: deque[_Seen] = deque()
         self._bases: list[_Base] = []
         self._next = 0  # number of the next snapshot
         for total in self._totals:
             total[0] = 0.0
         self._aged = True  # the next snapshot needs a base
-        self._rig = RigArrays.of(rig)  # the last one of which the error was asked for ...
-        self._at = np.zeros_like(self._weighted[0])  # ... and that error
+        self._rig = RigArrays.of(rig)  # the last rig passed to `_error` ...
+        self._at = np.zeros_like(self._weighted[0])  # ... and its error
         self._at[self._unit.size :] = object_offset.numpy()
         self._change = camera_change_errors(rig, torch.from_numpy(self._unit))
 
     def resume(self) -> None:
-        """Put together what has been read.
+        """Rebuild the ring from a saved state.
 
         Raises:
-            ValueError: shapes do not belong together.
+            ValueError: the shapes are inconsistent.
         """
         self._unit = self._belief.unit.numpy()
         (cameras, free), wide = self._unit.shape, len(self._belief.factor)
@@ -145,12 +145,12 @@ class RecentSnapshots:
         self._bases, self._aged = [], True
 
     def append(self, result: MeasurementUpdate, observations: Observations, seconds: float) -> None:
-        """Take a snapshot that has just been absorbed.
+        """Add a snapshot that has just been absorbed.
 
         Args:
-            result: of the filter.
+            result: the filter's.
             observations: (1, C, N).
-            seconds: since the snapshot before.
+            seconds: since the previous snapshot.
         """
         while len(self._seen) >= KEPT_SNAPSHOTS or len(self._bases) >= MOST_BASES:
             self._drop()
@@ -165,7 +165,7 @@ class RecentSnapshots:
         self._aged = False
 
     def relinearize(self, result: MeasurementUpdate) -> None:
-        """Take the same snapshots, and any number before them, as they are where they lead together."""
+        """Relinearize the snapshots at their joint estimate; `result` may include earlier ones."""
         brought, before, seen = result.brought, result.before, self._seen
         while len(seen) > len(brought):  # beyond the filter's horizon
             seen.popleft()
@@ -190,22 +190,22 @@ class RecentSnapshots:
         pauses: Sequence[float],
         result: MeasurementUpdate,
     ) -> None:
-        """Forget all snapshots, and take some that were absorbed together.
+        """Forget all snapshots, and add some that were absorbed together.
 
         Args:
             snapshots: observations (1, C, N) and poses (1,).
             pauses: s before each of them.
-            result: what they taught.
+            result: their joint update.
         """
         self._seen = deque(_Seen(*snapshot, pause) for snapshot, pause in zip(snapshots, pauses, strict=True))
         self.relinearize(result)
 
     def rebase(self, belief: RigBelief, information: Tensor) -> None:
-        """Believe something else, of which these snapshots brought a part.
+        """Replace the belief by another one that includes the information of these snapshots.
 
         Args:
-            belief: what is believed now.
-            information: (D, D) of it, before it was aged.
+            belief: the current belief.
+            information: (D, D) of it, before aging.
         """
         at = self._follow(belief)
         brought, weighted = self._sums(0, self._next)
@@ -213,11 +213,11 @@ class RecentSnapshots:
         self._aged = True
 
     def snapshots(self, age: int) -> list[tuple[Observations, RigidTransform]]:
-        """The latest `age` ones."""
+        """The latest `age` snapshots."""
         return [(entry.observations, entry.rig_from_object) for entry in list(self._seen)[-age:]]
 
     def seconds(self, age: int) -> float:
-        """How long ago the snapshot before the latest `age` ones was."""
+        """Seconds since the snapshot before the latest `age` ones."""
         return sum(self.pauses(age))
 
     def pauses(self, age: int) -> list[float]:
@@ -235,11 +235,11 @@ class RecentSnapshots:
         """Test for changes before the latest `age` snapshots.
 
         Args:
-            age: how many.
-            aged: all that the rig may have wandered since then may have happened then.
+            age: number of snapshots.
+            aged: allow for all drift since then at once.
 
         Raises:
-            RefusedError: nothing is known of the rig.
+            RefusedError: nothing is known about the rig.
         """
         number = self._next - age
         information, at = self._known(number)
@@ -253,16 +253,16 @@ class RecentSnapshots:
         return ChangeTest.of(information, brought, pull, self._change, self._pixels, self.lasting)
 
     def score_without_episode(self, age: int, camera: int, kind: str, episode: int) -> tuple[float, float]:
-        """Score a change of a camera, all else taken to be known, without the episode that speaks most for it.
+        """Score a camera's change without the episode that supports it most, treating everything else as known.
 
         Args:
             age: snapshots since the change.
             camera: its number.
             kind: of `CHANGES`.
-            episode: successive snapshots that one passing error may last.
+            episode: successive snapshots that a passing error may last.
 
         Returns:
-            Chi-squared, and the shift (px, RMS) of the image that it amounts to; zeros where all may be one episode.
+            Chi-squared, and the equivalent image shift (px, RMS); zeros if all snapshots may be one episode.
         """
         number, part = self._next - age, CHANGES[kind]
         if age <= episode:
@@ -282,14 +282,14 @@ class RecentSnapshots:
         gained = total[self._next % len(total)][camera] - total[number % len(total)][camera]
         weight = (
             gained[PRINCIPAL_POINT, PRINCIPAL_POINT] / self._unit[camera, PRINCIPAL_POINT] ** 2
-        )  # of all its labels
+        )  # over all its labels
         return score, math.sqrt(max(score, 0.0) / max(weight, 1e-12))
 
     def belief_before(self, age: int) -> RigBelief:
-        """What was believed before the latest `age` snapshots.
+        """The belief before the latest `age` snapshots.
 
         Raises:
-            RefusedError: nothing was known of the rig.
+            RefusedError: nothing was known about the rig.
         """
         information, at = self._known(self._next - age)
         wide = self._unit.size
@@ -298,12 +298,12 @@ class RecentSnapshots:
         return replace(self._belief, rig=rig, object_offset=at[wide:], factor=_cholesky(information))
 
     def information(self, count: int) -> tuple[Tensor, Tensor]:
-        """Information (D, D) of the latest snapshots, and their pull (D,) at what is believed now."""
+        """Information (D, D) of the latest snapshots, and their gradient (D,) at the current belief."""
         information, weighted = self._sums(self._next - count, self._next)
         return information, weighted - information @ torch.from_numpy(self._at)
 
     def _known(self, number: int) -> tuple[Tensor, Tensor]:
-        """Information (D, D) before a snapshot, and what was most probable (D,)."""
+        """Information (D, D) before a snapshot, and the most probable error (D,)."""
         base = next(base for base in reversed(self._bases) if base.number <= number)
         brought, weighted = self._sums(base.number, number)
         information, weighted = base.information + brought, base.weighted + weighted
@@ -311,7 +311,7 @@ class RecentSnapshots:
         return information, torch.cholesky_solve(weighted[:, None], factor)[:, 0]
 
     def _sums(self, first: int, last: int) -> tuple[Tensor, Tensor]:
-        """Information (D, D) and weighted errors (D,) of some snapshots."""
+        """Information (D, D) and weighted errors (D,) of a range of snapshots."""
         first = max(first, self._next - len(self))
         rows = np.arange(first, last) % KEPT_SNAPSHOTS
         carried = torch.from_numpy(self._carried[rows].reshape(-1, self._at.size))
@@ -326,25 +326,25 @@ class RecentSnapshots:
         return information, torch.from_numpy(self._weighted[rows].sum(0))
 
     def _put(self, brought: SnapshotInformation, number: int, at: Tensor) -> None:
-        """Write the numbers of one snapshot, linearized at an error, into the ring."""
+        """Write a snapshot's information, linearized at an error, into the ring."""
         parts = (brought.camera, brought.carried, brought.border, brought.pull)
         put(self._ring, self._totals, self._next, tuple(part[number].numpy() for part in parts), at.numpy())
         self._next += 1
 
     def _drop(self) -> None:
-        """Forget the oldest snapshot: it becomes part of what was known before."""
+        """Forget the oldest snapshot: the knowledge before the others absorbs it."""
         base = self._bases[0]
         if len(self._bases) > 1 and self._bases[1].number == base.number + 1:
             self._bases.pop(0)
         else:
-            if not base.own:  # the belief has the same numbers
+            if not base.own:  # the belief shares this array
                 base.information, base.own = base.information.clone(), True
             add_row(self._ring, self._totals, base.number, base.information.numpy(), base.weighted.numpy())
             base.number += 1
         self._seen.popleft()
 
     def _follow(self, belief: RigBelief) -> Tensor:
-        """Remember what is believed now, and return its error."""
+        """Remember the current belief, and return its error."""
         self._belief = belief
         return self._error(belief.arrays, belief.object_offset)
 
@@ -358,7 +358,7 @@ class RecentSnapshots:
 
 
 def _all_but(values: Tensor, width: int) -> Tensor:
-    """Sums of values (S, ...) without each of the S - width + 1 windows of so many successive ones."""
+    """Sums of values (S, ...) without each of the S - width + 1 windows of `width` successive ones."""
     sums = torch.cat((torch.zeros_like(values[:1]), values.cumsum(0)))
     return sums[-1] - (sums[width:] - sums[:-width])
 
@@ -366,5 +366,5 @@ def _all_but(values: Tensor, width: int) -> Tensor:
 def _cholesky(matrix: Tensor) -> Tensor:
     factor, failed = torch.linalg.cholesky_ex(matrix)
     if bool(failed):
-        raise RefusedError("estimation: these observations leave a rig that nothing is known of")
+        raise RefusedError("estimation: these observations do not determine the rig")
     return factor

@@ -33,5 +33,5 @@ class RigArrays:
 
     @property
     def parts(self) -> tuple[Array, ...]:
-        """In the order of the compiled loops."""
+        """The arrays in the order of the compiled loops."""
         return (self.rotation, self.position, self.focal_length, self.principal_point, self.distortion)

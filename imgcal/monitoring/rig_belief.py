@@ -1,8 +1,8 @@
-"""What is known of a rig (`RigBelief`), what snapshots make of it (`MeasurementUpdate`), and what time does to it.
+"""What is known about a rig (`RigBelief`), its update by snapshots (`MeasurementUpdate`), and its decay with time.
 
-Information is kept as its Cholesky factor about errors in which a motion of the whole rig is the same direction
-everywhere (`rig_error.py`), so that it says nothing about what no image shows, however often the estimate has moved
-meanwhile.
+Information is kept as its Cholesky factor, about errors in which a motion of the whole rig has the same direction
+everywhere (`rig_error.py`). It therefore says nothing about directions that no image shows, however often the estimate
+has moved.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from imgcal.types import CalibrationObject, CameraRig, DriftRate, RigPrior, Unkn
 
 LEAST_STD = (1e-9,) * 3 + (1e-6,) * 3 + (1e-6,) * 4
 LEAST_COEFFICIENT = 1e-9
-"""Standard deviation (rad, mm, pixels, 1) of a value that is fixed: small, and not zero."""
+"""Standard deviation (rad, mm, pixels, 1) of a fixed value: small, but not zero."""
 
 
 @dataclass(frozen=True)
 class ObjectArrays:
-    """What compiled loops are given of an object and of lenses."""
+    """An object and lenses as compiled loops need them."""
 
     shared: tuple[NDArray[np.float64] | None, ...]  # see `linearization_cpu`
     centroid: NDArray[np.float64]  # (3,) mm
     own_std: NDArray[np.float64]  # (M,) prior standard deviation of the object's offset
-    pose_rank: int  # numbers of a pose that the object shows
+    pose_rank: int  # degrees of freedom of a pose that the object determines
 
     @classmethod
     def of(cls, obj: CalibrationObject, rig: CameraRig) -> ObjectArrays:
-        """Take an object, and the lenses of a rig."""
+        """Take an object and the lenses of a rig."""
         centroid = obj.points.mean(0)
         own_std = obj.points.new_zeros(0) if obj.exact else object_prior_std(obj)
         squared = None if obj.radius is None else obj.radius.double().square()
@@ -51,13 +51,13 @@ class ObjectArrays:
 
 @dataclass(frozen=True)
 class RigBelief:
-    """The most probable rig, and how surely it is known."""
+    """The most probable rig, and its uncertainty."""
 
     rig: CameraRig  # without batch axes, float64
-    obj: CalibrationObject  # with its tolerances, as it was given
-    object_offset: Tensor  # (M,) in units of its prior standard deviation: what is known of it; M = 0 where it is exact
+    obj: CalibrationObject  # as given, with its tolerances
+    object_offset: Tensor  # (M,) estimate in units of its prior standard deviation; M = 0 if it is exact
     factor: Tensor  # (D, D) lower Cholesky factor of the information; D = K C + M
-    unit: Tensor  # (C, K) rad, mm, pixels, 1: of the cameras' errors
+    unit: Tensor  # (C, K) rad, mm, pixels, 1: units of the cameras' errors
 
     STATE: ClassVar = {
         "rig": ("rig", CameraRig),
@@ -65,14 +65,14 @@ class RigBelief:
         "object_offset": ("object_offset", Tensor),
         "factor": ("factor", Tensor),
         "unit": ("unit", Tensor),
-        # What the properties make of these is rounded otherwise than what `absorb` has at hand.
+        # `absorb` has these at hand; the properties would round them differently.
         "information": ("information", Tensor),
         "arrays": ("arrays", RigArrays),
     }
 
     @classmethod
     def of_prior(cls, rig: CameraRig, obj: CalibrationObject, prior_std: Tensor | None = None) -> RigBelief:
-        """What the factory says: `prior_std` (C, K), None = as the rig file has it."""
+        """The factory calibration: `prior_std` (C, K), None = as in the rig file."""
         rig = rig.to(torch.float64)
         std = (rig.prior or RigPrior()).std(rig) if prior_std is None else prior_std
         least = torch.full((rig.num_parameters,), LEAST_COEFFICIENT, dtype=torch.float64)
@@ -96,12 +96,12 @@ class RigBelief:
 
     @cached_property
     def half_log_determinant(self) -> float:
-        """Of the information."""
+        """Half of the log determinant of the information."""
         return float(np.log(self.factor.numpy().diagonal()).sum())
 
     @cached_property
     def constants(self) -> ObjectArrays:
-        """What compiled loops are given of the object and the lenses; the same of all beliefs about them."""
+        """The object and the lenses as compiled loops need them; shared by all beliefs about them."""
         return ObjectArrays.of(self.obj, self.rig)
 
     def covariance(self) -> Tensor:
@@ -117,7 +117,7 @@ class RigBelief:
         return self.covariance().diagonal().clamp_min(0).sqrt().view(self.unit.shape)
 
     def scale_std(self) -> float:
-        """One standard deviation of the rig's size, relative: what lights say nothing about."""
+        """One standard deviation of the rig's relative size, which lights do not determine."""
         away = self.rig.positions - self.rig.positions.mean(0)
         by_step = torch.zeros_like(self.unit)
         by_step[:, 3:6] = away / away.square().sum()
@@ -127,18 +127,18 @@ class RigBelief:
 
     @property
     def pose_freedom(self) -> int:
-        """Numbers of the pose in a snapshot that are let free, at most: six, or a place for each light."""
+        """Maximum number of degrees of freedom of a snapshot's pose: six, or a position of each light."""
         return 3 * max(self.obj.num_fiducials, 2) if isinstance(self.obj, UnknownLights) else 6
 
     def points_at(self, rig_from_object: RigidTransform) -> Tensor:
-        """Where the fiducials of an object in poses (S,) are, or lights (S, N): (S, N, 3) mm in the rig's frame."""
+        """Fiducials of an object in poses (S,), or lights (S, N), in the rig's frame: (S, N, 3) mm."""
         if isinstance(self.obj, UnknownLights):
             return rig_from_object.translation
         return rig_from_object.apply(self.points_object)
 
     @property
     def points_object(self) -> Tensor:
-        """The fiducials as they are known now: (N, 3) mm."""
+        """The fiducials as currently estimated: (N, 3) mm."""
         if not len(self.object_offset):
             return self.obj.points
         offset = self.object_offset * object_prior_std(self.obj)
@@ -148,29 +148,29 @@ class RigBelief:
 
 @dataclass(frozen=True)
 class MeasurementUpdate:
-    """What some snapshots have taught."""
+    """The result of absorbing some snapshots."""
 
     belief: RigBelief
     rig_from_object: RigidTransform  # (S,) the object's poses; (S, N) of lights, see `UnknownLights`
     residual: Tensor  # (S, C, N, 2) pixels, predicted minus observed; zero where not seen
-    chi2: float  # sum of squared whitened residuals (robust), and of the change in standard deviations of the belief
-    dof: int  # 2 observations less the freedom of all poses: what chi2 is expected to be
-    evidence: float  # log probability of what was seen, up to what is the same for every belief before it (Laplace)
-    before: RigBelief  # what they were absorbed into
-    brought: SnapshotInformation  # what they say by themselves
+    chi2: float  # sum of squared whitened residuals (robust) and the squared whitened change of the belief
+    dof: int  # expected chi2: 2 per observation less the degrees of freedom of all poses
+    evidence: float  # log probability of the observations, up to a constant for every prior belief (Laplace)
+    before: RigBelief  # the belief before them
+    brought: SnapshotInformation  # their own information
 
     def of_last(self) -> MeasurementUpdate:
-        """The same, with pose and residual of the last snapshot alone: (1,) and (1, C, N, 2)."""
+        """The same, with the pose and residual of the last snapshot only: (1,) and (1, C, N, 2)."""
         return replace(self, rig_from_object=self.rig_from_object[-1:], residual=self.residual[-1:])
 
 
 def age_belief(belief: RigBelief, seconds: float, rate: DriftRate | Tensor) -> RigBelief:
-    """Know less of a rig after some time, over which every value took a random walk on its own.
+    """Lower the confidence in a rig after some time, in which every value took its own random walk.
 
     Args:
-        belief: what was known.
-        seconds: how long ago.
-        rate: of the walks; or the standard deviation (C, K) of each after an hour.
+        belief: at an earlier time.
+        seconds: since then.
+        rate: of the random walks; or the standard deviation (C, K) of each after an hour.
     """
     if seconds <= 0:
         return belief
@@ -180,14 +180,14 @@ def age_belief(belief: RigBelief, seconds: float, rate: DriftRate | Tensor) -> R
 
 
 def widen(belief: RigBelief, variance: Tensor) -> RigBelief:
-    """Know less of some parameters: add variances (C, K), in the units and order of `CameraRig.parameter_names`."""
+    """Add variances (C, K) to some parameters, in the units and order of `CameraRig.parameter_names`."""
     covariance = torch.cholesky_inverse(belief.factor)
     add_blocks(covariance, error_covariance(belief, variance))
     return replace(belief, factor=cholesky_factor(torch.cholesky_inverse(cholesky_factor(covariance))))
 
 
 def widen_along(belief: RigBelief, steps: Tensor) -> RigBelief:
-    """Know less along some changes of all cameras together, each by one standard deviation: steps (M, C, K)."""
+    """Add uncertainty along joint changes of all cameras, each one standard deviation long: steps (M, C, K)."""
     covariance = torch.cholesky_inverse(belief.factor)
     error = (_error_by_step(belief) @ steps[..., None]).flatten(1)
     wide = error.shape[1]
@@ -196,7 +196,7 @@ def widen_along(belief: RigBelief, steps: Tensor) -> RigBelief:
 
 
 def error_covariance(belief: RigBelief, variance: Tensor) -> Tensor:
-    """Covariance (C, K, K) of errors in units, of variances (C, K) of a camera's own parameters."""
+    """Covariance (C, K, K) of errors in units, from variances (C, K) of a camera's own parameters."""
     error_by_step = _error_by_step(belief)
     return error_by_step @ torch.diag_embed(variance) @ error_by_step.mT
 
@@ -206,10 +206,10 @@ def _error_by_step(belief: RigBelief) -> Tensor:
 
 
 def cholesky_factor(matrix: Tensor) -> Tensor:
-    """Factorize what is positive definite but for rounding.
+    """Factorize a matrix that is positive definite up to rounding.
 
     Raises:
-        RefusedError: it is not.
+        RefusedError: the matrix is not positive definite.
     """
     factor, failed = torch.linalg.cholesky_ex(matrix)
     if bool(failed):
@@ -218,5 +218,5 @@ def cholesky_factor(matrix: Tensor) -> Tensor:
 
 
 def whiten(step: Tensor, unit: Tensor) -> Tensor:
-    """Whitened offsets by errors in units, of the derivative of a step by an error: (C, K, K)."""
+    """Derivative of whitened offsets by errors in units, from that of a step by an error: (C, K, K)."""
     return step * unit[:, None, :] / unit[:, :, None]

@@ -42,7 +42,7 @@ def write_error(rotation, position, focal, principal, distortion, known_rig, uni
 @njit(cache=True, fastmath=kernels.FAST)
 def _logarithm(rotation, vector):  # noqa: ANN202
     """Write the rotation vector (3,) of a rotation (3, 3), like `rotations.vector_from_rotation`."""
-    # The quaternion's largest part first: exact near no rotation, and near half a turn.
+    # Start with the quaternion's largest part: it is exact near no rotation and near half a turn.
     trace = rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
     if trace >= 0:
         w = 1 + trace
@@ -82,7 +82,7 @@ def write_basis(rotation, position, unit, basis):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def times_basis(row, basis):
-    """Multiply a row (K,) by the steps by errors; columns from the fourth on are those of the unit matrix."""
+    """Multiply a row (K,) by the steps by errors, whose columns from the fourth on are those of the identity."""
     x, y, z = 0.0, 0.0, 0.0
     for i in range(6):
         x += row[i] * basis[i, 0]

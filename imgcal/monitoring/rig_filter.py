@@ -1,4 +1,4 @@
-"""Follow a rig in constant memory: `RigFilter`. What is learnt from a snapshot: `measurement_update.py`."""
+"""Track a rig in constant memory: `RigFilter`. `measurement_update.py` updates it with a snapshot."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belie
 from imgcal.types import CalibrationObject, CameraRig, DriftRate, Observations
 
 TOGETHER = (*range(2, 17), 20, 25, 32, 40, 50, 64, 80, 100, 128)
-"""Numbers of snapshots that are absorbed together once there are as many."""
+"""Numbers of snapshots at which all so far are absorbed together again."""
 MEMORY = TOGETHER[-1]
 YOUNG_SECONDS = 60.0
-"""Time over which a rig may be taken to stand still; what it wanders by then is far below the noise of a snapshot."""
+"""Time for which a rig may be assumed to stand still: its drift is far below the noise of a snapshot."""
 LEAST_SECONDS = 1.0
-"""Time that is worth an inversion of the information."""
+"""Minimum time worth an inversion of the information."""
 
 
 class RigFilter:
-    """Follows a rig, snapshot after snapshot, in constant memory.
+    """Tracks a rig in constant memory, snapshot by snapshot.
 
-    The first snapshots are kept, and absorbed again together while their number grows: what was linearized far from the
-    truth is so no more.
+    The first snapshots are kept and absorbed together again as their number grows: this removes errors of early
+    linearizations far from the truth.
 
     Examples:
         >>> import torch, imgcal
@@ -68,31 +68,31 @@ class RigFilter:
         start: tuple[RigBelief, int] | None = None,
         horizon: int | None = None,
     ) -> None:
-        """Begin with the factory calibration.
+        """Start with the factory calibration.
 
         Args:
             rig: the factory calibration, without batch axes.
             obj: the calibration object.
-            rate: how fast the rig wanders; None = as the rig says.
+            rate: drift rate of the rig; None = as in the rig.
             options: how to minimize.
-            prior_std: (C, K) how far the factory values may be off; None = as the rig says.
-            start: what a calibration has found, and from how many snapshots; None = nothing.
-            horizon: number of latest snapshots that count beside the factory calibration; None = all. With a horizon
-                the rig is taken to stand still within it, and is not believed to wander.
+            prior_std: (C, K) standard deviations of the factory values; None = as in the rig.
+            start: a calibration's result, and its number of snapshots; None = nothing.
+            horizon: number of latest snapshots that count beside the factory calibration; None = all. With a horizon,
+                the rig is assumed to stand still within it, and not to drift.
         """
         self.rate, self.options = rate or rig.drift_rate or DriftRate(), options
-        self.calibrated = start is not None  # it began with what a calibration has found
+        self.calibrated = start is not None  # it started with a calibration's result
         self.belief, self.count = start or (RigBelief.of_prior(rig, obj, prior_std), 0)  # and snapshots absorbed
         self._young = start is None  # the first snapshots are still kept
-        self.pace = torch.ones_like(self.belief.unit)  # (C, K) times the rate at which values are believed to wander
+        self.pace = torch.ones_like(self.belief.unit)  # (C, K) believed drift relative to `rate`
         self.horizon = None if horizon is None else Horizon(horizon, self.belief)
         self._first = self.belief
         self._early: list[tuple[Observations, RigidTransform]] = []
-        self._span = self._waited = 0.0  # s, since the first snapshot; of it, what the belief has not aged by
+        self._span = self._waited = 0.0  # s since the first snapshot; the part not yet aged by
 
     @property
     def walk(self) -> Tensor:
-        """How far every value is believed to wander in an hour, one standard deviation: (C, K)."""
+        """Believed drift of every value in an hour, one standard deviation: (C, K)."""
         return self.rate.std(self.belief.rig) * self.pace
 
     @property
@@ -102,18 +102,18 @@ class RigFilter:
 
     @property
     def waited(self) -> float:
-        """Time (s) by which the belief has not aged yet."""
+        """Time (s) for which the belief has not been aged yet."""
         return self._waited
 
     def update(
         self, observations: Observations, rig_from_object: RigidTransform, seconds: float = 0.0
     ) -> MeasurementUpdate:
-        """Learn from a snapshot; where it is refused, nothing is learnt, and its time counts for the next one.
+        """Learn from a snapshot; a refused one teaches nothing, and its time counts for the next one.
 
         Args:
             observations: (1, C, N).
             rig_from_object: (1,) first guess of the object's pose.
-            seconds: since the update before.
+            seconds: since the previous update.
 
         Raises:
             RefusedError: see `absorb`.
@@ -124,7 +124,7 @@ class RigFilter:
     def follow(
         self, observations: Observations, rig_from_object: RigidTransform, seconds: float = 0.0
     ) -> MeasurementUpdate:
-        """Do the work of `update`, and leave it to the caller to `relinearize` where that is `due`."""
+        """Do the work of `update`, except that the caller must call `relinearize` when `due`."""
         horizon, alone = self.horizon, None
         if horizon is not None and horizon.snapshots == 1 and self._early:
             alone = horizon.without(self.belief, shown(self._early), observations.seen[0].any(-1), self._first)
@@ -137,7 +137,7 @@ class RigFilter:
         if alone is not None and horizon is not None:
             self._first, horizon.away, self._early = alone.first, alone.away, []
         self.belief, self._waited, self.count = result.belief, self._waited - due, self.count + 1
-        still = self._span <= YOUNG_SECONDS or not any(vars(self.rate).values())  # a steady rig stands still for ever
+        still = self._span <= YOUNG_SECONDS or not any(vars(self.rate).values())  # a steady rig never moves
         self._young = self._young and (self.horizon is not None or (len(self._early) < MEMORY and still))
         if self._young:
             self._early.append((observations, result.rig_from_object))
@@ -146,7 +146,7 @@ class RigFilter:
         return result
 
     def rescale(self, ratio: Tensor) -> None:
-        """Change the standard deviations of the snapshots that are still kept by a factor (C,) for each camera."""
+        """Scale the standard deviations of the kept snapshots by a factor (C,) for each camera."""
         self._early = [
             (replace(observations, sigma=observations.sigma * ratio[:, None]), pose)
             for observations, pose in self._early
@@ -154,29 +154,29 @@ class RigFilter:
 
     @property
     def due(self) -> bool:
-        """Tell whether the snapshots that are kept are to be absorbed together now."""
+        """Tell whether to absorb the kept snapshots together now."""
         count, horizon = len(self._early), self.horizon
         if horizon is not None and count > horizon.snapshots:
             return count > horizon.most
         return count in TOGETHER
 
     def learnt_since(self, number: int) -> int:
-        """How many snapshots what is known rests on, of those from the one of a number on."""
+        """Number of snapshots from number `number` on that the belief rests on."""
         count = self.count - number
         return count if self.horizon is None else min(count, self.horizon.snapshots)
 
     def relinearize(self) -> MeasurementUpdate:
-        """Absorb the snapshots that are kept anew, all together, but those beyond the horizon.
+        """Absorb the kept snapshots again, all together, and forget those beyond the horizon.
 
         Returns:
-            What they teach; `rig_from_object` and `residual` are those of the last one.
+            The joint update; `rig_from_object` and `residual` are those of the last one.
         """
         horizon, start = self.horizon, None
         if horizon is not None:
-            start, gone = self.belief, self._early[: -horizon.snapshots]
+            start, forgotten = self.belief, self._early[: -horizon.snapshots]
             if len(self._early) > horizon.most:
                 self._early = self._early[-horizon.snapshots :]
-                left = horizon.without(self.belief, shown(gone), shown(self._early), self._first)
+                left = horizon.without(self.belief, shown(forgotten), shown(self._early), self._first)
                 self._first, horizon.away = left.first, left.away
         result = absorb(self._first, *stack_snapshots(self._early), self.options, start)
         self.belief, self._waited = age_belief(result.belief, self._span, self.walk), 0.0
@@ -185,10 +185,10 @@ class RigFilter:
     def restart(
         self, first: RigBelief, snapshots: Sequence[tuple[Observations, RigidTransform]], new: int = 0
     ) -> MeasurementUpdate:
-        """Begin anew: with what was believed before some snapshots, and these.
+        """Restart with an earlier belief and the snapshots since.
 
         Args:
-            first: what was believed before them.
+            first: the belief before the snapshots.
             snapshots: observations (1, C, N) and the object's pose (1,) of each.
             new: how many of them have not been absorbed before.
 
@@ -202,10 +202,10 @@ class RigFilter:
         return result
 
     def suppose(self, first: RigBelief, belief: RigBelief) -> None:
-        """Hold other beliefs: before the first snapshots that are kept, and now."""
+        """Replace the beliefs: before the first kept snapshot, and now."""
         self._first, self.belief, self._waited = first, belief, 0.0
 
 
 def shown(snapshots: Sequence[tuple[Observations, RigidTransform]]) -> Tensor:
-    """Tell which cameras see the object in some snapshots: (C,) bool."""
+    """Return which cameras see the object in some snapshots: (C,) bool."""
     return torch.cat([observations.seen for observations, _ in snapshots]).any(0).any(-1)

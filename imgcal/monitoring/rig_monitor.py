@@ -1,4 +1,4 @@
-"""A filter that notices when something changes, says what, and learns a camera anew while it keeps the others."""
+"""A filter that detects changes, reports their kind, and relearns the camera concerned while it keeps the others."""
 
 from __future__ import annotations
 
@@ -39,27 +39,27 @@ from imgcal.monitoring.unsynchronized_cameras import drop_cameras
 from imgcal.types import Observations
 
 FEW_SNAPSHOTS = 16
-"""Snapshots up to which what was known before a change is too little to go by: it bends, within what it leaves open, by
-more than it says, and others would be blamed. What came before is then forgotten ..."""
+"""With at most so many snapshots before a change, the earlier knowledge is unreliable: it bends by more than its stated
+uncertainty, and the wrong camera would be blamed. It is then forgotten ..."""
 OBJECT_SNAPSHOTS = 8
-"""... and no change of the object is looked for before so many have been learnt."""
+"""... and a change of the object is not considered before so many snapshots have been absorbed."""
 UNDECIDED_SNAPSHOTS = 16
-"""Snapshots for which a camera is in doubt that seemed to have moved, and of which nothing could be decided."""
+"""Snapshots for which a camera stays in doubt that seemed to have moved without a decision."""
 SETTLED_SNAPSHOTS, LEAST_AGAIN = 16, 8
-"""Snapshots within which a camera does not move twice without a doubt, and those that decide what it does instead: a
-late camera looks moved in any two snapshots in a row, and in no eight."""
+"""A second move of a camera within so many snapshots is doubted, and so many snapshots are needed to decide: a late
+camera seems to have moved in any two successive snapshots, but not in eight."""
 
 
 @dataclass(frozen=True)
 class MonitorUpdate:
-    """What a snapshot taught, and what became known with it."""
+    """The result of a snapshot's update, and the changes found with it."""
 
     update: MeasurementUpdate  # with the pose (1,) and the residual (1, C, N, 2) of the latest snapshot
-    changes: tuple[Change, ...] = ()  # of cameras: first that there is one, then of which kind it is
+    changes: tuple[Change, ...] = ()  # of cameras: first detected, later with their kind
     slips: tuple[ClockSlip, ...] = ()
-    unsynchronized: tuple[int, ...] = ()  # cameras that see the object at moments of their own
+    unsynchronized: tuple[int, ...] = ()  # unsynchronized cameras
     object_change: ObjectChange | None = None
-    restarted: bool = False  # nothing that was known before a change counts any more
+    restarted: bool = False  # the knowledge before a change was discarded
 
 
 class RigMonitor:
@@ -92,13 +92,13 @@ class RigMonitor:
     }
 
     def __init__(self, rig_filter: RigFilter) -> None:
-        """Watch over a filter, which is to be updated by this monitor alone from now on."""
+        """Monitor a filter; from now on, only this monitor may update it."""
         self.filter = rig_filter
-        self.open: dict[int, Change] = {}  # changes whose kind is not decided yet, by camera
-        self.undecided: dict[int, int] = {}  # cameras that seem to have moved, and for how many snapshots yet
-        self.quarantine = Quarantine()  # cameras that see the object elsewhere, until it is known why
+        self.open: dict[int, Change] = {}  # changes of a still undecided kind, by camera
+        self.undecided: dict[int, int] = {}  # cameras in doubt, and their remaining snapshots
+        self.quarantine = Quarantine()  # cameras that see the object in the wrong place
         self.shaking = ShakeLevel(rig_filter.belief.rig.num_cameras)
-        self.known_since = 0  # number of the first snapshot that what is known rests on
+        self.known_since = 0  # number of the first snapshot that counts
         self._diagnosis = Diagnosis()
         self._misfit = Misfit()
         self.noise = NoiseCorrelation(rig_filter.belief.rig.num_cameras)
@@ -106,9 +106,9 @@ class RigMonitor:
         self._drifting = DriftLearning(DriftPaces(rig_filter.belief.rig.num_cameras))
         self._pending: PendingChange | None = None
         self._prior = rig_filter.belief
-        self._moved_early: set[int] = set()  # cameras of which the factory knows nothing more
-        self._moved_at: dict[int, int] = {}  # snapshots learnt when it was last said of a camera that it had moved
-        self._suspect: int | None = None  # the camera without which the last snapshot would not have been refused
+        self._moved_early: set[int] = set()  # cameras that have left their factory poses
+        self._moved_at: dict[int, int] = {}  # filter count at the last reported move
+        self._suspect: int | None = None  # the camera that caused the last snapshot to be refused
 
     def update(
         self,
@@ -122,15 +122,15 @@ class RigMonitor:
         Args:
             observations: (1, C, N).
             rig_from_object: (1,) first guess of the object's pose.
-            seconds: since the update before.
-            moved: cameras that are known to have moved before this snapshot, how far they may.
+            seconds: since the previous update.
+            moved: cameras that are known to have moved before this snapshot, by any distance.
 
         Returns:
-            What was learnt, and what became known.
+            The update, and the changes found.
 
         Raises:
-            RefusedError: see `absorb`. What no minimum is found for, but for one camera, is refused once; if the next
-                snapshot says the same, that camera has moved.
+            RefusedError: see `absorb`. If a single camera prevents a minimum, the snapshot is refused once; if the next
+                snapshot agrees, that camera has moved.
         """
         self.undecided = {camera: left - 1 for camera, left in self.undecided.items() if left > 1}
         given = observations
@@ -151,7 +151,7 @@ class RigMonitor:
         return found
 
     def _follow_noise(self, observations: Observations, residual: Tensor) -> None:
-        """Measure by a snapshot that nothing is wrong with how much cameras shake, and how long their errors last."""
+        """Update shake levels and error correlation times from a snapshot without suspicion."""
         self.shaking.observe(observations, residual)
         before = self.noise.time
         self.noise.add(observations, residual)
@@ -160,11 +160,11 @@ class RigMonitor:
             self.filter.rescale((self.noise.time / before).sqrt())
 
     def _is_new(self, age: int = 0) -> bool:
-        """Tell whether hardly anything was known of the rig before the latest `age` snapshots."""
+        """Tell whether hardly anything was known about the rig before the latest `age` snapshots."""
         return self.filter.learnt_since(self.known_since) - age < FEW_SNAPSHOTS
 
     def _follow(self, observations: Observations, rig_from_object: RigidTransform, seconds: float) -> MonitorUpdate:
-        """Learn from a snapshot, and test whether something has changed before it.
+        """Learn from a snapshot, and test for a change before it.
 
         Raises:
             RefusedError: see `update`.
@@ -191,7 +191,7 @@ class RigMonitor:
             return anew
         changes: list[Change] = []
         if alarm is not None:
-            with contextlib.suppress(RefusedError):  # what cannot be decided or learnt is tested with the next snapshot
+            with contextlib.suppress(RefusedError):  # undecided: test again with the next snapshot
                 anew = self._diagnose_alarm(alarm, changes)
                 self.undecided = {}
                 return replace(anew, changes=(*changes, *anew.changes))
@@ -210,24 +210,24 @@ class RigMonitor:
     def _follow_beside_quarantine(
         self, observations: Observations, rig_from_object: RigidTransform, seconds: float
     ) -> MonitorUpdate:
-        """Learn from a snapshot without the cameras in quarantine, and diagnose these.
+        """Learn from a snapshot without the cameras in quarantine, and diagnose those.
 
         Raises:
             RefusedError: see `update`.
         """
         quarantine, cameras = self.quarantine, set(self.quarantine.cameras)
         found = self._follow(drop_cameras(observations, cameras), rig_from_object, seconds)
-        if not quarantine.cameras or quarantine.cameras != cameras:  # those that are new have seen it already
+        if not quarantine.cameras or quarantine.cameras != cameras:  # new ones have seen it already
             return found
         snapshot = observations, found.update.rig_from_object[-1:]
         episode = max(self.noise.episode(camera, _shift(found.update.belief, snapshot, camera)) for camera in cameras)
         if quarantine.observe(observations, seconds, episode):
-            with contextlib.suppress(RefusedError):  # it cannot be decided yet, or they do not see enough
+            with contextlib.suppress(RefusedError):  # undecided, or they do not see enough
                 found = self._diagnose_quarantine(found)
         return replace(found, unsynchronized=quarantine.report_unsynchronized())
 
     def _shows_move(self, case: Case) -> bool:
-        """Tell whether the image of some suspected camera is shifted by clearly more than errors that last."""
+        """Tell whether a suspected camera's image is shifted by clearly more than persistent errors."""
         least = self.noise.least_shifts
         for camera in case.cameras:
             seen = [one for one in case.latest if bool(one[0].seen[0, camera].any())]
@@ -237,10 +237,10 @@ class RigMonitor:
         return False
 
     def _diagnose_quarantine(self, found: MonitorUpdate) -> MonitorUpdate:
-        """Find out what has happened to the cameras in quarantine, and learn them anew where they have moved.
+        """Diagnose the cameras in quarantine, and relearn them if they have moved.
 
         Raises:
-            RefusedError: it cannot be decided yet, or they do not see enough.
+            RefusedError: the case cannot be decided yet, or the cameras do not see enough.
         """
         quarantine = self.quarantine
         case = quarantine.case(self._recent, self.filter.options, self.noise.correlated)
@@ -251,7 +251,8 @@ class RigMonitor:
             return found
         quarantine.release()
         if verdict.harmless and self._pending is None:
-            # What was known leaves room for it, so it is learnt as any snapshot is: else it would be asked for ever.
+            # The belief allows for it, so learn it like any other snapshot. Otherwise the question would never be
+            # settled.
             quiet = verdict.explained[Steady.name]
             return MonitorUpdate(self._restart(quiet.before, quiet.snapshots, case.pauses[-case.count :]))
         if verdict.best.name == Moved.name and self._shows_move(case):
@@ -261,21 +262,21 @@ class RigMonitor:
         return replace(found, slips=self._clock_slips(verdict))
 
     def _diagnose_alarm(self, age: int, changes: list[Change]) -> MonitorUpdate:
-        """Find out what has happened before the latest snapshots, since which cameras seem to have changed.
+        """Diagnose what has happened before the latest snapshots, since which cameras seem to have changed.
 
         Args:
             age: number of these snapshots.
-            changes: those that are decided meanwhile are added.
+            changes: changes decided on the way are appended.
 
         Raises:
-            RefusedError: it cannot be decided yet, or learnt.
+            RefusedError: the case cannot be decided yet, or the snapshots cannot be learnt.
         """
         free: dict[int, str | None] = {}
         pending, test = self._pending, self._recent.test(age)
         age = likeliest_age(self._recent, likeliest_camera(test), age)
-        if pending is not None and age >= pending.count - NEARBY_SNAPSHOTS:  # it was then that the open ones changed
+        if pending is not None and age >= pending.count - NEARBY_SNAPSHOTS:  # the pending changes happened then
             again = likeliest_camera(self._recent.test(age)) in pending.kinds
-            # Again: the first snapshots were from the old place.
+            # A second change: the first snapshots were taken from the old pose.
             age = age if again else min(pending.count, len(self._recent))
             before, seconds, free = pending.before, pending.seconds, dict(pending.kinds)
         else:
@@ -283,7 +284,7 @@ class RigMonitor:
             before, seconds = self._recent.belief_before(age), self._recent.seconds(age)
         excluded = {Steady.name: "a test of every camera has excluded it"}
         if pending is not None and free:
-            excluded[ObjectChanged.name] = "a change of a camera is open"
+            excluded[ObjectChanged.name] = "a change of a camera is pending"
         free, evidence = changed_cameras(self._recent.test(age), free, self.noise.least_shifts)
         self.undecided |= dict.fromkeys(free, UNDECIDED_SNAPSHOTS)
         if self._is_new(age):
@@ -298,14 +299,14 @@ class RigMonitor:
         return self._learn_moved(case, free, LARGE, seconds, evidence)
 
     def _moved_lately(self, camera: int) -> bool:
-        """Tell whether it was said of a camera not long ago that it had moved."""
+        """Tell whether a move of a camera was reported recently."""
         return camera in self._moved_at and self.filter.count - self._moved_at[camera] < SETTLED_SNAPSHOTS
 
     def _doubt(self, case: Case, cameras: Sequence[int]) -> MonitorUpdate:
-        """Put cameras into quarantine that seem to move again and again: two snapshots cannot tell why, eight can.
+        """Quarantine cameras that seem to move again and again: two snapshots cannot tell why, eight can.
 
         Raises:
-            RefusedError: see `absorb`; the monitor stays as it was.
+            RefusedError: see `absorb`; the monitor is unchanged.
         """
         new, pauses = self._is_new(case.count), case.pauses[-case.count :]
         anywhere = dict.fromkeys(cameras)
@@ -319,7 +320,7 @@ class RigMonitor:
         return MonitorUpdate(result)
 
     def _case(self, before: RigBelief, age: int, cameras: tuple[int, ...], excluded: Mapping[str, str]) -> Case:
-        """Put together a case of cameras that seem to have moved before the latest `age` snapshots."""
+        """Make a case of cameras that seem to have moved before the latest `age` snapshots."""
         kept = len(self._recent)
         everything = self.filter.count - self.known_since == kept
         beginning = self._anywhere(self._moved_early) if everything else None
@@ -330,11 +331,11 @@ class RigMonitor:
         )  # fmt: skip
 
     def _adopt(self, case: Case, verdict: Verdict, new: bool = False) -> MonitorUpdate:
-        """Learn snapshots anew as the best explanation has them.
+        """Learn snapshots again according to the best explanation.
 
         Args:
-            case: what was explained.
-            verdict: how.
+            case: the explained case.
+            verdict: its explanations.
             new: the filter has not absorbed these snapshots before.
 
         Raises:
@@ -355,7 +356,7 @@ class RigMonitor:
         return MonitorUpdate(result, slips=self._clock_slips(verdict), object_change=change)
 
     def _clock_slips(self, verdict: Verdict) -> tuple[ClockSlip, ...]:
-        """The slips of clocks that a verdict has found among the latest snapshots."""
+        """Clock slips that a verdict has found in the latest snapshots."""
         since = self.filter.count - len(verdict.best.snapshots)
         return tuple(replace(slip, since=since, odds=verdict.lead) for slip in verdict.best.finding.slips)
 
@@ -367,19 +368,19 @@ class RigMonitor:
         seconds: float,
         evidence: Mapping[int, float] = MappingProxyType({}),
     ) -> MonitorUpdate:
-        """Learn the latest snapshots of a case anew, with cameras that have moved before them.
+        """Learn a case's latest snapshots again, with cameras that moved before them.
 
-        Where hardly anything had been learnt before, only what the factory says is kept of that time.
+        If hardly anything was known before, only the factory calibration is kept from that time.
 
         Args:
-            case: those snapshots, and what was believed before them.
-            free: the cameras, and how they moved, None = in any way.
-            jump: pixels by which they may have.
-            seconds: since the snapshot before.
-            evidence: chi-squared of each camera that has not moved.
+            case: the snapshots and the belief before them.
+            free: the cameras, and how they moved (None = in any way).
+            jump: pixels by which they may have moved.
+            seconds: since the previous snapshot.
+            evidence: chi-squared of "it has not moved", by camera.
 
         Raises:
-            RefusedError: see `absorb`; the monitor stays as it was.
+            RefusedError: see `absorb`; the monitor is unchanged.
         """
         forget, nan, horizon = self._is_new(case.count), math.nan, self.filter.horizon
         early = self._moved_early | free.keys()
@@ -403,13 +404,13 @@ class RigMonitor:
         return MonitorUpdate(result, tuple(new.values()))
 
     def _anywhere(self, cameras: Collection[int]) -> RigBelief:
-        """What the factory says of a rig in which some cameras may be anywhere."""
+        """The factory calibration with some cameras unconstrained."""
         return free_cameras(self._prior, dict.fromkeys(sorted(cameras)), JUMPS[-1])
 
     def _begin_pending(
         self, result: MeasurementUpdate, before: RigBelief, seconds: float, kinds: dict[int, str | None]
     ) -> None:
-        """Wait until the kinds of changes can be decided; beyond the horizon nothing more comes to decide them by."""
+        """Wait until the kinds of changes can be decided, but not beyond the horizon: no more evidence comes then."""
         self._pending = PendingChange.of(result, before, seconds, kinds)
         if self.filter.horizon is not None:
             self._pending.most = min(self._pending.most, self.filter.horizon.snapshots)
@@ -420,13 +421,13 @@ class RigMonitor:
         """Restart the filter with the latest snapshots.
 
         Args:
-            before: what was believed before them.
+            before: the belief before them.
             snapshots: observations (1, C, N) and the object's pose (1,) of each.
             pauses: s before each of them.
             new: the filter has not absorbed them before.
 
         Raises:
-            RefusedError: see `absorb`; the monitor stays as it was.
+            RefusedError: see `absorb`; the monitor is unchanged.
         """
         result = self.filter.restart(before, snapshots, new=len(snapshots) if new else 0)
         self._recent = RecentSnapshots(result.belief, self.filter.walk, self.noise.model_error)
@@ -434,17 +435,17 @@ class RigMonitor:
         return result
 
     def _diagnose_misfit(self, age: int) -> MonitorUpdate | None:
-        """Learn the object anew where the latest snapshots fit worse because it has changed."""
+        """Learn the object again if it has changed and the latest snapshots therefore fit worse."""
         age = min(age, len(self._recent))
         if self.filter.learnt_since(self.known_since) - age < OBJECT_SNAPSHOTS:
             return None
-        with contextlib.suppress(RefusedError):  # nothing was known of the rig
+        with contextlib.suppress(RefusedError):  # nothing was known about the rig
             before = self._recent.belief_before(age)
             return self._adopt_object(before, self._recent.snapshots(age), self._recent.pauses(age))
         return None
 
     def _diagnose_first_misfit(self, result: MeasurementUpdate) -> MonitorUpdate | None:
-        """Learn the object anew where it never was as its file says, and so the first snapshots do not fit."""
+        """Learn the object again if it never matched its file and the first snapshots therefore do not fit."""
         count = self.filter.count
         first = not self.known_since and self._pending is None and len(self._recent) == count
         if not first or not has_never_fitted(result, count):
@@ -454,20 +455,20 @@ class RigMonitor:
     def diagnose_object(
         self, snapshots: Sequence[Snapshot], pauses: Sequence[float], learnt: bool
     ) -> MonitorUpdate | None:
-        """Find out whether labels do not fit because the object has changed, and learn it anew then.
+        """Diagnose whether labels do not fit because the object has changed, and learn it again if so.
 
         Args:
-            snapshots: observations (1, C, N), with those labels, and poses (1,): the latest ones.
+            snapshots: observations (1, C, N) with those labels, and poses (1,), of the latest snapshots.
             pauses: s before each of them.
-            learnt: they have been learnt without those labels; else not at all.
+            learnt: the snapshots were absorbed without those labels; otherwise not at all.
 
         Returns:
-            What they taught, and how it has changed; None = the object is as it was.
+            The update and the change of the object; None = the object has not changed.
         """
         if self._pending is not None or (learnt and len(self._recent) < len(snapshots)):
             return None
         found = None
-        with contextlib.suppress(RefusedError):  # nothing was known of the rig
+        with contextlib.suppress(RefusedError):  # nothing was known about the rig
             if learnt:
                 before = self._recent.belief_before(len(snapshots))
             else:
@@ -476,14 +477,14 @@ class RigMonitor:
         return None if found is None else replace(found, update=found.update.of_last())
 
     def quarantine_doubtful(self, snapshots: Sequence[Snapshot], pauses: Sequence[float]) -> tuple[int, ...]:
-        """Put cameras into quarantine because of which labels fit in most cameras no more.
+        """Quarantine the cameras because of which labels no longer fit in most cameras.
 
         Args:
-            snapshots: observations (1, C, N), with those labels, and poses (1,): of the latest ones, not learnt.
+            snapshots: observations (1, C, N) with those labels, and poses (1,), of the latest snapshots; not absorbed.
             pauses: s before each of them.
 
         Returns:
-            Those that are new there.
+            The newly quarantined cameras.
         """
         if self._pending is not None:
             return ()
@@ -501,10 +502,10 @@ class RigMonitor:
     def _adopt_object(
         self, before: RigBelief, snapshots: Sequence[Snapshot], pauses: Sequence[float], new: bool = False
     ) -> MonitorUpdate | None:
-        """Learn the object anew where a change of it explains some snapshots, which the filter has absorbed or are new.
+        """Learn the object again if its change explains some snapshots; `new`: the filter has not absorbed them.
 
         Returns:
-            What was learnt; None = it does not, or cannot be learnt.
+            The update; None = the change does not explain them, or cannot be learnt.
         """
         case = Case(before, snapshots, pauses, len(snapshots), self.filter.options)
         with contextlib.suppress(RefusedError):  # nothing explains these snapshots
@@ -515,7 +516,7 @@ class RigMonitor:
         return None
 
     def _decide_kinds(self, last: bool) -> tuple[Change, ...]:
-        """Decide what kind of change each open one is, where the snapshots since can tell, or it is time."""
+        """Decide the kinds of pending changes where the snapshots since allow it, or it is time."""
         pending = self._pending
         if pending is None:
             return ()
@@ -533,7 +534,7 @@ class RigMonitor:
 
 
 def _shift(belief: RigBelief, snapshot: Snapshot, camera: int) -> float:
-    """Median distance (px) along both axes of what a camera sees in a snapshot from where it should be."""
+    """Median distance (px), over both axes, between observed and predicted blobs of a camera."""
     observations, pose = snapshot
     seen = observations.seen[0, camera]
     off = (observations.uv[0, camera] - project_fiducials(belief, pose, camera)[0])[seen]

@@ -1,7 +1,7 @@
-"""Do cameras shake? A fan, a floor, a trigger that jitters: all that a camera sees in a snapshot is shifted alike.
+"""Shaking cameras (a fan, a floor, trigger jitter): all blobs of a camera share one random shift per snapshot.
 
-Such noise does not average out over the points of a snapshot. Taken for noise of each point by itself, it looks like
-cameras that move, over and over, and like a rig that is known better than it is.
+Such noise does not average out over the points of a snapshot. If it is treated as independent noise of each point, the
+cameras seem to move over and over, and the rig's uncertainty is underestimated.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from imgcal.monitoring.rig_belief import MeasurementUpdate
 from imgcal.types import Observations
 
 SHAKES = (0.15, 0.5, 1.5)
-"""Pixels, one standard deviation: by how much cameras may shake. What shakes by more counts as moved."""
+"""Pixels, one standard deviation: candidate shake levels. A camera that shakes more than that counts as moved."""
 EVERY = 64
-"""Snapshots after which the level is estimated anew."""
+"""Number of snapshots between estimates of the level."""
 OTHER = 2.0
-"""Factor between two variances that are told apart; 1.3 comes by chance."""
+"""Minimum ratio of variances that counts as different; 1.3 occurs by chance."""
 LEAST_POINTS = 3
-"""That a camera sees, from which they can be shifted alike."""
+"""Minimum number of points in a camera that show a shared shift."""
 LEAST_SHIFTS, SMOOTH = 4, 0.7
-"""Snapshots that tell whether shifts follow each other smoothly, as a clock that is off would have it; and von
-Neumann's ratio (2 where each is drawn by itself) below which they do."""
+"""Number of snapshots that show whether shifts are smooth, as with a clock offset, and the upper limit of von Neumann's
+ratio (2 for independent shifts) for that."""
 
 
 class Shaking(Explanation):
-    """All cameras shake, or the suspected ones: by each of `SHAKES`."""
+    """All cameras shake, or the suspected ones, by each of `SHAKES`."""
 
     name = "shaking"
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
-        """Let all that a camera sees in a snapshot be shifted alike."""
+        """Allow a shared shift of a camera's blobs in each snapshot."""
         every = tuple(range(case.before.rig.num_cameras))
         sets = dict.fromkeys((every, tuple(sorted(case.cameras)) or every))
         return [
@@ -50,14 +50,14 @@ class Shaking(Explanation):
         ]
 
     def premature(self, case: Case, found: Explained) -> str | None:
-        """Wait for several shifts: one shift twice is no random one, and a late clock shifts smoothly."""
+        """Wait for several shifts: the same shift twice is not random, and a late clock shifts smoothly."""
         if case.count < LEAST_SHIFTS:
             return "too few snapshots to call their shifts random"
         return "too little was seen before to exclude a late clock" if case.too_early else None
 
 
 def shake_cameras(start: Start, cameras: Sequence[int], size: float) -> Variant:
-    """Let cameras shake by so many pixels, or by more where that is known."""
+    """Let cameras shake by so many pixels, or by more if they are known to."""
     snapshots = []
     for one, pose in start.snapshots:
         shake = torch.zeros(1, one.seen.shape[1], dtype=torch.float64) if one.shake is None else one.shake.clone()
@@ -67,21 +67,21 @@ def shake_cameras(start: Start, cameras: Sequence[int], size: float) -> Variant:
 
     def find(result: MeasurementUpdate) -> Finding:
         if _smooth(shared_shifts(observations, result.residual)[0][:, shake[0].numpy() > 0]):
-            raise RefusedError("the shifts follow each other smoothly, as those of a late clock do")
+            raise RefusedError("the shifts are smooth, like those of a late clock")
         return Finding(shake=shake[0])
 
     return Variant(start.before, snapshots, start.log_prior, find=find)
 
 
 def shared_shifts(observations: Observations, residual: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """By how much all that a camera sees in a snapshot is off, and how much of that noise makes.
+    """Shared shift of a camera's blobs in a snapshot, and its variance by noise.
 
     Args:
         observations: (S, C, N).
         residual: (S, C, N, 2) pixels.
 
     Returns:
-        Weighted means (S, C, 2) of the residuals, and the variance (S, C) that noise gives each of their axes.
+        Weighted means (S, C, 2) of the residuals, and the variance (S, C) of each of their axes by noise.
     """
     weight = np.where(observations.seen.numpy(), observations.sigma.numpy() ** -2.0, 0.0)
     total = np.maximum(weight.sum(-1), 1e-12)
@@ -89,7 +89,7 @@ def shared_shifts(observations: Observations, residual: Tensor) -> tuple[NDArray
 
 
 def _smooth(shifts: NDArray[np.float64]) -> bool:
-    """Tell whether shifts (S, C, 2) follow each other smoothly."""
+    """Tell whether successive shifts (S, C, 2) are smooth."""
     if len(shifts) < LEAST_SHIFTS:
         return False
     about = np.square(shifts - shifts.mean(0)).sum()
@@ -98,7 +98,7 @@ def _smooth(shifts: NDArray[np.float64]) -> bool:
 
 @dataclass
 class ShakeLevel:
-    """By how much each camera shakes, followed by what single snapshots leave.
+    """How much each camera shakes, estimated from the residuals of single snapshots.
 
     Examples:
         >>> level = ShakeLevel(2)
@@ -111,20 +111,20 @@ class ShakeLevel:
     latest: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=EVERY))  # (3, C): see `take`
 
     def __post_init__(self) -> None:
-        """Begin with cameras that stand still."""
+        """Start with cameras that stand still."""
         self.shake = torch.zeros(self.cameras, dtype=torch.float64)
 
     def apply_to(self, observations: Observations) -> Observations:
-        """Observations (1, C, N) with what is known of it."""
+        """Add the shake levels to observations (1, C, N)."""
         return replace(observations, shake=self.shake[None]) if bool(self.shake.any()) else observations
 
     def believe(self, shake: Tensor) -> None:
-        """Begin anew with what has been found out otherwise: (C,) pixels."""
+        """Restart with levels (C,) in pixels from another source."""
         self.shake = shake
         self.latest.clear()
 
     def observe(self, observations: Observations, residual: Tensor) -> None:
-        """Take what a snapshot without any suspicion has left: (1, C, N) and pixels (1, C, N, 2)."""
+        """Take the residuals of a snapshot without suspicion: (1, C, N) and pixels (1, C, N, 2)."""
         (shift,), (variance,) = shared_shifts(observations, residual)
         both = np.concatenate((shift.T, variance[None]))
         both[:, observations.seen[0].sum(1).numpy() < LEAST_POINTS] = np.nan
@@ -133,15 +133,15 @@ class ShakeLevel:
             self._ask()
 
     def _ask(self) -> None:
-        """Ask how large shifts are against what noise makes of them."""
+        """Estimate the levels by comparing shifts with those expected from noise."""
         known = np.stack(self.latest)
         self.latest.clear()
         often = np.isfinite(known[:, 0]).sum(0) > EVERY // 2
         if not often.any():
             return
         found, expected = np.full((2, self.cameras), np.nan)
-        # The mean square of two coordinates is exponential; where the object is moved takes some of the shifts. What
-        # stays the same is no shaking.
+        # The mean square of two coordinates has an exponential distribution. The object's pose absorbs a part of the
+        # shifts. A constant shift is not shaking.
         free = max(1 - 1.5 / self.cameras, 0.25)
         shifts = known[:, :2, often] - np.nanmedian(known[:, :2, often], axis=0)
         found[often] = np.nanmedian(np.square(shifts).mean(1), axis=0) / (math.log(2) * free)

@@ -1,8 +1,8 @@
-"""Does a camera that stands where it was see the object at moments of its own? Then it sees it elsewhere each time.
+"""Unsynchronized cameras: one that has not moved sees the object at its own times, so in a different place each time.
 
-A camera whose clock is off by more than anybody can say how the object moves, or whose snapshots are too far apart for
-that, is supposed to be where it was, and to see the object in a pose of its own in every snapshot. One change of the
-camera explains one such pose as well, and not several: two or three snapshots tell, at any rate and for any slip.
+If a clock is off by so much that the object's motion cannot be extrapolated, or if snapshots are too far apart for
+that, assume that the camera has not moved and sees the object in an independent pose in every snapshot. A single change
+of the camera also explains one such pose, but not several: two or three snapshots decide, at any rate and for any slip.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
 from imgcal.types import Observations
 
 ELSEWHERE = (0.2,) * 3 + (50.0,) * 3
-"""Standard deviations of the pose (rad, mm) in which such a camera sees the object, about that of the others."""
+"""Standard deviations of the object's pose (rad, mm) as seen by such a camera, relative to the other cameras."""
 NUDGE = (1e-5,) * 3 + (1e-3,) * 3
-"""By which a pose is changed for derivatives (rad, mm)."""
+"""Steps of a pose for numerical derivatives (rad, mm)."""
 LEAST_SNAPSHOTS = 2
-"""Snapshots that tell a camera that has moved from one with moments of its own: one explains any pose of the object."""
+"""Snapshots needed to tell an unsynchronized camera from a moved one: a move explains any single pose."""
 
 
 class Unsynchronized(Explanation):
-    """The suspected cameras, or the surest alone, see the object at moments of their own."""
+    """The suspected cameras, or the most likely one alone, are unsynchronized."""
 
     name = "unsynchronized"
 
     def variants(self, case: Case) -> Sequence[Callable[[], Variant]]:
-        """Let the cameras see the object in poses of their own."""
+        """Let the cameras see the object in their own poses."""
         case.require_body()
         if case.count < LEAST_SNAPSHOTS:
-            raise RefusedError("a single snapshot is explained by a move as well")
+            raise RefusedError("a move explains a single snapshot equally well")
         return [partial(_unsynchronize, case, start, cameras) for start in case.starts for cameras in case.camera_sets]
 
 
 def _unsynchronize(case: Case, start: Start, cameras: tuple[int, ...]) -> Variant:
-    """Suppose that some cameras see the object at moments of their own."""
+    """Suppose that some cameras are unsynchronized."""
     snapshots = [(drop_cameras(one, cameras), pose) for one, pose in start.snapshots]
     own = partial(_evidence_of_own_poses, stack_snapshots(start.snapshots)[0], cameras, case.options)
     return Variant(start.before, snapshots, start.log_prior, own, lambda _: Finding(unsynchronized=cameras))
@@ -57,17 +57,17 @@ def unsynchronized_evidence(
     cameras: Collection[int],
     options: EstimationOptions,
 ) -> float:
-    """Log probability of snapshots in which some cameras see the object at moments of their own.
+    """Log probability of snapshots with unsynchronized cameras.
 
     Args:
-        before: what was believed before them.
+        before: the belief before them.
         observations: (S, C, N).
         rig_from_object: (S,) poses of the object, as most cameras see it.
-        cameras: those with moments of their own, each.
+        cameras: the unsynchronized cameras, each with its own times.
         options: how to minimize.
 
     Returns:
-        What is comparable with `MeasurementUpdate.evidence` of the same snapshots.
+        Evidence, comparable with `MeasurementUpdate.evidence` of the same snapshots.
 
     Raises:
         RefusedError: the other cameras do not determine poses.
@@ -79,13 +79,13 @@ def unsynchronized_evidence(
 def _evidence_of_own_poses(
     observations: Observations, cameras: Collection[int], options: EstimationOptions, result: MeasurementUpdate
 ) -> float:
-    """Log probability of what cameras with moments of their own see, given what the others taught.
+    """Log probability of what unsynchronized cameras see, given the update by the others.
 
     Args:
         observations: (S, C, N).
-        cameras: those with moments of their own, each.
+        cameras: the unsynchronized cameras, each with its own times.
         options: how to minimize.
-        result: the same snapshots without these cameras, absorbed.
+        result: the update by the same snapshots without these cameras.
 
     Raises:
         RefusedError: the other cameras do not determine poses.
@@ -93,7 +93,7 @@ def _evidence_of_own_poses(
     poses, evidence = result.rig_from_object, 0.0
     others = _pose_information(result.belief, drop_cameras(observations, cameras), poses)
     every = _pose_information(result.belief, observations, poses)
-    evidence += 0.5 * float((torch.logdet(every) - torch.logdet(others)).sum())  # `absorb` leaves out what all share
+    evidence += 0.5 * float((torch.logdet(every) - torch.logdet(others)).sum())  # `absorb` leaves out shared terms
     for camera in cameras:
         rest = [other for other in range(observations.seen.shape[1]) if other != camera]
         alone = drop_cameras(observations, rest)
@@ -108,7 +108,7 @@ def _evidence_of_own_poses(
 
 
 def _are_determined(information: Tensor) -> Tensor:
-    """Tell which poses, of information (S, 6, 6), are known better than from those of the other cameras: (S,)."""
+    """Return which poses, with information (S, 6, 6), are known better than from the other cameras: (S,)."""
     spread = torch.tensor(ELSEWHERE, dtype=torch.float64)
     return torch.linalg.eigvalsh(spread[:, None] * information * spread)[:, 0] > 1
 
@@ -116,13 +116,13 @@ def _are_determined(information: Tensor) -> Tensor:
 def _evidence_of_sure_poses(
     alone: Observations, options: EstimationOptions, belief: RigBelief, there: RigidTransform
 ) -> float:
-    """Log probability of what one camera sees (S, C, N), poses (S,) being fitted that lie about `there`."""
+    """Log probability of a camera's observations (S, C, N), with poses (S,) fitted around `there`."""
     own = absorb(belief, alone, there, options)
     information = _pose_information(own.belief, alone, own.rig_from_object)
     turn = vector_from_rotation(own.rig_from_object.rotation @ there.rotation.mT)
     way = torch.cat((turn, own.rig_from_object.translation - there.translation), -1)
     spread = torch.tensor(ELSEWHERE, dtype=torch.float64)
-    scatter = spread.square().diag() + torch.linalg.inv(information)  # of the pose about that of the others
+    scatter = spread.square().diag() + torch.linalg.inv(information)  # of the pose relative to the other cameras' pose
     squared = (way * torch.linalg.solve(scatter, way[..., None])[..., 0]).sum(-1)
     return own.evidence - 0.5 * float((torch.logdet(scatter) + torch.logdet(information) + squared).sum())
 
@@ -130,7 +130,7 @@ def _evidence_of_sure_poses(
 def _evidence_of_few_labels(
     alone: Observations, options: EstimationOptions, belief: RigBelief, there: RigidTransform
 ) -> float:
-    """The same where the camera sees too few fiducials for a pose: linearized at `there`, the camera fixed."""
+    """The same if the camera sees too few fiducials for a pose: linearized at `there`, with the camera fixed."""
     image, jacobian = _weighted_jacobian(belief, alone, there)
     weight = torch.where(alone.seen, 1 / alone.sigma, 0.0)[..., None]
     residual = torch.nan_to_num((alone.uv - image) * weight)
@@ -143,7 +143,7 @@ def _evidence_of_few_labels(
 
 
 def drop_cameras(observations: Observations, cameras: Collection[int]) -> Observations:
-    """Drop what some cameras have seen."""
+    """Remove the observations of some cameras."""
     seen = observations.seen.clone()
     seen[:, list(cameras)] = False
     return replace(observations, seen=seen)
@@ -158,7 +158,7 @@ def _pose_information(belief: RigBelief, observations: Observations, rig_from_ob
 def _weighted_jacobian(
     belief: RigBelief, observations: Observations, rig_from_object: RigidTransform
 ) -> tuple[Tensor, Tensor]:
-    """Images (S, C, N, 2) of the fiducials; their derivatives (S, C, N, 2, 6) by the poses over the blobs' sigmas."""
+    """Images (S, C, N, 2) of the fiducials; derivatives (S, C, N, 2, 6) by the poses, divided by the sigmas."""
     nudge = torch.tensor(NUDGE, dtype=torch.float64).diag()
     turned, shifted = rotation_from_vector(nudge[:, :3]), nudge[:, 3:]
 

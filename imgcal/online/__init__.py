@@ -1,4 +1,4 @@
-"""Recalibration while a rig runs: a window of snapshots, cameras that move, cameras that are found again."""
+"""Recalibration while a rig runs: recent snapshots, cameras that move, and cameras that are found again."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""How each camera of a running rig is, in a word, and the rig in a sentence."""
+"""The health of each camera of a running rig in a word, and of the rig in a sentence."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.rig_state import CameraHealth
 
 VAIN = 2
-"""Snapshots in a row that fit in most cameras no more: the labels of a single one may be wrong."""
+"""Successive snapshots that do not fit in most cameras; a single one may just have wrong labels."""
 SAID: Mapping[CameraHealth, tuple[str, str]] = {
     "lost": ("is lost", "are lost"),
     "blind": ("is blind", "are blind"),
@@ -19,15 +19,15 @@ SAID: Mapping[CameraHealth, tuple[str, str]] = {
     "defocused": ("is out of focus", "are out of focus"),
     "unseen": ("has not seen the object yet", "have not seen the object yet"),
 }
-"""What is said of one camera, and of several."""
+"""The words for one camera, and for several."""
 
 
 def camera_health(memory: KeeperMemory) -> dict[str, CameraHealth]:
-    """How each camera is, by name."""
+    """The health of each camera, by name."""
     found: dict[str, CameraHealth] = {}
     doubted = {*memory.sightings.doubtful_cameras, *memory.monitor.quarantine.cameras, *memory.monitor.undecided}
     if memory.in_vain >= VAIN:
-        doubted |= set(range(memory.prior.num_cameras))  # nobody knows yet which of them are not where they were
+        doubted |= set(range(memory.prior.num_cameras))  # it is unknown which of them have moved
     for camera, name in enumerate(memory.prior.camera_names):
         if camera in memory.sightings.lost:
             found[name] = "lost"
@@ -43,7 +43,7 @@ def camera_health(memory: KeeperMemory) -> dict[str, CameraHealth]:
 
 
 def take_health(memory: KeeperMemory, event: Event) -> None:
-    """Remember what a test says of a camera."""
+    """Remember a test's verdict on a camera."""
     if event.camera is None:
         return
     camera = memory.prior.camera_names.index(event.camera)
@@ -56,7 +56,7 @@ def take_health(memory: KeeperMemory, event: Event) -> None:
 
 
 def describe_health(health: Mapping[str, CameraHealth], learnt: int) -> str:
-    """Say how a rig is, of which so many snapshots have been learnt.
+    """Describe a rig's health in a sentence; `learnt` is the number of learnt snapshots.
 
     Examples:
         >>> describe_health({"cam01": "ok", "cam02": "lost", "cam03": "lost"}, 9)

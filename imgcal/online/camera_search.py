@@ -1,8 +1,8 @@
-"""Cameras that see something, but not the object where it should be: they are looked for until they are found.
+"""Search for cameras that see something, but not the object where it should be, until they are found.
 
-A camera that turned a little is found from one snapshot, near where it was. One that turned far is found anywhere, by
-all that it has seen since: the other cameras know where the object was. Its blobs are kept until then, whether or not
-the object should be in its view by where it was.
+A camera that turned a little is found from one snapshot, near its last pose. One that turned far is found anywhere,
+from everything it has seen since: the other cameras know where the object was. Its blobs are kept until then, whether
+or not the object should be in view from its last pose.
 """
 
 from __future__ import annotations
@@ -32,53 +32,53 @@ from imgcal.online.resection import labels_at, resect_camera
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
 REMEMBERED = 64
-"""Latest snapshots of a camera that is looked for."""
+"""Number of latest snapshots to keep for a missing camera."""
 ASKED_TOGETHER = 16
-"""Of them, spread over all, that are asked where the camera is."""
+"""Number of those, evenly spread, used to locate the camera."""
 NEARBY_TRIES = 16
-"""Snapshots in each of which a camera is looked for near its place; later only when it is looked for everywhere."""
+"""Number of snapshots in which a camera is searched for near its last pose; later only in a search everywhere."""
 LONGEST_REST = 512
-"""Snapshots between two tries at most. A try is dear: there is one after 1, 2, 4, 8, ... snapshots."""
+"""Maximum number of snapshots between two tries. A try is slow: they come after 1, 2, 4, 8, ... snapshots."""
 SUSPICIOUS = 3
-"""Snapshots in a row with blobs that nothing explains, and no labels, from which a camera is looked for."""
+"""Successive snapshots with unexplained blobs and no labels after which a camera is searched for."""
 USUAL_OF = 15
-"""Snapshots that say how many blobs without a label a camera usually has."""
+"""Number of snapshots that define a camera's usual number of unlabelled blobs."""
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is known where a camera is looked for."""
+    """What is known where a camera is searched for."""
 
     belief: RigBelief
-    widest: Tensor  # (C, K) standard deviations that are not exceeded: the factory calibration's
-    obj: CalibrationObject  # as it is known
+    widest: Tensor  # (C, K) upper limit of the standard deviations: the factory calibration's
+    obj: CalibrationObject  # as currently estimated
     options: PipelineOptions
 
     @property
     def rig(self) -> CameraRig:
-        """The rig as it is known."""
+        """The rig as currently estimated."""
         return self.belief.rig
 
     @cached_property
     def std(self) -> Tensor:
-        """How well the rig is known, with some reserve: (C, K). Dear, and asked for only where a camera is searched."""
+        """Uncertainty of the rig with a margin: (C, K). Slow; computed only when a camera is searched for."""
         return torch.minimum(2 * self.belief.std(), self.widest)
 
 
 @dataclass
 class SearchedCamera:
-    """A camera that is looked for."""
+    """A camera that is being searched for."""
 
     since: float  # s
     blobs: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=REMEMBERED))  # (M, 2) px
-    places: deque[Tensor] = field(default_factory=lambda: deque(maxlen=REMEMBERED))  # (N, 3) mm, of the fiducials
+    places: deque[Tensor] = field(default_factory=lambda: deque(maxlen=REMEMBERED))  # (N, 3) mm, fiducials
     taken: int = 0  # snapshots so far
-    latest: int = -1  # number of the last one
-    found: int = -1  # number of the last one in which it was found
-    place: CameraRig | None = None  # where it was found, alone
+    latest: int = -1  # number of the latest one
+    found: int = -1  # number of the latest one in which it was found
+    place: CameraRig | None = None  # the camera alone, where it was found
 
     def add(self, number: int, uv: NDArray[np.float64], points: Tensor) -> None:
-        """Keep what it sees in a snapshot; of a snapshot that is looked at again, what it sees then."""
+        """Keep the camera's blobs in a snapshot; a repeated snapshot replaces the earlier one."""
         if number == self.latest:
             self.blobs[-1], self.places[-1] = uv, points
             return
@@ -88,39 +88,39 @@ class SearchedCamera:
 
     @property
     def due(self) -> bool:
-        """Tell whether it is time to look everywhere."""
+        """Tell whether to search everywhere now."""
         return self.taken & (self.taken - 1) == 0 or self.taken % LONGEST_REST == 0
 
     def collect(self) -> tuple[list[NDArray[np.float64]], Tensor]:
-        """Blobs and places of some snapshots, the last one among them."""
+        """Blobs and fiducials of some snapshots, including the latest one."""
         some = np.unique(np.linspace(0, len(self.blobs) - 1, ASKED_TOGETHER).astype(np.int64)).tolist()
         return [self.blobs[s] for s in some], torch.stack([self.places[s] for s in some])
 
 
 @dataclass
 class Search:
-    """Looks for cameras, snapshot after snapshot, in constant memory."""
+    """Searches for cameras, snapshot by snapshot, in constant memory."""
 
     num_cameras: int
     sought: dict[int, SearchedCamera] = field(default_factory=dict)
     spare: deque[NDArray[np.int64]] = field(default_factory=lambda: deque(maxlen=USUAL_OF))
-    vainly: dict[int, int] = field(default_factory=dict)  # camera -> snapshots in a row that nothing explains
+    vainly: dict[int, int] = field(default_factory=dict)  # camera -> successive unexplained snapshots
 
     def label_lost_cameras(
         self, checked: Checked, known: Surroundings, time: float, number: int, doubted: frozenset[int] = frozenset()
     ) -> tuple[Checked, frozenset[int]]:
-        """Label the blobs of cameras that do not see the object where it should be, where they are found.
+        """Search for cameras that do not see the object where it should be, and label their blobs if they are found.
 
         Args:
-            checked: a snapshot, labelled as far as the rig as it is known allows.
+            checked: a snapshot, labelled as far as the current rig allows.
             known: the rig and the object.
             time: of the snapshot, s.
             number: of the snapshot. The same one may come again, with other labels.
-            doubted: cameras that have not seen the object where it should be for some time.
+            doubted: cameras that have not seen the object in the right place for some time.
 
         Returns:
-            The snapshot with the labels of those that were found (`off`: elsewhere, so they have moved), and the
-            cameras that were not found: whatever labels they had by chance are gone, as are those of cameras in doubt.
+            The snapshot with the labels of the cameras that were found (`off`: elsewhere, so they have moved), and the
+            cameras that were not found. Chance labels of these, and of cameras in doubt, are removed.
         """
         pose = checked.rig_from_object[0]
         checked = self._drop_chance_labels(checked, known, doubted)
@@ -149,7 +149,7 @@ class Search:
         return self._weigh(checked, found, known) if found else checked, frozenset(missed)
 
     def _weigh(self, checked: Checked, found: list[int], known: Surroundings) -> Checked:
-        """Tell cameras that were found where they stood, and had but lost their labels, from those that moved."""
+        """Tell cameras that were found in place and only lost their labels from those that moved."""
         again = check_labels(checked.blobs, known.rig, known.obj, checked.rig_from_object, known.options)
         before, kept = _label(checked.blobs, self.num_cameras), _label(again.blobs, self.num_cameras)
         stands = ~again.off & (kept >= np.maximum(LEAST_AGREEING * before, LEAST_BLOBS))
@@ -164,7 +164,7 @@ class Search:
         return replace(checked, blobs=blobs, off=off, labels=int((fiducial >= 0).sum()))
 
     def _drop_chance_labels(self, checked: Checked, known: Surroundings, doubted: frozenset[int]) -> Checked:
-        """Take away labels of cameras in doubt that are too few to say that they are back."""
+        """Remove labels of cameras in doubt that are too few to show that they are back."""
         few = _label(checked.blobs, self.num_cameras) < least_back(known.obj.num_fiducials)
         chance = [camera for camera in (*self.sought, *doubted) if few[camera]]
         rows = np.isin(checked.blobs.camera, chance) & (checked.blobs.fiducial >= 0)
@@ -174,7 +174,7 @@ class Search:
         return replace(checked, blobs=blobs, labels=checked.labels - int(rows.sum()))
 
     def observe(self, blobs: Detections, number: int) -> None:
-        """Note a snapshot that has been learnt: which cameras see the object again, and what is usual."""
+        """Note, after an absorbed snapshot, which cameras see the object again and how many blobs are usual."""
         labelled, spare, usual = _label(blobs, self.num_cameras), self._spare(blobs), self._usual()
         for camera in range(self.num_cameras):
             vainly = spare[camera] >= LEAST_BLOBS and labelled[camera] < LEAST_BLOBS
@@ -187,23 +187,23 @@ class Search:
             for camera, sought in self.sought.items()
             if sought.found == number or labelled[camera] < LEAST_BLOBS
         }
-        # What nothing explains is not usual.
+        # Unexplained blobs are not usual.
         unexplained = np.isin(np.arange(self.num_cameras), [*self.sought, *self.vainly])
         self.spare.append(np.where(unexplained, usual.astype(np.int64), spare_blobs(blobs, self.num_cameras)))
 
     def lost_since(self, camera: int, time: float) -> float:
-        """Since when a camera is looked for; `time` where it is not."""
+        """Time since which a camera is searched for; `time` if it is not."""
         return self.sought[camera].since if camera in self.sought else time
 
     def _usual(self) -> NDArray[np.float64]:
         return np.median(self.spare, axis=0) if self.spare else np.zeros(self.num_cameras)
 
     def _spare(self, blobs: Detections) -> NDArray[np.float64]:
-        """Blobs without a label beyond those that a camera usually has: (C,)."""
+        """Number of unlabelled blobs of each camera beyond its usual number: (C,)."""
         return np.maximum(spare_blobs(blobs, self.num_cameras) - self._usual(), 0)
 
     def _suspects(self, blobs: Detections, known: Surroundings, pose: RigidTransform) -> list[int]:
-        """Cameras to look for."""
+        """Cameras to search for."""
         bare = spare_blobs(blobs, self.num_cameras)
         if not self.sought and bare.max(initial=0) < LEAST_BLOBS:
             return []
@@ -225,7 +225,7 @@ def _label(blobs: Detections, cameras: int) -> NDArray[np.int64]:
 def _find(
     sought: SearchedCamera, blobs: Detections, camera: int, known: Surroundings, pose: RigidTransform
 ) -> NDArray[np.int64] | None:
-    """Label the latest blobs (M,) of a camera: where it was found before, near its place, or anywhere."""
+    """Label the latest blobs (M,) of a camera: where it was found before, near its last pose, or anywhere."""
     if sought.place is not None:
         labels = labels_at(sought.blobs[-1], sought.places[-1], sought.place)
         if labels is not None:

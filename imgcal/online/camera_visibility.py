@@ -1,4 +1,4 @@
-"""Which cameras of a running rig see the object: those that are lost, and those that are back."""
+"""Track which cameras of a running rig see the object: lost cameras, and cameras that are back."""
 
 from __future__ import annotations
 
@@ -12,25 +12,24 @@ from imgcal.online.events import Event
 from imgcal.types import CameraRig, Detections
 
 LEAST_EXPECTED = 3
-"""Fiducials that a camera should see before it says anything that it sees none."""
+"""Number of fiducials that should be in view before their absence counts."""
 MARGIN = 0.05
-"""Of the image's size, from its border, within which a fiducial may as well be out of view."""
+"""Margin at the image border, as a share of the image size, in which a fiducial may be out of view."""
 DOUBTED = 3
-"""Snapshots in a row in which a camera sees nothing of what it should see, from which it is in doubt."""
+"""Successive snapshots in which a camera sees nothing of what it should see until it is in doubt."""
 ASTRAY = 2
-"""Snapshots in which a camera sees something, and not the object where it should be, before it counts as lost: a single
+"""Snapshots in which a camera sees something, but not the object where it should be, until it counts as lost: a single
 one may be garbage. It is in doubt at once."""
 ABSENT_SECONDS, ABSENT_SNAPSHOTS = 2.0, 30
-"""How long, and how often, a camera must miss what it should see before it counts as lost: arms hide objects, too."""
+"""Seconds and snapshots for which a camera must miss what it should see until it counts as lost: arms hide objects."""
 SILENT_SECONDS = 0.5
-"""How long nothing comes from a camera, at least, before it counts as lost; also, until it is known how often it sends,
-`ABSENT_SECONDS`."""
+"""Minimum time without data from a camera until it counts as lost; `ABSENT_SECONDS` applies until its rate is known."""
 RESTS, LATEST = 3.0, 8
-"""Times its usual rest, the median of so many, that a camera that sends less often than the others is waited for."""
+"""How long to wait for a slow camera, in multiples of its usual interval, and how many intervals give that median."""
 
 
 def well_inside(predicted: NDArray[np.float64], rig: CameraRig) -> NDArray[np.bool_]:
-    """Tell which predictions (C, N, 2) px, NaN = none, are so far inside of their image that they should be seen."""
+    """Tell which predictions (C, N, 2) px, NaN = none, are far enough inside the image that they should be seen."""
     size = rig.image_size.numpy()[:, None]
     with np.errstate(invalid="ignore"):
         return np.asarray(((predicted > MARGIN * size) & (predicted < (1 - MARGIN) * size)).all(-1))
@@ -38,36 +37,36 @@ def well_inside(predicted: NDArray[np.float64], rig: CameraRig) -> NDArray[np.bo
 
 @dataclass(frozen=True)
 class VisibleObject:
-    """What was looked at in a snapshot."""
+    """What the cameras saw in a snapshot."""
 
     time: float
     number: int
     blobs: Detections  # labelled
-    predicted: NDArray[np.float64]  # (C, N, 2), nan where that is not known
-    astray: frozenset[int]  # cameras that see what may be the object, and not where it should be
-    silent: frozenset[int]  # cameras of which nothing came
+    predicted: NDArray[np.float64]  # (C, N, 2), nan if unknown
+    astray: frozenset[int]  # cameras that see a possible object in the wrong place
+    silent: frozenset[int]  # cameras without data
 
 
 @dataclass
 class CameraVisibility:
-    """Follows every camera."""
+    """Tracks the visibility of the object in every camera."""
 
     names: tuple[str, ...]
     seen: set[int] = field(default_factory=set)  # cameras that have ever had labels
-    lost: dict[int, float] = field(default_factory=dict)  # camera -> since when
-    missing: dict[int, tuple[float, int]] = field(default_factory=dict)  # not lost yet: since when, how often
-    silent: dict[int, float] = field(default_factory=dict)  # since when nothing came
-    heard: dict[int, deque[float]] = field(default_factory=dict)  # when something came, the latest times
-    astray: dict[int, tuple[float, int]] = field(default_factory=dict)  # since when, and how often
+    lost: dict[int, float] = field(default_factory=dict)  # camera -> time of the loss
+    missing: dict[int, tuple[float, int]] = field(default_factory=dict)  # not lost yet: start, number of snapshots
+    silent: dict[int, float] = field(default_factory=dict)  # start of the silence
+    heard: dict[int, deque[float]] = field(default_factory=dict)  # latest times of data
+    astray: dict[int, tuple[float, int]] = field(default_factory=dict)  # start, number of snapshots
 
     @property
     def doubtful_cameras(self) -> frozenset[int]:
-        """Cameras that may not be where they were."""
+        """Cameras that may have moved."""
         missing = (camera for camera, (_, times) in self.missing.items() if times >= DOUBTED)
         return frozenset((*self.astray, *missing))
 
     def observe(self, rig: CameraRig, look: VisibleObject) -> list[Event]:
-        """Say which cameras are lost or back with a snapshot."""
+        """Return which cameras are lost or back with this snapshot."""
         count = np.bincount(look.blobs.camera[look.blobs.fiducial >= 0], minlength=len(self.names))
         some = set(np.flatnonzero(count).tolist())
         self.seen |= some
@@ -93,7 +92,7 @@ class CameraVisibility:
         return events
 
     def _listen(self, look: VisibleObject) -> None:
-        """Note from which cameras something came, and since when nothing does."""
+        """Note which cameras sent data, and since when the others have not."""
         for camera in set(range(len(self.names))) - look.silent:
             heard = self.heard.setdefault(camera, deque(maxlen=LATEST + 1))
             if heard and look.time < heard[-1]:  # the clocks were set back
@@ -102,7 +101,7 @@ class CameraVisibility:
         self.silent = {camera: min(self.silent.get(camera, look.time), look.time) for camera in look.silent}
 
     def _patience(self, camera: int) -> float:
-        """How long (s) a camera may be silent."""
+        """Time (s) for which a camera may be silent."""
         times = self.heard.get(camera, ())
         if len(times) < 3:
             return ABSENT_SECONDS
@@ -112,18 +111,18 @@ class CameraVisibility:
         first, times = self.astray.get(camera, (look.time, 0))
         if times >= ASTRAY:
             return min(first, self.missing.get(camera, (first, 0))[0]), (
-                "sees what may be the object, but not where it should be: it has moved far; move the object through "
-                "the middle of its image, and it will be found again"
+                "sees what may be the object, but in the wrong place: the camera has moved far; move the object "
+                "through the middle of its image, and the camera will be found again"
             )
         if camera in self.silent and look.time - self.silent[camera] >= self._patience(camera):
-            return self.silent[camera], "sends nothing at the moments of the other cameras"
+            return self.silent[camera], "sends nothing when the other cameras do"
         first, times = self.missing.get(camera, (look.time, 0))
         if times >= ABSENT_SNAPSHOTS and look.time - first >= ABSENT_SECONDS:
             return first, "does not see the object, which should be in view: it is covered, or has turned away"
         return None
 
     def _should_see(self, rig: CameraRig, predicted: NDArray[np.float64]) -> set[int]:
-        """Cameras in which the object is well inside of the image."""
+        """Cameras in which the object is well inside the image."""
         return set(np.flatnonzero(well_inside(predicted, rig).sum(1) >= LEAST_EXPECTED).tolist())
 
     def _event(self, kind: str, camera: int, since: float, message: str, look: VisibleObject) -> Event:
@@ -132,5 +131,5 @@ class CameraVisibility:
 
 
 def least_back(fiducials: int) -> int:
-    """Labels by which a camera that did not see the object is said to see it again: one or two come by chance."""
+    """Number of labels that show that a camera sees the object again: one or two occur by chance."""
     return min(LEAST_EXPECTED, (fiducials + 1) // 2)

@@ -1,4 +1,4 @@
-"""Cameras that expose later than the others: their blobs, put where they would have been in time."""
+"""Correct the blobs of cameras that expose late: move them to where they would have been in time."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from imgcal.monitoring import ObjectMotion, RigBelief, project_fiducials
 from imgcal.types import Detections
 
 INEXACT, UNSTEADY = 0.1, 30.0
-"""Share of the way that a camera is behind, and pixels for each second of its lateness, by which its blobs count as off
-then. Where it sees the object is extrapolated, and what that is off by is alike for all blobs of a snapshot."""
+"""Error of a corrected blob: a share of the distance moved, and pixels per second of delay. The place is extrapolated,
+and the extrapolation error is the same for all blobs of a snapshot."""
 LONGEST = 0.2
-"""Seconds since the last snapshot but one up to which it is known how the object moves."""
+"""Maximum time (s) since the last snapshot but one for which the object's motion is known."""
 POSES = 16
-"""Latest snapshots that say that."""
+"""Number of latest snapshots that give the motion."""
 
 
 def clock_shifts(
@@ -29,18 +29,18 @@ def clock_shifts(
     poses: Sequence[tuple[float, RigidTransform]],
     time: float,
 ) -> NDArray[np.float64]:
-    """Find by how much blobs of late cameras are off where they would have been in time.
+    """Find the shift of each blob of a late camera to where it would have been in time.
 
     Args:
         blobs: of one snapshot.
-        late: (C,) s by which cameras expose later.
+        late: (C,) s of delay of the cameras' exposures.
         belief: the rig and the object.
-        poses: times (s) and rig_from_object (1,) of snapshots before, and of this one, if it is known.
-        time: s, of this one.
+        poses: times (s) and rig_from_object (1,) of earlier snapshots, and of this one if known.
+        time: s, of this snapshot.
 
     Returns:
-        What is to be added to each, (M, 2) pixels; nan where nobody knows how the object moves: such a camera can teach
-        nothing then.
+        Shift to add to each blob, (M, 2) pixels; nan if the object's motion is unknown: such a camera teaches nothing
+        then.
     """
     shift = np.zeros((len(blobs), 2))
     cameras = np.flatnonzero(late)
@@ -61,6 +61,6 @@ def clock_shifts(
 
 
 def shift_blobs(blobs: Detections, shift: NDArray[np.float64], late: NDArray[np.float64]) -> Detections:
-    """Put blobs where they would have been in time, less surely: see `clock_shifts`."""
+    """Move blobs to where they would have been in time, with more noise: see `clock_shifts`."""
     off = np.hypot(INEXACT * np.linalg.norm(shift, axis=1), UNSTEADY * np.abs(late[blobs.camera]))
     return replace(blobs, uv=blobs.uv + shift, sigma=np.hypot(blobs.sigma, off))

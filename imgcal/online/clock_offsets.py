@@ -1,4 +1,4 @@
-"""Does a camera expose at another time than the others? What its blobs are off along the object's motion tells."""
+"""Detect cameras that expose at another time than the others, from residuals along the object's motion."""
 
 from __future__ import annotations
 
@@ -16,45 +16,45 @@ from imgcal.online.events import Event
 from imgcal.online.rig_state import RigState
 
 MEMORY = 5.0
-"""Seconds after which a residual counts for less, by a factor e."""
+"""Decay time (s, to 1/e) of a residual's weight."""
 LONGEST = 0.2
-"""Seconds between snapshots up to which the difference of predictions is a velocity."""
+"""Maximum time (s) between snapshots for which the difference of predictions is a velocity."""
 SIGNIFICANT, LEAST = 40.0, 1e-3
-"""Chi-squared (one degree of freedom, once in 10^9 independent looks by chance), and seconds, to tell an offset ..."""
+"""Chi-squared (one degree of freedom; chance: once in 10^9 independent tests), and seconds, to report an offset ..."""
 LEAST_KNOWN = 1e-4
-"""... and seconds from which it is reckoned with."""
+"""... and seconds from which it is corrected."""
 INEXACT = 0.05
-"""Share of an offset by which it must be otherwise to be told again."""
+"""Relative change of an offset at which it is reported again."""
 LEAST_MEMORY = 1.0
-"""Seconds of motion before anything is told."""
+"""Seconds of motion required before a report."""
 LEAST_MOTION, LEAST_SIGMAS = 0.5, 5.0
-"""Pixels, and standard deviations, by which blobs (their median) must move from a snapshot to the next one: less is the
-noise of the pose, which goes with the residuals. Not predictions: they move with what is learnt about the rig, too."""
+"""Pixels, and standard deviations, by which blobs (their median) must move between snapshots: less is noise of the
+pose, which correlates with the residuals. Predictions would not do: they also move as the rig is learnt."""
 STEP, STEPS = 0.2, 3
-"""Pixels by which a camera's image must be otherwise, and for how many snapshots, to begin it anew."""
+"""Change (px) of a camera's image, and number of snapshots that it must last, to restart that camera's estimate."""
 LEAST_DETERMINED = 1e-6
-"""Determinant, of ones on the diagonal, from which motion and shift are told apart."""
+"""Minimum determinant, scaled to a unit diagonal, for separating motion and shift."""
 MOST_PIXELS = 50.0
-"""Residuals beyond are wrong labels."""
+"""Larger residuals come from wrong labels."""
 
 
 class ClockOffsets:
-    """Estimates when each camera exposes, against the median camera, and tells it.
+    """Estimates each camera's exposure time relative to the median camera, and reports offsets.
 
-    Residuals are explained by a time (the object's velocity in the image times it) and a constant shift of the image
+    Residuals are explained by a time offset (times the object's velocity in the image) and a constant image shift
     together: a camera that was bumped shifts its image the same way wherever the object goes.
     """
 
     name = "clock"
 
     def __init__(self, cameras: int) -> None:
-        """Begin with nothing known."""
+        """Start without knowledge."""
         self._normal, self._right = np.zeros((cameras, 3, 3)), np.zeros((cameras, 3))
-        self._other = np.zeros(cameras, dtype=np.int64)  # snapshots in a row that are otherwise
+        self._other = np.zeros(cameras, dtype=np.int64)  # successive snapshots that differ
         self._last: tuple[float, RigidTransform, NDArray[np.float64]] | None = None
-        self._seconds = np.zeros(cameras)  # of motion that each has seen
-        self._told = np.zeros(cameras)  # s, what was told last
-        self.late = np.zeros(cameras)  # s by which cameras are known to expose later: blobs come as if in time
+        self._seconds = np.zeros(cameras)  # of motion seen by each camera
+        self._told = np.zeros(cameras)  # s, as last reported
+        self.late = np.zeros(cameras)  # s of known delay: blobs are corrected for it
         self._period = math.nan
 
     def __call__(
@@ -72,7 +72,7 @@ class ClockOffsets:
         least = max(LEAST_MOTION, LEAST_SIGMAS * float(np.median(state.detections.sigma)))
         if not len(went) or np.median(went) < least:
             return ()
-        # Both by the rig as it is now: what is learnt about cameras is no motion.
+        # Use the current rig for both: what is learnt about cameras is no motion.
         self._add(state, (state.predicted - self._predicted(state, last[1])) / self._period)
         offset, sigma = self.offsets()
         changed = np.abs(offset - self.late)
@@ -80,19 +80,19 @@ class ClockOffsets:
         sure &= self._seconds >= LEAST_MEMORY
         if not sure.any():
             return ()
-        camera = int(np.argmax(np.where(sure, changed / sigma, 0.0)))  # one at a time: the others may lean on it
+        camera = int(np.argmax(np.where(sure, changed / sigma, 0.0)))  # one at a time: the others may depend on it
         evidence = float(changed[camera] / sigma[camera]) ** 2
         return self._adopt_offset(state, camera, float(offset[camera]), float(sigma[camera]), evidence)
 
     def adopt_slip(self, state: RigState, slip: ClockSlip, since: float) -> Iterable[Event]:
-        """Take over a slip that was seen at once."""
+        """Adopt a clock slip that was found at once."""
         late = float(self.late[slip.camera] + slip.seconds)
         return self._adopt_offset(state, slip.camera, late, slip.sigma, slip.odds, since)
 
     def _adopt_offset(
         self, state: RigState, camera: int, late: float, sigma: float, evidence: float, since: float | None = None
     ) -> Iterable[Event]:
-        """Reckon with an offset (s) from now on, and tell it if that is worth it."""
+        """Correct an offset (s) from now on, and report it if significant."""
         self.late[camera] = late
         self._begin(camera)
         if abs(late - self._told[camera]) < LEAST + INEXACT * abs(late):
@@ -101,12 +101,12 @@ class ClockOffsets:
         return (self._event(state, camera, late, sigma, evidence, since),)
 
     def _begin(self, cameras: int | NDArray[np.bool_]) -> None:
-        """Forget what cameras have shown."""
+        """Discard the data of some cameras."""
         self._normal[cameras], self._right[cameras] = 0.0, 0.0
         self._other[cameras], self._seconds[cameras] = 0, 0.0
 
     def offsets(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """By how much each camera exposes after the median one, and its standard deviation: (C,) s; nan = unknown."""
+        """Delay of each camera relative to the median one, and its standard deviation: (C,) s; nan = unknown."""
         power = np.diagonal(self._normal, axis1=1, axis2=2)
         scale = np.sqrt(np.maximum(power, 1e-30))
         scaled = self._normal / (scale[:, :, None] * scale[:, None])
@@ -114,7 +114,7 @@ class ClockOffsets:
         inverse = np.linalg.inv(np.where(known[:, None, None], scaled, np.eye(3)))
         offset = np.where(known, (inverse[:, 0] * self._right / scale).sum(1) / scale[:, 0], np.nan)
         sigma = np.where(known, np.sqrt(inverse[:, 0, 0]) / scale[:, 0], np.nan)
-        # Most cameras are as late as is known: where half of them slipped together, what is known already stays.
+        # Most cameras keep their known delay. If half of them slip together, the known delays stay.
         offset += self.late - (np.nanmedian(offset) if known.any() else 0.0)
         return offset, sigma
 
@@ -128,7 +128,7 @@ class ClockOffsets:
 
     @staticmethod
     def _predicted(state: RigState, rig_from_object: RigidTransform) -> NDArray[np.float64]:
-        """Where the rig puts the fiducials of an object elsewhere: (C, N, 2) pixels, nan out of view."""
+        """Project the fiducials of an object in another pose: (C, N, 2) pixels, nan out of view."""
         belief = state.belief
         points = rig_from_object.reshape(1).apply(belief.points_object)
         image = belief.rig.expand(1).project_values(points, belief.obj.radius)
@@ -148,7 +148,7 @@ class ClockOffsets:
         sigma[at] = blobs.sigma[rows]
         with np.errstate(invalid="ignore"):
             good = np.isfinite(velocity).all(-1) & (np.linalg.norm(residual, axis=-1) < MOST_PIXELS)
-        # A camera in doubt sees the object elsewhere for whatever reason; only the others are late by little.
+        # Leave out cameras in doubt: their residuals have other causes than a small delay.
         good &= np.array([state.cameras.get(name) != "doubtful" for name in state.factory.camera_names])[:, None]
         good &= ~self._reset_changed(velocity, residual, sigma, good)[:, None]
         weight = np.where(good, 1 / np.square(sigma), 0.0)
@@ -168,15 +168,15 @@ class ClockOffsets:
         sigma: NDArray[np.float64],
         good: NDArray[np.bool_],
     ) -> NDArray[np.bool_]:
-        """Tell which cameras no longer do what they did, bumped, or their clock slipped; begin anew those that stay so.
+        """Find the cameras that were bumped or whose clock slipped; restart the estimates of those that stay so.
 
-        The first such snapshots are left out: together with what was before they would be explained by any time.
+        The first such snapshots are left out: together with the earlier ones, any time offset would explain them.
         """
         scale = np.sqrt(np.maximum(np.diagonal(self._normal, axis1=1, axis2=2), 1e-30))
         scaled = self._normal / (scale[:, :, None] * scale[:, None])
         known = good.any(1) & (np.linalg.det(scaled) > LEAST_DETERMINED)
         solved = np.linalg.solve(np.where(known[:, None, None], scaled, np.eye(3)), (self._right / scale)[..., None])
-        explained = solved[..., 0] / scale  # (C, 3): seconds and a shift
+        explained = solved[..., 0] / scale  # (C, 3): time offset and shift
         off = residual - velocity * explained[:, None, :1] - explained[:, None, 1:]
         count = np.maximum(good.sum(1), 1)
         middle = _middle(np.where(good[..., None], off, np.inf), count)
@@ -184,9 +184,9 @@ class ClockOffsets:
         with np.errstate(invalid="ignore"):
             other = known & (np.linalg.norm(middle, axis=1) > np.maximum(STEP, 6 * usual / np.sqrt(count)))
         self._other = np.where(other, self._other + 1, np.where(known, 0, self._other))
-        anew = self._other >= STEPS
-        self._begin(anew)
-        return other & ~anew
+        restarted = self._other >= STEPS
+        self._begin(restarted)
+        return other & ~restarted
 
     def _event(
         self, state: RigState, camera: int, offset: float, sigma: float, evidence: float, since: float | None = None
@@ -212,7 +212,7 @@ class ClockOffsets:
 
 
 def unsynchronized_event(camera: str, since: float, time: float, snapshot: int) -> Event:
-    """Tell that a camera exposes at moments of its own, by how much nobody knows yet.
+    """Report an unsynchronized camera whose offset is unknown.
 
     Args:
         camera: its name.
@@ -220,7 +220,7 @@ def unsynchronized_event(camera: str, since: float, time: float, snapshot: int) 
         time: s since the epoch, now.
         snapshot: number of the update.
     """
-    message = f"{camera} sees the object at other moments than the other cameras, by how much is not known yet"
+    message = f"{camera} is not synchronized with the other cameras; its time offset is not known yet"
     return Event(time, snapshot, "clock_slip", camera, since, message=message)
 
 

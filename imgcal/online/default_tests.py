@@ -1,4 +1,4 @@
-"""What watches a rig beside the filter where nothing else is asked for."""
+"""The tests that run beside the filter by default."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ from imgcal.online.sequential_test import SequentialTest
 
 
 def default_tests(cameras: int) -> tuple[SequentialTest, ...]:
-    """Images that get worse, clocks that slip, and another object."""
+    """Tests for worse images, clock slips, and a different object."""
     return ImageQuality(cameras), ClockOffsets(cameras), ForeignObject()

@@ -1,4 +1,4 @@
-"""Slow drift of a running rig, which the filter follows without alarm, told when it has become worth knowing."""
+"""Slow drift of a running rig, which the filter follows without an alarm: report it once it is large enough."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from imgcal.online.relearning import relative_std
 from imgcal.types import CameraRig
 
 EVERY_SECONDS = 10.0
-"""Between two looks."""
+"""Time between two checks."""
 WORTH = {"rotation": math.radians(0.05), "position": 0.5, "focal_length": 1.0, "principal_point": 1.0}
-"""Drift (rad, mm, pixels) that is told, where it is sure."""
+"""Drift (rad, mm, pixels) that is reported if significant."""
 SURE = 5.0
-"""Standard deviations that the values had when the drift began to be measured."""
+"""Significance of the drift, in standard deviations of the values at the start of the measurement."""
 HOW = {
     "rotation": "has slowly turned by",
     "position": "has slowly shifted by",
@@ -31,21 +31,21 @@ HOW = {
 
 @dataclass
 class DriftWatch:
-    """Compares a rig with what it was when it was last told of, or learnt."""
+    """Compares a rig with its state when drift was last reported, or when it was learnt."""
 
     names: tuple[str, ...]
-    looked: float | None = None  # s since the epoch
+    looked: float | None = None  # time of the last check, s since the epoch
     reference: CameraRig | None = None
     std: Tensor | None = None  # (C, K) of the reference
     since: dict[int, float] = field(default_factory=dict)  # camera -> time of its reference
-    unsettled: frozenset[int] = frozenset()  # at any time since the last look
+    unsettled: frozenset[int] = frozenset()  # cameras unsettled at any time since the last check
 
     def observe(self, belief: RigBelief, unsettled: frozenset[int], time: float, number: int) -> list[Event]:
-        """Say which cameras have drifted.
+        """Return the cameras that have drifted.
 
         Args:
-            belief: what is known now.
-            unsettled: cameras that moved and are not known again, or do not see the object.
+            belief: the current belief.
+            unsettled: cameras that moved and have not been relearnt, or that do not see the object.
             time: s since the epoch.
             number: of the update.
         """
@@ -59,21 +59,21 @@ class DriftWatch:
             self._begin(range(len(self.names)), belief, std, time)
             return []
         change = Gauge.from_majority(belief.rig, self.reference).difference(belief.rig, self.reference)
-        events, anew = [], set(unsettled)
+        events, restarted = [], set(unsettled)
         for camera in range(len(self.names)):
             if camera in unsettled:
                 continue
             found = self._largest(change[camera], torch.maximum(self.std, std)[camera])
             if found is not None:
                 events.append(self._event(camera, *found, std[camera], time, number))
-                anew.add(camera)
+                restarted.add(camera)
             elif bool((std[camera, :10] < 0.5 * self.std[camera, :10]).any()):
-                anew.add(camera)  # what changed until now may have been learning
-        self._begin(anew, belief, std, time)
+                restarted.add(camera)  # earlier changes may be learning, not drift
+        self._begin(restarted, belief, std, time)
         return events
 
     def _largest(self, change: Tensor, std: Tensor) -> tuple[ChangeKind, float] | None:
-        """The kind of change that stands out most, where one is worth telling, and its size."""
+        """Most significant kind of change and its size, or None if none is worth a report."""
         best: tuple[float, ChangeKind, float] | None = None
         for kind, part in CHANGES.items():
             size = float(change[part].norm())
@@ -93,7 +93,7 @@ class DriftWatch:
         return Event(time, number, "drift", name, self.since[camera], kind, size, sigma, unit, message=message)
 
     def _begin(self, cameras: Iterable[int], belief: RigBelief, std: Tensor, time: float) -> None:
-        """Measure the drift of some cameras from now on."""
+        """Start measuring the drift of some cameras."""
         chosen = sorted(cameras)
         if self.reference is None or self.std is None:
             self.reference, self.std = belief.rig, std

@@ -1,4 +1,4 @@
-"""What happened to a rig that is kept calibrated: one line of `events.jsonl` each."""
+"""Events of a rig that is kept calibrated; each is one line of `events.jsonl`."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ EVENT_KINDS: tuple[EventKind, ...] = get_args(EventKind)
 
 @dataclass(frozen=True)
 class Event:
-    """Something that became known about a rig.
+    """Something that happened to a rig.
 
-    Of a camera that moved there are two: one as soon as it is sure, with the change `unknown`, and a second one with
-    the same camera and `since` once it is decided how it moved and how far.
+    A camera that moved has two events: one with the change `unknown` as soon as the move is certain, and a second one
+    with the same camera and `since` once the kind and size of the move are decided.
 
     Examples:
         >>> event = Event(1.5, 90, "moved", "cam07", since=1.48, change="rotation", size=0.3, sigma=0.01, unit="deg",
@@ -46,8 +46,8 @@ class Event:
         ('1970-01-01T00:00:01.500+00:00', 'rotation')
     """
 
-    time: float  # s since the epoch: when it became known
-    snapshot: int  # number of the update that it became known with
+    time: float  # s since the epoch: when it was detected
+    snapshot: int  # number of the update that detected it
     kind: EventKind
     camera: str | None = None
     since: float | None = None  # s since the epoch: when it happened
@@ -55,13 +55,13 @@ class Event:
     size: float | None = None  # in `unit`
     sigma: float | None = None  # one standard deviation of the size
     unit: Unit | None = None
-    evidence: float | None = None  # chi-squared of standing still, of a camera that moved
+    evidence: float | None = None  # chi-squared of "it stood still", for a camera that moved
     message: str = ""  # one sentence
 
     def to_json(self) -> str:
-        """Write one line of `events.jsonl`: times in ISO 8601, UTC; `event` is what happened, `kind` how it changed.
+        """Write one line of `events.jsonl`: times in ISO 8601, UTC; `event` says what happened, `kind` how it changed.
 
-        A number that is none (nan, infinity) is null.
+        A number that is not finite becomes null.
         """
         since, size, sigma, evidence = map(_finite, (self.since, self.size, self.sigma, self.evidence))
         values = {
@@ -81,12 +81,12 @@ class Event:
 
 
 def snapshot_name(number: int) -> str:
-    """Name of the update of a number."""
+    """Name of update `number`."""
     return f"{number:05d}"
 
 
 def iso_time(seconds: float) -> str:
-    """ISO 8601 of seconds since the epoch, to the millisecond, in UTC."""
+    """Format seconds since the epoch in ISO 8601, UTC, to the millisecond."""
     return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
 
 

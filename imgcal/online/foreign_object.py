@@ -1,4 +1,4 @@
-"""Is that another object? As many blobs as fiducials, and for seconds nobody can tell which is which."""
+"""Detect a different object: as many blobs as fiducials, but no snapshot can be labelled for seconds."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from imgcal.online.events import Event
 from imgcal.online.rig_state import RigState
 
 SECONDS, SNAPSHOTS = 3.0, 30
-"""How long, and how often, a snapshot must be refused: an object half hidden is refused for moments."""
+"""Seconds and snapshots for which labelling must fail: a half-hidden object fails for moments only."""
 KNOWN, BY_CHANCE = 0.75, 3
-"""Share of the fiducials of the cameras that see something like it from which it is the object that is seen; a snapshot
-that was learnt with fewer labels may have them by chance, and takes back so many that were refused."""
+"""Share of the object's fiducials, over the cameras that see something like it, that must be labelled to recognize it.
+A snapshot with fewer labels may have them by chance, and cancels this number of refused ones."""
 SHARE, CAMERAS = 0.6, 2
-"""Blobs, in parts of the object's fiducials, from which a camera sees something like it, and cameras that must."""
+"""Number of blobs, as a share of the object's fiducials, for a camera to see something like it, and of such cameras."""
 
 
 class ForeignObject:
-    """Tells once when what is seen is no longer the object; again after the object has been seen."""
+    """Reports once that the cameras no longer see the object; again only after the object has been seen."""
 
     name = "foreign object"
 
     def __init__(self) -> None:
-        """Begin before the object has been seen."""
+        """Start before the object has been seen."""
         self._known = False  # the object has been seen since the last alarm
         self._since: float | None = None  # s, of the first refused snapshot
         self._times = 0

@@ -1,4 +1,4 @@
-"""Is a camera getting dirty, or out of focus? Compare its blobs with what it used to see at that place."""
+"""Detect dirt and defocus by comparing a camera's blobs with earlier ones at the same place."""
 
 from __future__ import annotations
 
@@ -18,45 +18,45 @@ from imgcal.online.rig_state import RigState
 Array = NDArray[np.float64]
 
 BLOCK = 1.0
-"""Seconds of snapshots that are averaged into one block."""
+"""Duration of a block, whose snapshots are averaged."""
 INTERVAL = 0.06
-"""Seconds between snapshots that are looked at, at least: more of them say the same."""
+"""Minimum time between evaluated snapshots: more of them add nothing."""
 LEAST_FIDUCIALS = np.array((10.0, 10.0, 20.0))
-"""Fiducials in a block, for each measure; a block with fewer goes on."""
+"""Minimum number of fiducials in a block, for each measure; a block with fewer continues."""
 LONGEST = 60.0
-"""Seconds after which an unfinished block is discarded: the object was away."""
+"""Age (s) at which an unfinished block is discarded: the object was away."""
 CORRELATION_SECONDS = 4.0
 """Time constant of what place and distance do not explain: arms in front, motion blur, the object's attitude. On the
 ten-camera stream the autocorrelation at one second is below 0.3 for nine cameras and 0.6 for the tenth."""
 CENTRES = (-2 / 3, 0.0, 2 / 3)
-"""Centres of the local terms across and down the image, in halves of its size from its middle ..."""
+"""Centres of the local terms across and down the image, relative to its centre, in half image sizes ..."""
 WIDTH = 0.5
 """... and the standard deviation of each."""
 FEATURES = 1 + len(CENTRES) ** 2 + 2 + 3  # constant, local terms, log distance and its square, direction
 SPREAD = np.array((0.03, 0.15, 0.1))
-"""Standard deviations of a block at least: size (3 %), sigma (15 %), share missing (0.1, on the real stream)."""
+"""Minimum standard deviations of a block: size (3 %), sigma (15 %), share missing (0.1, on the real stream)."""
 PRIOR = np.array(((10.0, 0.1, 0.3, 0.1), (10.0, 0.5, 2.0, 0.5), (0.3, 0.2, 0.2, 0.2)))
 """Prior standard deviations of the coefficients of each measure: constant, local terms, distance, direction."""
 PRIOR_BLOCKS = 20
-"""Blocks that the prior `SPREAD` counts for."""
+"""Weight of the prior `SPREAD`, in blocks."""
 MEMORY = 600
-"""Blocks over which the spread is averaged."""
+"""Number of blocks over which the spread is averaged."""
 LEARNT = 0.1
-"""Variance of the expected value, in variances of a block, below which a place is known: it is only tested there, so
-that slow changes are not learnt."""
+"""A place is known if the variance of its expected value is below this, in variances of a block. Only known places are
+tested; nothing is learnt there, so that slow changes are not absorbed."""
 SUSPICION = 0.3
-"""Of the threshold of an alarm, from which nothing is learnt: it may be the fault that is looked for."""
+"""Share of the alarm threshold above which nothing is learnt: it may be the fault itself."""
 RUN_LENGTH = 1e7
-"""Blocks between two false alarms of a camera and measure if blocks were normal: four months in view."""
+"""Mean number of blocks between false alarms of a camera and measure, if blocks were normal: four months in view."""
 REFERENCE = 0.5
-"""Standard deviations of a block that are subtracted from each."""
+"""Standard deviations that are subtracted from each block."""
 MOST_SPREADS = np.array((4.0, 4.0, 1.0))
-"""Standard deviations for which one block counts at most. An arm in front of a camera hides fiducials for seconds, dirt
-until somebody cleans: evidence that they are missing grows with time alone, and suffices after half a minute."""
+"""Maximum number of standard deviations that one block counts for. An arm hides fiducials for seconds, dirt until it is
+cleaned: evidence for missing fiducials grows with time alone, and suffices after half a minute."""
 COMMON = 4
-"""Cameras from which what most see alike (a fast object, a hand, a weak lamp) is the fault of none of them."""
+"""Minimum number of cameras for a shared effect (a fast object, a hand, a weak lamp) to be blamed on none of them."""
 CLEAN, CLEAN_BLOCKS = 1.5, 5
-"""Standard deviations below which a block is as usual, and how many of them in a row end an alarm."""
+"""Standard deviations below which a block is normal, and how many such blocks in a row end an alarm."""
 MESSAGES: tuple[tuple[EventKind, str], ...] = (
     ("defocused", "shows larger blobs than it used to: out of focus"),
     ("dirty", "shows fainter blobs than it used to: dirty, or badly lit"),
@@ -65,39 +65,39 @@ MESSAGES: tuple[tuple[EventKind, str], ...] = (
 
 
 class ImageQuality:
-    """Follows three measures of each camera: size and sigma of its blobs, and the share of fiducials that it misses.
+    """Tracks three measures of each camera: size and sigma of its blobs, and the share of fiducials that it misses.
 
-    Each is averaged over a second and compared with a regression on where the object is in the image, how far away and
-    seen from which side, learnt from the camera's own history. Places that it does not know yet are learnt; known
-    ones are tested. What remains is correlated in time: its innovations feed Page's cumulative sum.
+    Each is averaged over a second and compared with a regression on the object's place in the image, its distance and
+    the viewing direction, learnt from the camera's own history. New places are learnt, known ones are tested. The
+    remainder is correlated in time, so its innovations feed Page's cumulative sum.
     """
 
     name = "image quality"
 
     def __init__(self, cameras: int) -> None:
-        """Begin with cameras whose images are good."""
+        """Start with cameras whose images are good."""
         shape = (3, cameras)
-        self._distance = np.zeros(cameras)  # log mm, the first one; 0 = the object has not been seen
-        self._began: float | None = None  # s, of the block
-        self._collected = -math.inf  # s, of the last snapshot in it
+        self._distance = np.zeros(cameras)  # log mm, first distance; 0 = object not seen yet
+        self._began: float | None = None  # s, start of the block
+        self._collected = -math.inf  # s, its last snapshot
         self._count = np.zeros(shape)  # fiducials in the block ...
         self._sum, self._place = np.zeros(shape), np.zeros((*shape, FEATURES))  # ... sums of values and of features
         self._last_time = np.full(shape, -1e9)  # s, of the last block ...
-        self._last_value, self._last_place = np.zeros(shape), np.zeros((*shape, FEATURES))  # ... and what it was
+        self._last_value, self._last_place = np.zeros(shape), np.zeros((*shape, FEATURES))  # ... and its contents
         self._coefficients = np.zeros((*shape, FEATURES))
         self._covariance = np.broadcast_to(_prior()[:, None], (*shape, FEATURES, FEATURES)).copy()
         self._variance = np.repeat(SPREAD[:, None] ** 2, cameras, 1)  # of a block
         self._blocks = np.zeros(shape)
-        self._usual = np.zeros(shape)  # blocks in a row that are as usual
+        self._usual = np.zeros(shape)  # successive normal blocks
         self._bad = np.zeros(shape, dtype=bool)
-        self._good = np.zeros(shape)  # s, until when nothing spoke for worse
+        self._good = np.zeros(shape)  # s, last time without a sign of a fault
         self._test = Cusum(3 * cameras, REFERENCE, RUN_LENGTH)
 
     def __call__(
         self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: MeasurementUpdate | None
     ) -> Iterable[Event]:
         """See `SequentialTest`."""
-        if self._began is None:  # also after a restart: what was before is not known to the second
+        if self._began is None:  # also after a restart, when earlier times are not exact
             self._good[:] = state.time
         self._good = np.minimum(self._good, state.time)  # clocks may be set back
         if self._began is None or not 0 <= state.time - self._began < LONGEST:
@@ -127,7 +127,7 @@ class ImageQuality:
         count[:2], value[:2] = _medians(measured)
         seen = np.zeros(shape, dtype=bool)
         seen[at] = True
-        others_tell = (seen.sum(0) - seen >= 2) & seen.any(axis=1, keepdims=True)  # of a camera that is not out
+        others_tell = (seen.sum(0) - seen >= 2) & seen.any(axis=1, keepdims=True)  # for a camera with data
         inside = well_inside(state.predicted, rig)
         asked = inside & others_tell
         unlabelled = np.bincount(blobs.camera[blobs.fiducial < 0], minlength=shape[0])  # each may be one of these
@@ -140,11 +140,11 @@ class ImageQuality:
         self._place += np.where(count[..., None] > 0, count[..., None] * place, 0.0)
 
     def _discard(self, which: NDArray[np.bool_]) -> None:
-        """Begin the blocks of some measures and cameras anew."""
+        """Restart the blocks of some measures and cameras."""
         self._count[which], self._sum[which], self._place[which] = 0.0, 0.0, 0.0
 
     def _judge(self, state: RigState) -> list[Event]:
-        """Compare the blocks that are complete with what is expected, and learn from them."""
+        """Compare complete blocks with their expectation, and learn from them."""
         done = self._count >= LEAST_FIDUCIALS[:, None]
         total = np.maximum(self._count, 1)
         value, place = self._sum / total, self._place / total[..., None]
@@ -176,7 +176,7 @@ class ImageQuality:
         return events
 
     def _report(self, state: RigState, worse: NDArray[np.bool_], better: NDArray[np.bool_], z: Array) -> list[Event]:
-        """Make the events of measures that became worse, and of cameras that are as before."""
+        """Make the events of measures that became worse, and of cameras that recovered."""
         events, names = [], state.factory.camera_names
         was = self._bad.any(0)
         for number, camera in zip(*np.nonzero(worse), strict=True):
@@ -219,7 +219,7 @@ def _prior() -> Array:
 
 
 def _medians(values: Array) -> tuple[NDArray[np.int64], Array]:
-    """Count finite values along the last axis, and take their median; 0 where there are none."""
+    """Count finite values along the last axis, and take their median; 0 if there are none."""
     finite = np.isfinite(values)
     count = finite.sum(-1)
     ordered = np.sort(np.where(finite, values, np.inf), axis=-1)
@@ -229,13 +229,13 @@ def _medians(values: Array) -> tuple[NDArray[np.int64], Array]:
 
 
 def _place(state: RigState, points: Array, inside: NDArray[np.bool_], reference: Array) -> Array:
-    """Describe where each camera sees the object: (C, F); nan where it should not see it.
+    """Describe where each camera sees the object: (C, F); nan if it should not see it.
 
     Args:
         state: with a pose and predictions of the fiducials.
         points: (C, N, 3) mm, the fiducials in the frame of each camera.
-        inside: (C, N), those that are well inside of the image.
-        reference: (C,) logarithms of the first distances (mm); 0 = not known yet, which is filled in.
+        inside: (C, N), fiducials well inside the image.
+        reference: (C,) logarithms of the first distances (mm); 0 = unknown, which is filled in.
     """
     rig, pose = state.rig, state.rig_from_object
     assert pose is not None
@@ -254,7 +254,7 @@ def _place(state: RigState, points: Array, inside: NDArray[np.bool_], reference:
 
 
 def _own_part(z: Array) -> Array:
-    """Subtract what most cameras see alike (3, C), where there are enough of them."""
+    """Subtract the effect shared by most cameras from z (3, C), if there are enough cameras."""
     enough = np.isfinite(z).sum(1) >= COMMON
     common = np.zeros(len(z))
     common[enough] = np.maximum(np.nanmedian(z[enough], axis=1), 0.0)

@@ -1,4 +1,4 @@
-"""A rig that is kept calibrated: every snapshot is learnt once, what moves is told, and nothing else is forgotten."""
+"""A rig that is kept calibrated: it learns from every snapshot once, reports cameras that move, and forgets nothing."""
 
 from __future__ import annotations
 
@@ -70,26 +70,26 @@ class RigKeeper:
 
         Args:
             rig: the factory calibration, without batch axes.
-            obj: the calibration object, or `UnknownLights`: whatever moves through the volume.
-            options: how sure labels must be, and how to minimize.
+            obj: the calibration object, or `UnknownLights`: anything that moves through the volume.
+            options: how certain labels must be, and how to minimize.
             detection: how blobs are found.
-            detector: who finds the fiducials in frames, as for `calibrate`.
-            drift: how fast values wander; None = as the rig says.
-            horizon: number of latest snapshots that the rig is known by, beside its factory calibration; None = all
-                that ever came, each worth less as the rig may have wandered. More know it better and follow it more
-                slowly. Of two and more, one and up to a quarter more count at times. A camera that none of them shows
+            detector: how fiducials are found in frames, as for `calibrate`.
+            drift: drift rates; None = as in the rig.
+            horizon: number of latest snapshots that count beside the factory calibration; None = all, with weights that
+                decrease as the rig may have drifted. A longer horizon is more accurate but slower to follow changes.
+                From two on, one and up to a quarter more count at times. A camera that none of the snapshots shows
                 keeps its last values.
-            tests: what else watches each snapshot; None = `default_tests`.
+            tests: other tests of each snapshot; None = `default_tests`.
         """
         if obj.pose_rank == 3 and not isinstance(obj, UnknownLights):
             obj = UnknownLights.of() if obj.unknown_markers else UnknownLights.of_light(obj)
         if horizon is not None and horizon < 1:
             raise InputError(f"horizon: found {horizon}, expected at least 1 snapshot")
         if horizon is not None and isinstance(obj, UnknownLights):
-            raise InputError("horizon: a rig known by unknown lights learns from all snapshots; leave the horizon out")
+            raise InputError("horizon: with unknown lights, the rig needs all snapshots; leave the horizon out")
         self.options = _for_keeping(options)
         self._memory = KeeperMemory.from_factory(rig, obj, drift, self.options, horizon)
-        usual = () if isinstance(obj, UnknownLights) else default_tests(rig.num_cameras)  # all of them ask for a body
+        usual = () if isinstance(obj, UnknownLights) else default_tests(rig.num_cameras)  # all need a rigid object
         self.tests = tuple(usual if tests is None else tests)
         clocks = (test for test in self.tests if isinstance(test, ClockOffsets))
         self._clock = next(clocks, ClockOffsets(rig.num_cameras))
@@ -102,32 +102,32 @@ class RigKeeper:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the threads."""
+        """Stop the threads."""
         self._labelling.close()
 
     @property
     def factory(self) -> CameraRig:
-        """The factory calibration that motion is told against."""
+        """The factory calibration, relative to which motion is reported."""
         return self._memory.factory
 
     @property
     def obj(self) -> CalibrationObject:
-        """The calibration object, as it was given."""
+        """The calibration object, as given."""
         return self._memory.obj
 
     @property
     def belief(self) -> RigBelief:
-        """What is known of the rig now."""
+        """The current belief about the rig."""
         return self._memory.belief
 
     @property
     def given(self) -> CameraRig:
-        """The factory calibration that it began with, whatever has been accepted as one since."""
+        """The factory calibration at the start, even if another one has been accepted since."""
         return self._memory.prior
 
     @property
     def noise(self) -> float:
-        """Noise (px, one standard deviation) that blobs have shown beyond what they say of themselves."""
+        """Noise (px, one standard deviation) of the blobs beyond their own sigmas."""
         return float(np.median(self._memory.noise.additive))
 
     def update(
@@ -136,17 +136,17 @@ class RigKeeper:
         """Learn from a snapshot.
 
         Args:
-            source: frames by camera, (H, W), None = no frame; or blobs that were found elsewhere, labelled or not.
-            time: s since the epoch. A time before the last one counts as the same time.
-            silent: cameras that sent nothing, where blobs come: without it, they are taken to have seen nothing. Of
-                frames, those that have none are.
+            source: frames by camera, (H, W), None = no frame; or blobs found elsewhere, labelled or not.
+            time: s since the epoch. A time before the previous one counts as equal to it.
+            silent: cameras without data, if `source` is blobs; other cameras without blobs count as having seen
+                nothing. If `source` is frames, cameras without a frame are silent.
 
         Returns:
-            What is known now. A snapshot that cannot decide teaches nothing: `refused` says why.
+            The current state. A snapshot that cannot be used teaches nothing: `refused` says why.
 
         Raises:
-            InputError: a frame is no grey image, of another size than the rig says, or of a camera that the rig does
-                not have; blobs of more than one snapshot; a time that is none.
+            InputError: a frame is not a grey image, has another size than the rig says, or is of a camera that is not
+                in the rig; blobs of more than one snapshot; an invalid time.
         """
         if not (math.isfinite(time) and 0 <= time <= GREATEST_TIME):
             raise InputError(f"time: found {time!r}, expected seconds since the epoch")
@@ -174,16 +174,15 @@ class RigKeeper:
     def _label(
         self, detections: Detections, lag: NDArray[np.float64], frames: Mapping[str, Frame | None] | None
     ) -> tuple[Labelled, Detections, NDArray[np.float64]]:
-        """Label a snapshot whose blobs are shifted to where they would have been in time.
+        """Label a snapshot whose late blobs are moved to where they would have been in time.
 
         Args:
             detections: its blobs.
-            lag: (M, 2) pixels by which they are shifted, as far as that is known before they are labelled.
-            frames: those that the blobs were found in; None = there are none.
+            lag: (M, 2) pixels by which they are moved, as far as known before labelling.
+            frames: frames that the blobs were found in; None = there are none.
 
         Returns:
-            The shifted blobs with their labels, all blobs with theirs, where they were seen, and by how much these are
-            to be shifted.
+            The moved blobs with their labels, the labelled blobs where they were seen, and the shifts between them.
 
         Raises:
             RefusedError: see `label_snapshot`.
@@ -193,7 +192,7 @@ class RigKeeper:
         usable = shift_blobs(detections.select(rows), lag[rows], late)
         labelled = label_snapshot(memory, self._labelling, usable, detections.snapshot_names[0], frames)
         found = labelled.checked.blobs
-        if len(found) != len(rows):  # those of a proposer
+        if len(found) != len(rows):  # blobs of a proposer
             return labelled, found, np.zeros((len(found), 2))
         fiducial = np.full(len(detections), -1, dtype=np.int64)
         fiducial[rows] = found.fiducial
@@ -205,17 +204,17 @@ class RigKeeper:
         return labelled, shown, lag
 
     def _lag(self, blobs: Detections, *now: tuple[float, RigidTransform]) -> NDArray[np.float64]:
-        """By how much blobs are off where they would have been in time: (M, 2) pixels."""
+        """Shift of each blob to where it would have been in time: (M, 2) pixels."""
         memory = self._memory
         return clock_shifts(blobs, self._clock.late, memory.belief, [*memory.poses, *now], memory.time)
 
     def _report_findings(self, found: MonitorUpdate) -> list[Event]:
-        """Say what the monitor found with a snapshot that was learnt."""
+        """Report what the monitor found with an absorbed snapshot."""
         memory, events = self._memory, []
         for change in found.changes:
             since = memory.change_time(change.since, change.camera)
             told = memory.relearning.events.get(change.camera)
-            if told is not None and told.change == "unknown" and told.since is not None:  # the same, told again
+            if told is not None and told.change == "unknown" and told.since is not None:  # a repeated report
                 since = told.since
             events.append(memory.relearning.report_change(change, since, memory.time, memory.count - 1, memory.before))
         if (of_object := found.object_change) is not None:
@@ -225,7 +224,7 @@ class RigKeeper:
     def _state(
         self, shown: Detections, lag: NDArray[np.float64], result: MeasurementUpdate | None, refused: str | None
     ) -> RigState:
-        """What is known now, without health and events."""
+        """The current state, without health and events."""
         memory, pose = self._memory, None if result is None else result.rig_from_object
         predicted, cameras = memory.predicted(pose), memory.prior.num_cameras
         residual = np.full(cameras, np.nan)
@@ -265,7 +264,7 @@ class RigKeeper:
         found: MonitorUpdate | None,
         events: list[Event],
     ) -> RigState:
-        """Add what became known of cameras, and what is said of them."""
+        """Add the health of the cameras and the events to a state."""
         memory, time, number = self._memory, state.time, state.snapshot
         names = memory.prior.camera_names
         for slip in () if found is None else found.slips:
@@ -274,7 +273,7 @@ class RigKeeper:
         for camera in () if found is None else found.unsynchronized:
             events.append(unsynchronized_event(names[camera], memory.off.get(camera, time), time, number))
         silent = (camera for camera, name in enumerate(names) if name in out)
-        # A camera with moments of its own has not moved far.
+        # An unsynchronized camera has not moved far.
         astray = frozenset() if labelled is None else labelled.astray - memory.monitor.quarantine.cameras
         look = VisibleObject(time, number, state.detections, state.predicted, astray, frozenset(silent))
         events += memory.sightings.observe(state.rig, look)
@@ -291,15 +290,15 @@ class RigKeeper:
         health = camera_health(memory)
         sentence = describe_health(health, memory.monitor.filter.count)
         if memory.lights is not None and memory.monitor.filter.count:
-            sentence += f"; their scale is known to +- {100 * memory.belief.scale_std():.2g} %, by no light"
+            sentence += f"; the scale is known to +- {100 * memory.belief.scale_std():.2g} % (lights cannot improve it)"
         lights = None if labelled is None else labelled.checked.lights
         return replace(state, cameras=health, events=tuple(events), sentence=sentence, lights=lights)
 
     def accept_as_factory(self) -> Event:
-        """Make the present rig the factory calibration that motion is told against; what is known stays known.
+        """Make the current rig the factory calibration, relative to which motion is reported; the belief is unchanged.
 
         Returns:
-            The event, which comes with the next state, too.
+            The event, which is also part of the next state.
 
         Raises:
             RefusedError: no snapshot has come yet.
@@ -315,10 +314,10 @@ class RigKeeper:
         return memory.pending[-1]
 
     def saved(self, progress: dict[str, Any] | None = None) -> KeeperFile:
-        """Take down all that is known, within milliseconds; the result can be written while the keeper goes on.
+        """Copy the state, within milliseconds; the copy can be written while the keeper continues.
 
         Args:
-            progress: what else is to be found in the file, in the same step: how far a source has been worked on.
+            progress: anything else to save in the same step, such as the position in a source.
         """
         memory = self._memory
         health = camera_health(memory)
@@ -342,10 +341,10 @@ class RigKeeper:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write all that is known to a file, in one step: JSON, the part for people first.
+        """Save the state to a file atomically: JSON, the readable part first.
 
         Raises:
-            InputError: it cannot be written.
+            InputError: the file cannot be written.
         """
         self.saved().write(path)
 
@@ -359,17 +358,17 @@ class RigKeeper:
         detector: DetectorName | Proposer = "classical",
         tests: Sequence[SequentialTest] | None = None,
     ) -> RigKeeper:
-        """Go on where `save` was called: the same snapshots give the same states.
+        """Resume from a saved state: the same snapshots then give the same states.
 
         Args:
-            path: the file; factory calibration and object stand in it.
+            path: the file, which includes the factory calibration and the object.
             options: as for a new one.
             detection: as for a new one.
             detector: as for a new one.
-            tests: as for a new one, those that were saved go on.
+            tests: as for a new one; their saved states are restored.
 
         Raises:
-            InputError: the file is none of ours, or was changed.
+            InputError: the file is not a saved state, or was changed.
         """
         found, reader = read_state(path)
         try:
@@ -392,5 +391,5 @@ class RigKeeper:
 
 
 def _for_keeping(options: PipelineOptions) -> PipelineOptions:
-    """Options with which a camera may be blind: it is told, and no reason to refuse a snapshot."""
+    """Options under which a camera may be blind: this is reported, but no snapshot is refused for it."""
     return replace(options, blind_cameras=True)

@@ -1,4 +1,4 @@
-"""The file of a rig that is kept calibrated: what people want to read, and all that is needed to go on exactly."""
+"""The state file of a rig that is kept calibrated: a readable part, and everything needed to resume exactly."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from imgcal.online.state_document import StateReader, StateWriter
 from imgcal.types import CalibrationObject, CameraRig
 
 FORMAT = "imgcal-keeper/6"
-"""The number rises with every change of a key or type of `state_document`; a state of another version is not read."""
+"""Raise the number when a key or type of `state_document` changes; a state of another version is not read."""
 MOST_BYTES = 2**28
 
 
 @dataclass(frozen=True)
 class KeeperFile:
-    """A keeper at one moment. Made within milliseconds; `write` may run in another thread, while the keeper goes on."""
+    """A keeper's state at one moment, made within milliseconds; `write` may run in another thread meanwhile."""
 
     time: float
     snapshot: int
@@ -31,12 +31,12 @@ class KeeperFile:
     rig: CameraRig
     factory: CameraRig
     obj: CalibrationObject
-    state: dict[str, Any]  # plain values, which refer to ...
-    tables: StateWriter  # ... the arrays and beliefs of this
-    progress: dict[str, Any] | None = None  # of whoever saves it
+    state: dict[str, Any]  # plain values that refer to ...
+    tables: StateWriter  # ... the arrays and beliefs in here
+    progress: dict[str, Any] | None = None  # the caller's
 
     def text(self) -> str:
-        """What the file holds: JSON, the part for people first."""
+        """Content of the file: JSON, the readable part first."""
         readable = {
             "format": FORMAT,
             "time": iso_time(self.time),
@@ -53,10 +53,10 @@ class KeeperFile:
         return f'{start},\n "state": {state}\n}}\n'
 
     def write(self, path: str | Path) -> None:
-        """Replace the file in one step.
+        """Replace the file atomically.
 
         Raises:
-            InputError: it cannot be written.
+            InputError: the file cannot be written.
         """
         write_text(path, self.text())
 
@@ -66,7 +66,7 @@ def _digest(state: str) -> str:
 
 
 def read_state(path: str | Path) -> tuple[dict[str, Any], StateReader]:
-    """Read the state of a keeper: plain values, and the reader of them.
+    """Read a keeper's state: plain values, and a reader for them.
 
     Raises:
         InputError: one line with the file, what was found and what was expected.
@@ -104,5 +104,5 @@ def read_state(path: str | Path) -> tuple[dict[str, Any], StateReader]:
 
 
 def unusable(path: str | Path, error: Exception) -> InputError:
-    """Say that a file was changed since it was written."""
+    """Make the error for a file that was changed since it was written."""
     return InputError(f"{path}: the state was changed since it was written, or is damaged ({shorten(str(error))})")

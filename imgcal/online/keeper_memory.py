@@ -1,4 +1,4 @@
-"""All that a keeper knows from snapshot to snapshot: what is saved, and what a file must hold to be gone on with."""
+"""Everything a keeper remembers between snapshots: what is saved, and what a file must contain to be resumed."""
 
 from __future__ import annotations
 
@@ -38,23 +38,23 @@ from imgcal.types import (
 )
 
 UNUSUAL = 5.0
-"""Times as far off as most cameras usually are, from which it is not the cameras but labels or pose that are wrong."""
+"""Error of most cameras, in multiples of its usual size, above which labels or pose must be wrong, not the cameras."""
 LEAST_LOOKS = 8
-"""Snapshots of a camera, from where it stands, from which its values say where its labels must be."""
+"""Number of snapshots of a camera in its current pose after which its labels can be predicted."""
 LEAST_USUAL = 8
-"""Snapshots that say how far off most cameras usually are."""
+"""Number of snapshots that define the usual error of most cameras."""
 
 
 @dataclass
 class KeeperMemory:
-    """What is known of a rig, of its object and of what is going on; changed in place."""
+    """What is known about a rig and its object, and what is in progress; changed in place."""
 
-    options: PipelineOptions = field(metadata=NOT_SAVED)  # the caller gives its own on resuming
+    options: PipelineOptions = field(metadata=NOT_SAVED)  # given by the caller on resuming
     factory: CameraRig
-    obj: CalibrationObject  # as its file says
+    obj: CalibrationObject  # as in its file
     drift: DriftRate | None
     horizon: int | None  # latest snapshots that count; None = all
-    prior: CameraRig  # what the filter began with
+    prior: CameraRig  # the filter's initial rig
     monitor: RigMonitor
     noise: NoiseLevel
     sightings: CameraVisibility
@@ -62,18 +62,18 @@ class KeeperMemory:
     drift_watch: DriftWatch
     doubts: ObjectChecks
     search: Search
-    looks: NDArray[np.int64]  # (C,) snapshots learnt from each camera where it stands
-    before: RigBelief  # from before what is being decided
+    looks: NDArray[np.int64]  # (C,) snapshots learnt of each camera in its current pose
+    before: RigBelief  # before the pending changes
     lights: LightTracks | None = None  # None = an object is known
     count: int = 0
-    learnt: float | None = None  # s, time of the last snapshot that was learnt
+    learnt: float | None = None  # s, time of the last absorbed snapshot
     times: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=512))  # number in the filter, time
     poses: deque[tuple[float, RigidTransform]] = field(default_factory=lambda: deque(maxlen=POSES))  # (1,), the latest
-    labels: int = 0  # of the last snapshot
+    labels: int = 0  # number in the last snapshot
     usual: deque[float] = field(default_factory=lambda: deque(maxlen=64))  # px
-    off: dict[int, float] = field(default_factory=dict)  # cameras that did not fit in the last snapshot -> since when
-    in_vain: int = 0  # snapshots in a row in which no camera fits
-    told_health: dict[int, CameraHealth] = field(default_factory=dict)  # by tests
+    off: dict[int, float] = field(default_factory=dict)  # camera that did not fit last -> since when
+    in_vain: int = 0  # successive snapshots that fit in no camera
+    told_health: dict[int, CameraHealth] = field(default_factory=dict)  # as reported by tests
     pending: list[Event] = field(default_factory=list)
     time: float = 0.0
 
@@ -86,10 +86,10 @@ class KeeperMemory:
         options: PipelineOptions,
         horizon: int | None = None,
     ) -> KeeperMemory:
-        """Begin with a factory calibration; what snapshots taught a calibration lies beyond any horizon.
+        """Start with a factory calibration; with a horizon, earlier calibration snapshots do not count.
 
         Raises:
-            InputError: the rig or the object cannot be, or the object's fiducials lie on one line.
+            InputError: the rig or the object is invalid, or the object's fiducials are collinear.
         """
         if not isinstance(obj, UnknownLights):
             obj.require_rigid("for a running rig")
@@ -121,19 +121,19 @@ class KeeperMemory:
         self.noise.restart()
         self.usual.clear()
         self.times.clear()
-        message = "no camera is where it was: learning begins again with the factory calibration"
+        message = "all cameras have moved: learning starts again from the factory calibration"
         self.pending.append(Event(self.time, self.count - 1, "restart", message=message))
 
     @property
     def belief(self) -> RigBelief:
-        """What is known of the rig now."""
+        """The current belief about the rig."""
         return self.monitor.filter.belief
 
     def elapsed(self, time: float) -> float:
-        """Seconds since the last snapshot that was learnt, as far as they count.
+        """Seconds since the last absorbed snapshot, limited to a useful range.
 
-        In longer ones no more is forgotten: one kind of value may have wandered as far as the factory calibration may
-        be off. Clocks that were set (from 1970, after a start) are not taken for years in which everything wandered.
+        Longer times forget no more: one kind of value may then be as far off as in the factory calibration. Also, a
+        clock that is set (from 1970, after a start) does not count as years of drift.
         """
         if self.learnt is None:
             return 0.0
@@ -143,25 +143,25 @@ class KeeperMemory:
 
     @property
     def obj_now(self) -> CalibrationObject:
-        """The object as it is known now."""
-        known = self.belief.obj  # with tolerances, also where an exact one has changed
+        """The object as currently estimated."""
+        known = self.belief.obj  # with tolerances, even if an exact object has changed
         return self.obj if known.exact else replace(self.obj.taken_as_exact(), points=self.belief.points_object)
 
     @property
     def surroundings(self) -> Surroundings | None:
-        """The rig, and with some reserve how well it is known; None = nothing but the factory calibration."""
+        """The rig and its uncertainty with a margin; None = nothing but the factory calibration is known."""
         if not self.monitor.filter.count:
             return None
         return Surroundings(self.belief, (self.prior.prior or RigPrior()).std(self.prior), self.obj_now, self.options)
 
     @property
     def settled(self) -> frozenset[int]:
-        """Cameras that every snapshot within the horizon shows where they stand now; none without a horizon."""
+        """Cameras that every snapshot within the horizon shows in their current poses; empty without a horizon."""
         return frozenset() if self.horizon is None else frozenset(np.flatnonzero(self.looks >= self.horizon).tolist())
 
     @property
     def most_usual(self) -> float:
-        """How far off most cameras may be, px."""
+        """Maximum error of most cameras, px."""
         if len(self.usual) < LEAST_USUAL:
             return math.inf
         return self.options.identity_error + UNUSUAL * max(
@@ -169,7 +169,7 @@ class KeeperMemory:
         )
 
     def predicted(self, pose: RigidTransform | None) -> NDArray[np.float64]:
-        """Where the rig puts the fiducials of an object in a pose (1,): (C, N, 2) pixels; None = nan."""
+        """Project the fiducials of an object in a pose (1,): (C, N, 2) pixels; nan without a pose."""
         if pose is None:
             return np.full((self.prior.num_cameras, self.obj.num_fiducials, 2), np.nan)
         points = self.belief.points_at(pose)
@@ -177,28 +177,28 @@ class KeeperMemory:
         return uv
 
     def observed(self, blobs: Detections) -> Observations:
-        """Labelled blobs of a snapshot with the noise that they have shown: (1, C, N)."""
+        """Labelled blobs of a snapshot with their estimated noise: (1, C, N)."""
         seen = to_observations(blobs, self.prior, self.obj)
         additive = torch.from_numpy(self.noise.additive)[:, None]
         return replace(seen, sigma=torch.hypot(seen.sigma, additive))
 
     def change_time(self, number: int, camera: int | None = None) -> float:
-        """When it happened what the filter found since a snapshot of this number, to a camera or the object: s."""
+        """Time (s) of a change, found by the filter since snapshot `number`, of a camera or the object."""
         since = next((time for learnt, time in self.times if learnt >= number), self.time)
         return since if camera is None else self.search.lost_since(camera, min(since, self.off.get(camera, since)))
 
     @classmethod
     def restored(cls, reader: StateReader, plain: dict[str, Any], options: PipelineOptions) -> KeeperMemory:
-        """Take over what a file says.
+        """Restore the memory from a file.
 
         Args:
             reader: of the file.
-            plain: what it says of all that is remembered.
+            plain: the file's values for it.
             options: as for a new one.
 
         Raises:
-            ValueError: it is not that, or belongs to another rig and object.
-            InputError: a rig or an object in it is none.
+            ValueError: the values are invalid, or belong to another rig and object.
+            InputError: the file contains an invalid rig or object.
         """
         rig, obj = reader.read(CameraRig, plain["prior"], "prior"), reader.read(CalibrationObject, plain["obj"], "obj")
         drift = reader.read(DriftRate | None, plain["drift"], "drift")

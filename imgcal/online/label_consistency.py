@@ -1,10 +1,10 @@
-"""Which labels of a snapshot fit a rig that is known: single ones that do not are strays, most of a camera's a move.
+"""Compare a snapshot's labels with the rig: single labels that do not fit are strays, most of a camera's mean a move.
 
-A blob that may be two fiducials in one lies between them, by less than shows: it has no label, either.
+A blob that may consist of two fiducials lies between them, unnoticeably; it loses its label, too.
 
-Where a camera turns, shifts or zooms a little, its image of the object is turned, shifted or stretched as a whole. What
-is left of each camera's residuals without such a motion of its image tells strays; the motion itself, against that of
-most cameras, tells whether the camera is where it was.
+If a camera rotates, shifts or zooms a little, its image of the object rotates, shifts or stretches as a whole. The
+residuals left after removing such an image motion show the strays. The motion itself, relative to that of most cameras,
+shows whether the camera has moved.
 """
 
 # Compiled functions take their types from their arguments.
@@ -26,27 +26,27 @@ from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 from renderers.compiling import njit
 
 MOST_APART = 5.0
-"""Times what is usual in a snapshot that a label, or the image of a whole camera, may be off."""
+"""Maximum error of a label, or of a camera's whole image, in multiples of the usual error in a snapshot."""
 LEAST_LABELS = 3
-"""Of a camera, from which it can be said that they agree with each other."""
+"""Number of a camera's labels needed to tell whether they agree."""
 LEAST_AGREEING = 0.5
-"""Share of a camera's labels that must agree with each other."""
+"""Share of a camera's labels that must agree."""
 DEPTH = 0.2
-"""Of the motion of a camera's image, what the object's depth may add to single fiducials."""
+"""Contribution of the object's depth to single fiducials, as a share of the image motion."""
 ROUNDS = 6
 
 
 @dataclass(frozen=True)
 class Checked:
-    """Labels of a snapshot, and how they go with a rig."""
+    """Labels of a snapshot, and how they fit a rig."""
 
-    blobs: Detections  # strays, and blobs that may be two fiducials in one, have lost their labels
+    blobs: Detections  # without the labels of strays and of blobs that may be two fiducials
     given: Detections  # the same, with all labels
-    rig_from_object: RigidTransform  # (1,) most probable for the rig as it is known
-    off: NDArray[np.bool_]  # (C,) the labels agree with each other, and lie elsewhere
-    usual: float  # px, how far off the image of a camera is: the median of all cameras
+    rig_from_object: RigidTransform  # (1,) most probable given the current rig
+    off: NDArray[np.bool_]  # (C,) the labels agree with each other, but not with the rig
+    usual: float  # px, median over all cameras of the error of the image
     labels: int
-    lights: FoundLights | None = None  # all that were found, not only those with numbers; None = an object is known
+    lights: FoundLights | None = None  # all lights found, also those without numbers; None = an object is known
 
 
 def check_labels(
@@ -56,14 +56,14 @@ def check_labels(
     rig_from_object: RigidTransform,
     options: PipelineOptions,
 ) -> Checked:
-    """Fit the object's pose with a rig that is known, and see which labels do not go with it.
+    """Fit the object's pose with a known rig, and find the labels that do not fit.
 
     Args:
         named: blobs of one snapshot, labelled.
-        rig: as it is known.
-        obj: the calibration object, as it is known.
+        rig: as currently estimated.
+        obj: the calibration object, as currently estimated.
         rig_from_object: (1,) first guess of its pose.
-        options: how far blobs may be off at all.
+        options: maximum error of blobs.
 
     Raises:
         RefusedError: the labels do not determine the pose.
@@ -75,19 +75,19 @@ def check_labels(
     rest, moved = np.full(there.shape, np.nan), np.full(len(there), np.nan)
     _compare(uv, fit.residual, there, options.identity_error, rest, moved)
     usual_rest = float(np.median(rest[there])) if there.any() else 0.0
-    told = np.isfinite(moved)
-    usual = float(np.median(moved[told])) if told.any() else 0.0
+    measured = np.isfinite(moved)
+    usual = float(np.median(moved[measured])) if measured.any() else 0.0
     least = options.identity_error + MOST_APART * usual_rest
     stray = there & (rest > least + DEPTH * np.nan_to_num(moved)[:, None])
-    off = told & (np.nan_to_num(moved) > options.identity_error + MOST_APART * usual)
+    off = measured & (np.nan_to_num(moved) > options.identity_error + MOST_APART * usual)
     given, left = there.sum(1), (there & ~stray).sum(1)
     nonsense = off & ((left < LEAST_AGREEING * given) | (left < LEAST_LABELS))
     stray |= there & nonsense[:, None]
     off &= ~nonsense
-    # A few labels are compared with the rig, there being nothing else.
+    # Too few labels to agree with each other: compare them with the rig.
     distance = np.linalg.norm(fit.residual, axis=-1)
     limit = options.identity_error + MOST_APART * float(np.median(distance[there])) if there.any() else 0.0
-    stray |= there & ~told[:, None] & (distance > limit)
+    stray |= there & ~measured[:, None] & (distance > limit)
     image = rig.expand(1).project_values(fit.rig_from_object.apply(obj.points), obj.radius)
     stray |= find_merged(named, there & ~stray, image.uv[0].numpy(), image.visible[0].numpy())
     rows = named.fiducial >= 0
@@ -100,10 +100,10 @@ def check_labels(
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _compare(uv, residual, seen, scale, rest, moved):
-    """Write what is left of each label's residual without a motion of its camera's image, and the RMS of the motion.
+    """Write each label's residual without its camera's image motion, and the RMS of that motion.
 
-    The motion is a shift, with four labels a turn and a scale as well, with six a linear map; Cauchy's weights find it
-    from the median shift.
+    The motion is a shift; with four labels also a rotation and a scale, with six a linear map. It is fitted with Cauchy
+    weights, starting from the median shift.
     """
     cameras, fiducials = seen.shape
     at, off, weight = np.empty((fiducials, 2)), np.empty((fiducials, 2)), np.empty(fiducials)

@@ -1,4 +1,4 @@
-"""What a running rig does with each snapshot before anything is estimated: blobs of frames, and labels of blobs."""
+"""Prepare a running rig's snapshots for estimation: find blobs in frames, and label blobs."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from imgcal.pipeline import DetectorName, check_detections, check_frames, choose
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 
 MOST_FOLLOWED = 64
-"""Fiducials of a lattice up to which a snapshot may be labelled by the last prediction alone; a larger one could have
+"""Maximum number of a lattice's fiducials for labels from the last prediction alone: a larger lattice could have
 slipped by a pitch unnoticed."""
 LEAST_FOLLOWED = 0.9
-"""Share of the last snapshot's labels that must be found again, and fit."""
+"""Share of the last snapshot's labels that must be found again and fit."""
 
 NEAR = "near the last prediction"
 
 
 class Labelling:
-    """Finds blobs, and labels those of a snapshot that the last prediction does not label. Owns a pool of threads.
+    """Finds blobs, and labels snapshots that the last prediction does not label. Owns a pool of threads.
 
     Examples:
         >>> import torch, imgcal
@@ -63,7 +63,7 @@ class Labelling:
     ) -> None:
         """Start with the factory calibration; arguments as of `RigKeeper`."""
         self.rig, self.obj, self.options, self.detection = rig, obj, options, detection
-        self.follows = False  # the last snapshot says where the object is now
+        self.follows = False  # the last snapshot predicts the object's pose
         self.slips = obj.num_fiducials > MOST_FOLLOWED and bool(lattice_shifts(obj))
         self._tracker = Tracker(rig, obj, options, remembered=0)
         self._refused = 0
@@ -74,14 +74,14 @@ class Labelling:
         self._pool = ThreadPoolExecutor(min(rig.num_cameras, os.cpu_count() or 1))
 
     def close(self) -> None:
-        """End the threads."""
+        """Stop the threads."""
         self._pool.shutdown()
 
     def blobs(self, source: Mapping[str, Frame | None] | Detections, name: str) -> Detections:
         """Find the blobs of a snapshot, and give it a name.
 
         Args:
-            source: frames by camera, (H, W), None = no frame; or blobs that were found elsewhere, labelled or not.
+            source: frames by camera, (H, W), None = no frame; or blobs found elsewhere, labelled or not.
             name: of the snapshot.
 
         Raises:
@@ -98,7 +98,7 @@ class Labelling:
         for camera in self.rig.camera_names:
             frame = given.get(camera)
             if isinstance(frame, Sequence):
-                raise InputError(f"camera {camera}: found {len(frame)} frames, expected one of this moment, or None")
+                raise InputError(f"camera {camera}: found {len(frame)} frames, expected a single frame or None")
             frames[camera] = frame
         blobs = detect_snapshot(frames, self.detection, pool=self._pool, board=self.obj.board)
         return to_detections([blobs], self.rig.camera_names, (name,))
@@ -111,17 +111,17 @@ class Labelling:
         frames: Mapping[str, Frame | None] | None,
         known: tuple[CameraRig, Tensor] | None,
     ) -> tuple[Detections, SnapshotIdentity]:
-        """Label a snapshot by itself, with what is known of the rig.
+        """Label a snapshot independently of the previous one, using the known rig.
 
         Args:
             usable: its blobs.
             name: its name.
-            coded: (M,) labels that came with them; None = none did.
-            frames: those that the blobs were found in, for a proposer; None = there are none.
-            known: the rig, and how well it is known (C, K); None = as the factory says.
+            coded: (M,) labels that came with the blobs; None = there are none.
+            frames: frames that the blobs were found in, for a proposer; None = there are none.
+            known: the rig and its uncertainty (C, K); None = as in the factory calibration.
 
         Raises:
-            RefusedError: it cannot be told which blob is which.
+            RefusedError: the blobs cannot be labelled.
         """
         self.follows = False
         prior, tracker = (self.rig.prior or RigPrior()).std(self.rig), self._tracker
@@ -133,7 +133,7 @@ class Labelling:
             return self._label_from_frames(self._proposer, usable, name, frames)
         again = known is not None and self._refused & (self._refused - 1) == 0
         if snapshot.status == "refused" and coded is None and again:
-            # What was known may hold no more. Another try is dear: after 1, 2, 4, 8, ... refusals in a row.
+            # The rig may have changed. Another try is slow, so make one after 1, 2, 4, 8, ... successive refusals.
             tracker.rig, tracker.prior_std = self.rig, prior
             snapshot, labels = tracker.decide(usable, name)
         if snapshot.status == "refused":
@@ -145,7 +145,7 @@ class Labelling:
     def _label_from_frames(
         self, proposer: Proposer, blobs: Detections, name: str, frames: Mapping[str, Frame | None]
     ) -> tuple[Detections, SnapshotIdentity]:
-        """Label a snapshot by what a proposer sees in its frames."""
+        """Label a snapshot by a proposer's view of its frames."""
         sight = Sight(proposer, lambda _: frames, self._where_blobs_fail, self.detection)
         snapshot, labels, found = self._tracker.look(sight, 0, blobs, name)
         if snapshot.status == "refused":
@@ -155,6 +155,6 @@ class Labelling:
         return replace(found, fiducial=labels), snapshot
 
     def follow(self, pose: RigidTransform) -> None:
-        """Take over the object's pose in the latest snapshot: the next one is near it."""
+        """Take the object's pose in the latest snapshot as a prediction for the next one."""
         self._tracker.follow(pose)
         self.follows = True

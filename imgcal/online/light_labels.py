@@ -1,7 +1,7 @@
-"""Which blobs of a snapshot show the same light, in a rig that is kept calibrated; cameras that see lights elsewhere.
+"""Find which blobs of a snapshot show the same light, and cameras that see the lights in the wrong place.
 
-A camera that was bumped agrees no longer with the places on which the others agree: its blobs are all shifted alike.
-The shift with which most of them fit is looked for, and the camera is off by it.
+A camera that was bumped no longer agrees with the light positions that the other cameras agree on: all its blobs are
+shifted alike. The search is for the shift with which most of them fit.
 """
 
 from __future__ import annotations
@@ -25,35 +25,35 @@ from imgcal.types import CameraRig, Detections
 Array = NDArray[np.float64]
 
 LEAST_MARGIN = 5.0
-"""Log odds of a light against the best other one that takes one of its blobs."""
+"""Log odds of a light against the best other light that uses one of its blobs."""
 ASTRAY_SECONDS, ASTRAY_BLOBS = 2.0, 3
-"""For how long a camera must see that many blobs where no light is before it may be said to have moved far."""
+"""Seconds, and number of blobs away from all lights, after which a camera may be reported to have moved far."""
 WINDOW = 60.0
-"""Pixels by which a camera's image may be shifted that is looked for."""
+"""Maximum image shift (px) in the search."""
 ALIKE, STRETCH = 1.5, 0.1
-"""Pixels, and share of the shift, by which a blob may be from its light once all are shifted back."""
+"""Distance (px, and share of the shift) allowed between a blob and its light after the shift is undone."""
 FOLLOWED = 3.0
-"""Pixels around the last shift of a camera within which it is looked for first."""
+"""Radius (px) around a camera's last shift that is searched first."""
 WENT, TOGETHER = 20.0, 3
-"""Pixels that lights must go in the image while their shift stays the same, or lights that it must fit together: else
-some other blob may happen to be there."""
+"""Distance (px) that lights must move in the image while their shift stays the same, or number of lights that it must
+fit together; otherwise a fit may be chance."""
 LEAST_FITTING = 0.5
-"""Share of the lights that a camera could show which must fit where it stands; else a shift is looked for."""
+"""Share of the visible lights that must fit without a shift; otherwise a shift is searched for."""
 
 
 def label_lights(memory: KeeperMemory, tracks: LightTracks, blobs: Detections) -> tuple[Checked, frozenset[int]]:
     """Label the blobs of a snapshot with the numbers of their lights.
 
     Args:
-        memory: what is known of the rig.
-        tracks: what is known of the lights, which changes.
-        blobs: of one snapshot; labels that they have do not count.
+        memory: what is known about the rig.
+        tracks: the tracked lights; updated.
+        blobs: of one snapshot; their labels are ignored.
 
     Returns:
-        The labels, and the cameras that see blobs where no light is, by whatever shift of their image.
+        The labels, and the cameras that see blobs where no light is, at any shift of their image.
 
     Raises:
-        RefusedError: three cameras agree on no light.
+        RefusedError: no three cameras agree on a light.
     """
     rig, time = memory.belief.rig, memory.time
     error = np.hypot(memory.options.identity_error, memory.noise.additive)
@@ -65,7 +65,7 @@ def label_lights(memory: KeeperMemory, tracks: LightTracks, blobs: Detections) -
     if not len(found):
         tracks.mark_still(blobs.camera, blobs.uv, np.zeros(len(blobs), dtype=bool), time)
         some = len(np.unique(blobs.camera[rows]))
-        seen = "no blob that moves is seen" if not some else f"{some} cameras see blobs that move"
+        seen = "no moving blob is seen" if not some else f"{some} cameras see moving blobs"
         raise RefusedError(f"identity: found no light on which three cameras agree: {seen}")
     numbers = tracks.number_lights(found.point, time)
     scene = _Scene(rig, blobs, found, rows)
@@ -104,7 +104,7 @@ def label_lights(memory: KeeperMemory, tracks: LightTracks, blobs: Detections) -
 def _all_lights(
     memory: KeeperMemory, blobs: Detections, label: NDArray[np.int64], lights: Lights, numbers: NDArray[np.int64]
 ) -> FoundLights:
-    """All lights of a snapshot, also those that are more than a rig learns from; of an object of one light that one."""
+    """All lights of a snapshot, including those that a rig does not learn from; of a one-light object, that light."""
     if memory.obj.num_fiducials > 1:
         return FoundLights(blobs, label.copy(), lights.point)
     place = np.where(numbers >= 0, 0, -1)
@@ -112,10 +112,10 @@ def _all_lights(
 
 
 class _Scene:
-    """A snapshot: where its lights should be in every camera, and which blobs have their labels."""
+    """A snapshot: where its lights should be in every camera, and which blobs are labelled."""
 
     def __init__(self, rig: CameraRig, blobs: Detections, lights: Lights, rows: NDArray[np.int64]) -> None:
-        """Begin with the lights that were found among some rows of the blobs."""
+        """Start with the lights found among some rows of the blobs."""
         self.camera, self.count = blobs.camera, len(lights)
         self.straight = np.full((len(blobs), 2), np.nan)  # (M, 2) px without distortion; nan = no light
         usable = rows[blobs.usable[rows]]
@@ -133,11 +133,11 @@ class _Scene:
         self.inside = well_inside(np.where(np.isfinite(self.expected), uv, np.nan), rig)
 
     def bare(self, camera: int) -> int:
-        """Count the blobs of a camera that may be lights and have no label."""
+        """Number of a camera's blobs that may be lights but have no label."""
         return int(((self.camera == camera) & (self.label < 0) & np.isfinite(self.straight[:, 0])).sum())
 
     def usual_shift(self) -> float:
-        """How far off (px) the image of a camera is, in the median of all cameras; less is left to the filter."""
+        """Median image shift (px) of all cameras; smaller shifts are left to the filter."""
         rows = np.flatnonzero(self.label >= 0)
         camera = self.camera[rows]
         rest = self.straight[rows] - self.expected[camera, self.label[rows]]
@@ -146,7 +146,7 @@ class _Scene:
         return float(np.median(np.linalg.norm(shift[count > 0], axis=-1) / count[count > 0]))
 
     def misfits(self) -> list[int]:
-        """Cameras that show fewer lights where they stand than they could, for the blobs that they have."""
+        """Cameras that, given their blobs, show fewer lights than they should."""
         cameras = len(self.expected)
         labelled = np.bincount(self.camera[self.label >= 0], minlength=cameras)
         bare = np.array([self.bare(camera) for camera in range(cameras)])
@@ -154,10 +154,10 @@ class _Scene:
         return np.flatnonzero((labelled < LEAST_FITTING * could) & (bare > 0)).tolist()
 
     def find_shift(self, camera: int, last: Array) -> tuple[Array, NDArray[np.int64]] | None:
-        """Find the shift (2,) px with which most blobs of a camera are lights; and which ones; None = there is none.
+        """Find the shift (2,) px with which most blobs of a camera are lights, and those blobs; None = there is none.
 
-        Lights that this camera has a say in are left out where two others do not agree on them. The shift must fit
-        more lights than any other, or be near the last one.
+        Lights that depend on this camera are left out unless two others agree on them. The shift must fit more lights
+        than any other, or be close to the last one.
         """
         rows = np.flatnonzero((self.camera == camera) & np.isfinite(self.straight[:, 0]))
         others = np.bincount(self.label[(self.label >= 0) & (self.camera != camera)], minlength=self.count)

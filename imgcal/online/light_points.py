@@ -1,4 +1,4 @@
-"""Where the lights of a snapshot are, and how surely: `LightPoints`."""
+"""Positions of a snapshot's lights, with their uncertainty: `LightPoints`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from imgcal.types import Detections
 Array = NDArray[np.float64]
 
 STEPS = 3
-"""Of Gauss and Newton, from a place that is right to a pixel."""
+"""Gauss-Newton steps, from a position that is right to a pixel."""
 
 
 @dataclass(frozen=True)
@@ -26,20 +26,20 @@ class FoundLights:
     """Which blobs of a snapshot show the same light."""
 
     blobs: Detections  # of the snapshot
-    light: NDArray[np.int64]  # (M,) number of the light that each of them shows, -1 = none
-    point: Array  # (L, 3) mm, about where each light is
+    light: NDArray[np.int64]  # (M,) number of each blob's light, -1 = none
+    point: Array  # (L, 3) mm, approximate position of each light
 
 
 @dataclass(frozen=True)
 class LightPoints:
     """Lights of one snapshot as points in the rig's frame.
 
-    Errors are against the cameras: a motion of the whole rig with all that it sees is not among them, nor is the rig's
-    scale, which no light shows.
+    Errors are relative to the cameras: they exclude a motion of the whole rig with everything it sees, and the rig's
+    scale, which lights do not determine.
     """
 
     point: Array  # (L, 3) mm
-    error: Array  # (L,) mm, RMS error that is to be expected
+    error: Array  # (L,) mm, expected RMS error
     seen: NDArray[np.bool_]  # (C, L), which camera saw which light
 
     def __len__(self) -> int:
@@ -53,17 +53,17 @@ def light_points(
     shake: Array,
     trusted: NDArray[np.bool_],
 ) -> LightPoints:
-    """Triangulate the lights of a snapshot with the rig as it is known after it.
+    """Triangulate the lights of a snapshot with the updated rig.
 
     Args:
         belief: about the rig.
         found: which blobs show which light.
-        noise: (C,) px that blobs have beyond what they say of themselves.
-        shake: (C,) px by which all that a camera sees is shifted alike.
+        noise: (C,) px of noise beyond the blobs' own sigmas.
+        shake: (C,) px by which all blobs of a camera are shifted alike.
         trusted: (C,) bool, cameras whose blobs count; they also define what stands still.
 
     Returns:
-        The lights that two of these cameras see, in the order of `found`.
+        The lights seen by two of these cameras, in the order of `found`.
     """
     rig, blobs, count = belief.rig, found.blobs, len(found.point)
     if trusted.sum() < 2:
@@ -103,12 +103,12 @@ def light_points(
 
 
 def _jacobians(belief: RigBelief, point: Tensor, camera: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives of pixels by the place of their light (M, 2, 3), by errors of their camera (M, 2, K)."""
+    """Derivatives of pixels by their light's position (M, 2, 3) and by errors of their camera (M, 2, K)."""
     by_camera = pixel_jacobian(belief.rig, point)[camera, light]
     return -by_camera[..., 3:6], by_camera @ (step_by_error(belief.rig) * belief.unit[:, None])[camera]
 
 
 def _information(by_point: Tensor, weight: Tensor, light: Tensor, count: int) -> Tensor:
-    """Inverse covariance of each light's place by its own blobs: (L, 3, 3)."""
+    """Information about each light's position from its own blobs: (L, 3, 3)."""
     parts = torch.einsum("mri,m,mrj->mij", by_point, weight, by_point)
     return parts.new_zeros(count, 3, 3).index_add_(0, light, parts)

@@ -1,6 +1,6 @@
-"""Lights of a running rig from snapshot to snapshot: their numbers, blobs that never move, cameras that see them off.
+"""Lights of a running rig from snapshot to snapshot: their numbers, static blobs, and shifted cameras.
 
-Everything is an array of fixed size, so that it can be saved.
+All arrays have a fixed size, so that they can be saved.
 """
 
 from __future__ import annotations
@@ -13,25 +13,25 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 MOST_STILL = 32
-"""Blobs that never move, of each camera."""
+"""Number of static blobs of each camera."""
 STILL_PIXELS, STILL_SECONDS = 1.0, 2.0
-"""How near to its place, and for how long, a blob must be that never moves; and how long it may then be hidden."""
+"""Distance (px) and time (s) that define a static blob; the same time applies to how long it may be hidden."""
 LONGEST = 0.5
-"""Seconds for which a light that is hidden keeps its number."""
+"""Time (s) for which a hidden light keeps its number."""
 NEAR = 100.0
-"""Millimetres, at most, from where a light should be, within which it keeps its number."""
+"""Maximum distance (mm) between a light and its prediction for it to keep its number."""
 ERROR, ACCELERATION = 10.0, 50_000.0
-"""Millimetres, and mm/s^2, by which a light may be elsewhere than where its velocity takes it."""
+"""Error of a light's prediction from its velocity: mm, and mm/s^2."""
 FASTEST = 5000.0
-"""Speed (mm/s) of a light whose velocity is not known."""
+"""Speed (mm/s) of a light with unknown velocity."""
 NEIGHBOUR, DIFFERENCE = 500.0, 2000.0
-"""Millimetres from a light whose velocity is known within which another one is taken to move likewise at first, and by
-how much (mm/s) it may move otherwise."""
+"""Distance (mm) from a light with known velocity within which a new light is assumed to move likewise, and the possible
+difference of their velocities (mm/s)."""
 
 
 @dataclass
 class LightTracks:
-    """What is remembered of N lights and C cameras.
+    """Memory of N lights and C cameras.
 
     Examples:
         >>> tracks = LightTracks.of(lights=4, cameras=2)
@@ -41,17 +41,17 @@ class LightTracks:
         array([1, 0])
     """
 
-    place: Array  # (N, 3) mm, where each light was last; nan = no light has the number
-    velocity: Array  # (N, 3) mm/s; nan = not known
-    time: Array  # (N,) s, when it was seen last; -inf = no light has had the number
-    shift: Array  # (C, 2) px by which a camera sees lights elsewhere than where the others say that they are
-    shift_at: Array  # (C, 2) px, where such lights should have been when that was first seen
-    astray: Array  # (C,) s, since when no shift of its image makes lights of what a camera sees; nan = it does not
-    still: Array = field(repr=False)  # (C, MOST_STILL, 4) px, px, s, s: a blob's place, since when and until when; nan
+    place: Array  # (N, 3) mm, last position of each light; nan = the number is free
+    velocity: Array  # (N, 3) mm/s; nan = unknown
+    time: Array  # (N,) s, last time it was seen; -inf = the number was never used
+    shift: Array  # (C, 2) px image shift of a camera relative to the lights' predictions by the others
+    shift_at: Array  # (C, 2) px, predictions of such lights when the shift was first seen
+    astray: Array  # (C,) s, time since which no image shift explains a camera's blobs; nan = not so
+    still: Array = field(repr=False)  # (C, MOST_STILL, 4) px, px, s, s: a blob's place, start, end; nan
 
     @classmethod
     def of(cls, lights: int, cameras: int) -> LightTracks:
-        """Begin with nothing seen."""
+        """Start empty."""
         nothing = np.full((lights, 3), np.nan)
         return cls(
             nothing, nothing.copy(), np.full(lights, -np.inf), np.zeros((cameras, 2)), np.zeros((cameras, 2)),
@@ -59,16 +59,16 @@ class LightTracks:
         )  # fmt: skip
 
     def number_lights(self, points: Array, time: float) -> NDArray[np.int64]:
-        """Give each light (L, 3) mm the number that it had, or a free one: (L,); -1 where there are too many.
+        """Give each light (L, 3) mm its earlier number, or a free one: (L,); -1 if there are too many.
 
-        Free are first those that no light ever had, then those that were left longest ago.
+        Unused numbers are given out first, then those unused for the longest time.
         """
         since = time - self.time
         self.place[(since > LONGEST) | (since < 0)] = np.nan
         velocity, reach = self._expected_velocity(points, since)
         expected = self.place + velocity * since[:, None]
         distance = np.linalg.norm(points[:, None] - expected, axis=-1)
-        distance = np.where(distance < reach, distance, np.inf)  # nor where there is no light
+        distance = np.where(distance < reach, distance, np.inf)  # and where there is no light
         number = np.full(len(points), -1, dtype=np.int64)
         hidden = self.time < self.time[np.isfinite(self.place[:, 0])].max(initial=-np.inf)
         seen = np.where(hidden, np.inf, distance)
@@ -78,7 +78,7 @@ class LightTracks:
                 break
             number[light] = known
             seen[light], seen[:, known] = np.inf, np.inf
-        # One that was hidden is known again where no other light may be it, and it no other one.
+        # Recognize a light that was hidden only if the match is unique in both directions.
         may_be = np.isfinite(distance) & hidden & (number < 0)[:, None]
         which, again = np.nonzero(may_be & (may_be.sum(0) == 1) & (may_be.sum(1) == 1)[:, None])
         number[which] = again
@@ -98,10 +98,10 @@ class LightTracks:
         return number
 
     def _expected_velocity(self, points: Array, since: Array) -> tuple[Array, Array]:
-        """Velocity (N, 3) mm/s of each light, and how far (N,) mm from where that takes it the light may be.
+        """Velocity (N, 3) mm/s of each light, and the error (N,) mm of the position predicted from it.
 
-        A light that has been seen once goes as its nearest neighbour does; where nothing is known of any, as lets most
-        of the lights go on together.
+        A light that has been seen once moves like its nearest neighbour. If no velocity is known, use the one with
+        which most lights match.
         """
         alive = np.isfinite(self.place[:, 0])
         known = alive & np.isfinite(self.velocity[:, 0])
@@ -121,7 +121,7 @@ class LightTracks:
         return velocity, reach
 
     def _common_velocity(self, points: Array, rows: NDArray[np.int64], since: Array) -> Array:
-        """Velocity (3,) mm/s with which most of some lights are where lights are now; nan = none brings two there."""
+        """Velocity (3,) mm/s that takes most of some lights to present lights; nan = none matches two."""
         passed = since[rows].max()
         shift = (points[:, None] - self.place[rows]).reshape(-1, 3)
         shift = shift[np.linalg.norm(shift, axis=1) < ERROR + FASTEST * passed]
@@ -134,7 +134,7 @@ class LightTracks:
         return shift[best] / passed if count[best] >= 2 else np.full(3, np.nan)
 
     def mark_still(self, camera: NDArray[np.int64], uv: Array, lit: NDArray[np.bool_], time: float) -> None:
-        """Follow blobs (M,) that may never move; a light that three cameras agree on (`lit`) is none of them."""
+        """Track blobs (M,) that may be static; a light that three cameras agree on (`lit`) is not."""
         for c in np.unique(camera[~lit]).tolist():
             known = self.still[c]
             known[(time - known[:, 3] > STILL_SECONDS) | (known[:, 3] > time)] = np.nan
@@ -148,7 +148,7 @@ class LightTracks:
                     known[empty] = place[0], place[1], time, time
 
     def is_still(self, camera: NDArray[np.int64], uv: Array) -> NDArray[np.bool_]:
-        """Tell which blobs (M,) have been where they are for so long that they are no lights that move."""
+        """Tell which blobs (M,) have been in place for so long that they are not moving lights."""
         known = np.where((self.still[..., 3] - self.still[..., 2] >= STILL_SECONDS)[..., None], self.still, np.inf)
         away = np.linalg.norm(known[camera, :, :2] - uv[:, None], axis=-1)
         return np.asarray((away <= STILL_PIXELS).any(1))

@@ -1,4 +1,4 @@
-"""How large the noise of each camera's blobs is, beyond what the blobs say themselves."""
+"""Estimate the noise of each camera's blobs beyond their own sigmas."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from imgcal.pipeline import fit_labelled
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 
 ASKED = (1, 2, 4, 8, 16, 32)
-"""Numbers of first snapshots that are asked together."""
+"""Numbers of first snapshots that are tested together."""
 OTHER = 1.2
-"""Factor between two noise levels that are told apart."""
+"""Minimum ratio of noise levels that counts as different."""
 FIRST, EVERY = (16, 32), 64
-"""Snapshots after which cameras are asked, one by one; and how often later, of as many at most."""
+"""Numbers of snapshots at which cameras are first tested one by one; then the interval, and the most snapshots used."""
 
 
 class NoiseLevel:
-    """Asks the first snapshots together, and each later one by what it leaves."""
+    """Tests the first snapshots together, and each later one by its residuals."""
 
     STATE: ClassVar = {
         "additive": ("additive", NDArray[np.float64]),
@@ -39,36 +39,36 @@ class NoiseLevel:
     }
 
     def __init__(self, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> None:
-        """Begin with the noise that the blobs say."""
+        """Start with the blobs' own noise."""
         self._rig, self._obj, self._options = rig, obj, options
         self.additive = np.zeros(rig.num_cameras)  # (C,) px
         self.restart()
 
     def trust(self) -> None:
-        """Ask no first snapshots: the rig is known, and each snapshot shows its noise by what it leaves."""
+        """Skip the test of first snapshots: the rig is known, so each snapshot's residuals show its noise."""
         self._asking = False
 
     def restart(self) -> None:
-        """Ask first snapshots again."""
-        self._early: list[tuple[Detections, SnapshotIdentity]] = []  # of one snapshot each
+        """Test first snapshots again."""
+        self._early: list[tuple[Detections, SnapshotIdentity]] = []  # one snapshot each
         self._asking = True
         self._ratios: deque[NDArray[np.float64]] = deque(maxlen=EVERY)  # (C, N)
-        self.first: list[tuple[Detections, RigidTransform]] = []  # snapshots that showed another noise, and poses
+        self.first: list[tuple[Detections, RigidTransform]] = []  # snapshots with another noise level, and poses
 
     def observe(
         self, blobs: Detections, observations: Observations, result: MeasurementUpdate, steady: bool, count: int
     ) -> bool:
-        """Take a snapshot that has been learnt.
+        """Take an absorbed snapshot.
 
         Args:
             blobs: labelled.
-            observations: the same, with the noise that was believed.
-            result: what they taught.
+            observations: the same, with the noise that was assumed.
+            result: the update by it.
             steady: no camera is in doubt.
-            count: snapshots learnt.
+            count: number of absorbed snapshots.
 
         Returns:
-            Whether the first snapshots should be learnt again: `first` has them all.
+            Whether to absorb the first snapshots again: `first` has them all.
         """
         again = False
         if self._asking:
@@ -86,7 +86,7 @@ class NoiseLevel:
         return again
 
     def _estimate(self) -> bool:
-        """Ask the first snapshots together how large the noise is."""
+        """Estimate the noise from the first snapshots together."""
         try:
             fit = fit_labelled(stack_labelled(self._early), self._rig, self._obj, self._options)
         except RefusedError:
@@ -108,13 +108,13 @@ class NoiseLevel:
         return max(before, now) > OTHER * min(before, now)
 
     def _follow(self, observations: Observations, result: MeasurementUpdate, count: int) -> None:
-        """Follow the noise by what single snapshots leave."""
+        """Track the noise by the residuals of single snapshots."""
         seen, residual = observations.seen[0], result.residual[0].numpy()
         if result.dof <= 0:
             return
-        # The median of squared residuals of two coordinates is 2 log 2; outliers do not count.
+        # The median of a 2D squared residual is 2 log 2; it ignores outliers.
         free = result.dof / (2 * int(seen.sum()))
-        if observations.shake is not None:  # what all points of a camera share is no noise of theirs
+        if observations.shake is not None:  # a shift shared by a camera's points is not their noise
             residual = residual - shared_shifts(observations, result.residual)[0][0, :, None]
             free *= 1 - int(seen.any(1).sum()) / int(seen.sum())
         whitened = residual / observations.sigma[0, ..., None].numpy()
@@ -124,7 +124,7 @@ class NoiseLevel:
             self._ask_later(observations)
 
     def _ask_later(self, observations: Observations) -> None:
-        """Ask the latest snapshots how large the noise of each camera is against what is believed of it."""
+        """Compare each camera's noise in the latest snapshots with the assumed noise."""
         known = np.stack(self._ratios)
         often = np.isfinite(known).any(-1).sum(0) > len(known) // 2
         some = often & observations.seen[0].any(1).numpy()
@@ -144,7 +144,7 @@ class NoiseLevel:
 
 
 def stack_labelled(snapshots: Sequence[tuple[Detections, SnapshotIdentity]]) -> Associations:
-    """Put labelled snapshots into one table."""
+    """Concatenate labelled snapshots into one table."""
     tables, identities = zip(*snapshots, strict=True)
     columns: dict[str, NDArray[np.generic]] = {
         name: np.concatenate([getattr(table, name) for table in tables])

@@ -1,7 +1,7 @@
-"""Is it the object that is not as its file says? Labels that no camera can place are kept, until that can be asked.
+"""Detect an object that differs from its file: keep labels that fit in no camera until this can be tested.
 
-A fiducial that is bent by a millimetre lies a few pixels from where it should in every camera: its labels look like
-strays, and would be dropped for ever. An object of another size fits nowhere: its snapshots would be refused for ever.
+A fiducial that is bent by a millimetre lies a few pixels off in every camera. Its labels look like strays, and would be
+dropped for ever. An object of another size fits nowhere, and all its snapshots would be refused.
 """
 
 from __future__ import annotations
@@ -18,38 +18,38 @@ from imgcal.online.label_consistency import Checked
 from imgcal.types import Detections
 
 ASKED = 8
-"""Snapshots in a row in which a fiducial, or the object, is where it cannot be, and that are asked together."""
+"""Successive snapshots with a fiducial, or the object, in an impossible place; they are tested together."""
 LEAST_CAMERAS = 2
-"""That must see a fiducial elsewhere."""
+"""Number of cameras that must see a fiducial in the wrong place."""
 
 
 @dataclass(frozen=True)
 class UnfittedSnapshot:
-    """A snapshot with the labels that do not fit."""
+    """A snapshot with labels that do not fit."""
 
     blobs: Detections
     rig_from_object: RigidTransform  # (1,)
-    seconds: float  # since the one before
+    seconds: float  # since the previous snapshot
     time: float  # s since the epoch
 
 
 @dataclass
 class ObjectChecks:
-    """Follows every fiducial, and the object as a whole."""
+    """Tracks every fiducial, and the object as a whole."""
 
     fiducials: int
-    learnt: list[UnfittedSnapshot] = field(default_factory=list)  # latest snapshots that taught something
-    refused: list[UnfittedSnapshot] = field(default_factory=list)  # in a row, that fit in no camera
-    odd: dict[int, int] = field(default_factory=dict)  # fiducial -> snapshots in a row in which it lies elsewhere
-    vain: int = 0  # snapshots since it was asked last in vain, before it is asked again
+    learnt: list[UnfittedSnapshot] = field(default_factory=list)  # latest absorbed snapshots
+    refused: list[UnfittedSnapshot] = field(default_factory=list)  # successive snapshots that fit in no camera
+    odd: dict[int, int] = field(default_factory=dict)  # fiducial -> successive snapshots in the wrong place
+    vain: int = 0  # snapshots to wait after a test without result
 
     def observe(self, checked: Checked, blobs: Detections, seconds: float, time: float) -> bool:
-        """Take a snapshot that has been learnt; tell whether it is time to ask.
+        """Take an absorbed snapshot; return whether to test the object now.
 
         Args:
             checked: which labels fit.
-            blobs: with the labels that were learnt.
-            seconds: since the one that was learnt before.
+            blobs: with the labels that were used.
+            seconds: since the previous absorbed snapshot.
             time: s since the epoch.
         """
         self.refused = []
@@ -67,24 +67,24 @@ class ObjectChecks:
         return len(self.learnt) == ASKED and max(self.odd.values(), default=0) >= ASKED and not self.vain
 
     def observe_refused(self, checked: Checked, learnt: float, time: float) -> None:
-        """Take a snapshot in which no camera fits; `learnt`: time (s) of the last one that taught something."""
+        """Take a snapshot that fits in no camera; `learnt`: time (s) of the last absorbed one."""
         seconds = max(time - (self.refused[-1].time if self.refused else learnt), 0.0)
         self.refused = [*self.refused, UnfittedSnapshot(checked.given, checked.rig_from_object, seconds, time)][-ASKED:]
         self.vain = max(self.vain - 1, 0)
 
     @property
     def due(self) -> bool:
-        """Tell whether to ask the snapshots in which no camera fits."""
+        """Tell whether to test the snapshots that fit in no camera."""
         return len(self.refused) == ASKED and not self.vain
 
     def record_test(self, found: bool) -> None:
-        """Begin anew where the object was found to have changed, else ask again later."""
+        """Restart if the object was found to have changed; otherwise wait for the next test."""
         if found:
             self.learnt, self.odd = [], {}
         self.refused, self.vain = [], 0 if found else 8 * ASKED
 
     def _count(self, given: Detections, left: Detections) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Cameras that see each fiducial elsewhere, and where it should be: (N,) each."""
+        """Number of cameras that see each fiducial in the wrong place, and in the right place: (N,) each."""
         named, lost = given.fiducial >= 0, left.fiducial < 0
         elsewhere = np.bincount(given.fiducial[named & lost], minlength=self.fiducials)
         fits = np.bincount(given.fiducial[named & ~lost], minlength=self.fiducials)
@@ -92,22 +92,22 @@ class ObjectChecks:
 
 
 def object_event(change: ObjectChange, since: float, time: float, snapshot: int) -> Event:
-    """Say that it is the object that is not as it was.
+    """Report that the object has changed.
 
     Args:
-        change: how.
+        change: the change found.
         since: s since the epoch.
         time: s since the epoch, now.
         snapshot: number of the update.
     """
     if change.fiducial is None:
         how = "larger" if change.size > 0 else "smaller"
-        message = f"the object is {100 * abs(change.size):.3g} % {how} than its file says: another one"
+        message = f"the object is {100 * abs(change.size):.3g} % {how} than its file says: it is a different object"
         values = (100 * change.size, 100 * change.sigma)
         return Event(time, snapshot, "object_exchanged", None, since, None, *values, None, change.odds, message)
     if change.fiducial == SHAPE:
-        off = f"its fiducials are {change.size:.3g} mm (RMS) from there"
-        message = f"the object is not as its file says: {off}; made less exactly, or another one"
+        off = f"its fiducials are off by {change.size:.3g} mm (RMS)"
+        message = f"the object differs from its file: {off}; it was made less accurately, or is a different object"
         size = (change.size, change.sigma)
         return Event(time, snapshot, "object_exchanged", None, since, None, *size, "mm", change.odds, message)
     message = f"fiducial {change.fiducial} of the object is {change.size:.3g} +- {change.sigma:.1g} mm from its place"

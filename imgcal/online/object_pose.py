@@ -1,4 +1,4 @@
-"""Where the object is in a snapshot, and how surely: `ObjectPose`."""
+"""The object's pose in a snapshot, with its covariance: `ObjectPose`."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ class ObjectPose:
     """The object's pose in one snapshot.
 
     Convention: the true pose is exp(w) R, t + v, where R and t are those of `rig_from_object`, w (rad) turns about the
-    rig's axes and v (mm) shifts along them. Errors (w, v) are against the cameras: a motion of the whole rig with all
-    that it sees, which no image shows, is not among them.
+    rig's axes and v (mm) shifts along them. Errors (w, v) are relative to the cameras: they exclude a motion of the
+    whole rig with everything it sees, which no image shows.
     """
 
     rig_from_object: RigidTransform
     covariance: Tensor  # (6, 6) of w (rad) and v (mm)
-    markers: int  # fiducials that some camera saw
-    cameras: int  # that saw some of them
-    points_object: Tensor | None = None  # (N, 3) mm, the fiducials as they are known now
+    markers: int  # number of fiducials seen
+    cameras: int  # number of cameras that saw some
+    points_object: Tensor | None = None  # (N, 3) mm, the fiducials as currently estimated
     seen: NDArray[np.bool_] | None = None  # (C, N), which camera saw which fiducial
 
     def matrix(self) -> NDArray[np.float64]:
@@ -41,12 +41,12 @@ class ObjectPose:
         return matrix
 
     def std(self) -> tuple[float, float]:
-        """RMS error that is to be expected: of the rotation (rad), of the object's origin (mm)."""
+        """Expected RMS error of the rotation (rad) and of the object's origin (mm)."""
         variance = self.covariance.diagonal().clamp_min(0)
         return float(variance[:3].sum().sqrt()), float(variance[3:].sum().sqrt())
 
     def points_rig(self) -> tuple[Tensor, Tensor]:
-        """Where the fiducials are: (N, 3) mm in the rig's frame, and the RMS error (N,) mm that is to be expected."""
+        """The fiducials, (N, 3) mm in the rig's frame, and their expected RMS error (N,) mm."""
         assert self.points_object is not None
         turned = self.points_object @ self.rig_from_object.rotation.mT
         by_pose = torch.cat((-cross_matrix(turned), torch.eye(3).to(turned).expand(len(turned), 3, 3)), dim=-1)
@@ -62,18 +62,18 @@ def object_pose(
     shake: NDArray[np.float64],
     trusted: NDArray[np.bool_],
 ) -> ObjectPose | None:
-    """Say how surely a pose is known, by its own blobs and by what is known of the rig and the object after them.
+    """Estimate a pose's covariance from its own blobs and the updated belief about rig and object.
 
     Args:
         belief: about the rig, the snapshot included.
         rig_from_object: the most probable pose, without batch axes.
         blobs: of the snapshot, labelled where identified.
-        noise: (C,) px that blobs have beyond what they say of themselves.
-        shake: (C,) px by which all that a camera sees is shifted alike.
+        noise: (C,) px of noise beyond the blobs' own sigmas.
+        shake: (C,) px by which all blobs of a camera are shifted alike.
         trusted: (C,) bool, cameras whose labels count; they also define what stands still.
 
     Returns:
-        None where these blobs do not determine a pose.
+        The pose; None if these blobs do not determine it.
     """
     rows = np.flatnonzero((blobs.fiducial >= 0) & trusted[blobs.camera])
     if not len(rows):
@@ -85,7 +85,7 @@ def object_pose(
     count, width = belief.unit.shape
     information = torch.einsum("mri,mrj->ij", weighted, by_pose)
     coupling = _sums(torch.einsum("mri,mrk->mik", weighted, by_error), camera, count)  # (C, 6, K)
-    # A camera that shakes sees all fiducials shifted alike, by an unknown that is integrated out.
+    # A camera that shakes shifts all fiducials alike by an unknown amount, which is integrated out.
     shift_pose, shift_error = (
         _sums(part * weight[:, None, None], camera, count) for part in (by_pose, by_error)
     )  # (C, 2, 6 or K)
@@ -98,7 +98,7 @@ def object_pose(
     across = torch.cat(
         (coupling.transpose(0, 1).flatten(1), torch.einsum("mri,mrk->ik", weighted, by_object)), dim=1
     )  # (6, D)
-    follows = torch.cholesky_solve(across, factor)  # how the pose follows the rig, with the other sign
+    follows = torch.cholesky_solve(across, factor)  # minus the derivative of the pose by the rig
     follows[:, : count * width] += common_motion(belief, rig_from_object, trusted)
     half = torch.linalg.solve_triangular(belief.factor, follows.mT, upper=False)
     covariance = torch.cholesky_inverse(factor) + half.mT @ half
@@ -111,7 +111,7 @@ def object_pose(
 def _jacobians(
     belief: RigBelief, pose: RigidTransform, camera: Tensor, fiducial: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Derivatives of pixels by the pose (M, 2, 6), by errors of their camera (M, 2, K), by the object (M, 2, Q)."""
+    """Derivatives of pixels by the pose (M, 2, 6), by errors of their camera (M, 2, K) and by the object (M, 2, Q)."""
     rig, obj, points = belief.rig, belief.obj, belief.points_object
     rotated = points @ pose.rotation.mT
     by_camera = pixel_jacobian(rig, rotated + pose.translation)[camera, fiducial]
@@ -128,7 +128,7 @@ def _jacobians(
 
 
 def common_motion(belief: RigBelief, pose: RigidTransform, trusted: NDArray[np.bool_]) -> Tensor:
-    """Motion of the pose (6, K C) that goes with errors of the rig as far as its cameras share them."""
+    """Motion of the pose (6, K C) that goes with the errors of the rig shared by its cameras."""
     motion = Gauge(torch.from_numpy(trusted).double()).averaging(belief.rig).unflatten(1, (-1, EXTRINSICS))
     by_error = torch.zeros(POSE, *belief.unit.shape, dtype=torch.float64)
     by_error[..., :EXTRINSICS] = motion * belief.unit[:, :EXTRINSICS]
@@ -138,5 +138,5 @@ def common_motion(belief: RigBelief, pose: RigidTransform, trusted: NDArray[np.b
 
 
 def _sums(values: Tensor, camera: Tensor, count: int) -> Tensor:
-    """Sum (M, ...) camera by camera: (C, ...)."""
+    """Sum (M, ...) per camera: (C, ...)."""
     return values.new_zeros(count, *values.shape[1:]).index_add_(0, camera, values)

@@ -1,4 +1,4 @@
-"""Labels for a snapshot from what the one before it has shown: near the prediction, or again after a camera moved."""
+"""Label a snapshot from the previous one: near the predictions, or again after a camera has moved."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
 TOO_NEAR = 0.6
-"""Distance (px) between two predictions below which nearness does not tell which is which."""
+"""Distance (px) below which two predictions are too close to tell their blobs apart."""
 MARGIN = 0.03
-"""Of the image's size, from its border: a fiducial predicted farther out may as well be out of view."""
+"""Margin at the image border, as a share of the image size, in which predicted fiducials may be out of view."""
 LEAST_EXPLAINED = 1 / 3
-"""Of what a camera sees of the object, the share that must have labels."""
+"""Share of the object's visible fiducials that must be labelled."""
 LEAST_SIGHT = 0.6
-"""Blobs that may be fiducials, in parts of the fiducials in view, from which a camera is said to see the object."""
+"""Number of possible fiducials, as a share of the fiducials in view, for a camera to see the object."""
 LEAST_BLOBS = 3
-"""From which a camera is said to see the object at all."""
+"""Minimum number of blobs for a camera to see the object at all."""
 TURNS = (0.02, 0.1, 0.4)
-"""Radians, one standard deviation of each axis: how far a camera may have been turned when it is looked for again."""
+"""Radians, one standard deviation per axis: possible rotations of a camera in the search for it."""
 
 
 def near_prediction(blobs: Detections, predicted: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Fiducial (M,) whose prediction (C, N, 2) is nearest to each blob, -1 where that is not mutual or not near enough.
+    """Fiducial (M,) whose prediction (C, N, 2) is nearest to each blob; -1 unless this is mutual and near enough.
 
-    Near is a quarter of the distance between predictions: a pattern that has moved less keeps its labels. Fiducials
-    whose predictions all but coincide get none.
+    Near enough is a quarter of the distance between predictions: a pattern that has moved less keeps its labels.
+    Fiducials with nearly coinciding predictions get no blob.
     """
     labels = np.full(len(blobs), -1, dtype=np.int64)
     gaps = distances_to_nearest(predicted)
@@ -53,14 +53,14 @@ def spare_blobs(blobs: Detections, cameras: int) -> NDArray[np.int64]:
 def find_displaced_cameras(
     blobs: Detections, usual: NDArray[np.float64], rig: CameraRig, obj: CalibrationObject, pose: RigidTransform
 ) -> NDArray[np.bool_]:
-    """Find cameras that see what may be the object, and hardly any of it where the rig puts it: (C,) bool.
+    """Find cameras that see a possible object, but hardly any of it where the rig predicts it: (C,) bool.
 
-    A camera that sees nothing, or no more false blobs than it always does, is no such camera.
+    A camera that sees nothing, or no more false blobs than usual, does not count.
 
     Args:
         blobs: of one snapshot, labelled.
-        usual: (C,) blobs without a label that a camera has at other times.
-        rig: as last known.
+        usual: (C,) usual number of unlabelled blobs of a camera.
+        rig: as last estimated.
         obj: the calibration object.
         pose: rig_from_object of this snapshot.
     """
@@ -87,16 +87,16 @@ def relabel_moved_camera(
     std: Tensor,
     options: PipelineOptions,
 ) -> Detections | None:
-    """Label the blobs of a camera that has moved, as its neighbours know where the object is; None = it cannot be.
+    """Label the blobs of a camera that has moved, given the object's pose by the other cameras; None = not possible.
 
     Args:
         blobs: of one snapshot, labelled by the other cameras.
         camera: its number.
-        rig: as last known.
+        rig: as last estimated.
         obj: the calibration object.
         pose: rig_from_object by the other cameras.
-        std: (C, K) how well the rig is known.
-        options: how sure labels must be.
+        std: (C, K) uncertainty of the rig.
+        options: how certain labels must be.
     """
     rows = np.flatnonzero(blobs.camera == camera)
     alone = blobs.select(rows)
@@ -120,7 +120,7 @@ def relabel_moved_camera(
 def widen_poses(
     std: Tensor, rig: CameraRig, cameras: list[int], pose: RigidTransform, obj: CalibrationObject, turn: float
 ) -> Tensor:
-    """Let cameras be anywhere within a turn (rad), and as far off as moves the image of the object as much: (C, K)."""
+    """Allow cameras a rotation (rad), and a shift that moves the object's image by as much: (C, K)."""
     std = std.clone()
     centre = pose.apply(obj.points).mean(0)
     for camera in cameras:

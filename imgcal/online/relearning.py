@@ -1,4 +1,4 @@
-"""Cameras that moved: what is told of them, until they are known again as well as before."""
+"""Cameras that moved: what is reported about them until they are relearnt."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from imgcal.monitoring import CHANGES, Change, RigBelief
 from imgcal.online.events import UNITS, ChangeKind, Event
 
 RELEARNT = 1.1
-"""Times the standard deviations that a camera's values had before it moved, from which it is known again."""
+"""Largest standard deviations of a relearnt camera, relative to those before it moved."""
 EVERY = 4
-"""Snapshots between two looks at that."""
+"""Number of snapshots between two checks for that."""
 EXTRINSICS_AND_PINHOLE = 10
-"""Values of a camera that are compared: the distortion changes with none of the changes that are told."""
+"""Number of a camera's values that are compared: distortion is not affected by the changes that are reported."""
 
 HOW: dict[ChangeKind, str] = {
     "rotation": "turned",
@@ -33,14 +33,14 @@ class Relearning:
     """Remembers cameras that moved."""
 
     names: tuple[str, ...]
-    events: dict[int, Event] = field(default_factory=dict)  # camera -> what was told of it last
+    events: dict[int, Event] = field(default_factory=dict)  # camera -> its latest report
     before: dict[int, Tensor] = field(default_factory=dict)  # camera -> (K,) std before it moved
 
     def report_change(self, change: Change, since: float, time: float, number: int, before: RigBelief) -> Event:
-        """Tell of a change.
+        """Report a change.
 
         Args:
-            change: by the monitor.
+            change: as found by the monitor.
             since: s since the epoch, when it happened.
             time: s since the epoch, now.
             number: of the update.
@@ -54,7 +54,7 @@ class Relearning:
         evidence = change.evidence if math.isfinite(change.evidence) else None
         message = f"{name} {how}"
         if len(self.names) == 2:
-            message += f", or {self.names[1 - change.camera]}: of two cameras nobody can tell which"
+            message += f", or {self.names[1 - change.camera]}: with two cameras it is impossible to tell which"
         event = Event(time, number, "moved", name, since, kind, size, sigma, unit, evidence, message)
         self.events[change.camera] = event
         if change.camera not in self.before:
@@ -64,19 +64,19 @@ class Relearning:
     def report_relearnt(
         self, belief: RigBelief, still_open: frozenset[int], settled: frozenset[int], time: float, number: int
     ) -> list[Event]:
-        """Say which cameras are known again as well as before.
+        """Report which cameras are known as well again as before they moved.
 
         Args:
-            belief: what is known now.
-            still_open: cameras of which it is not decided how they moved.
-            settled: cameras of which no more can become known: all that counts was seen since they moved.
+            belief: the current belief.
+            still_open: cameras whose kind of move is undecided.
+            settled: cameras that cannot become better known: everything that counts was seen after they moved.
             time: s since the epoch.
             number: of the update.
         """
         waiting = [camera for camera in self.events if camera not in still_open]
         if not waiting or number % EVERY:
             return []
-        std, told = relative_std(belief), []
+        std, events = relative_std(belief), []
         for camera in waiting:
             part = slice(0, EXTRINSICS_AND_PINHOLE)
             known = std[camera, part] <= RELEARNT * self.before[camera][part]
@@ -85,7 +85,7 @@ class Relearning:
                 del self.before[camera]
                 sigma = change_sigma(std[camera], event.change)
                 how_well = "" if sigma is None else f" to +- {sigma:.2g} {event.unit}"
-                told.append(
+                events.append(
                     replace(
                         event,
                         time=time,
@@ -95,11 +95,11 @@ class Relearning:
                         message=f"{event.message}; known again{how_well}",
                     )
                 )
-        return told
+        return events
 
 
 def relative_std(belief: RigBelief) -> Tensor:
-    """One standard deviation of every parameter against the mean of all cameras: (C, K)."""
+    """One standard deviation of every parameter relative to the mean of all cameras: (C, K)."""
     count = belief.rig.num_cameras
     jacobian = Gauge(torch.full((count,), 1 / count, dtype=torch.float64)).jacobian(belief.rig)
     spread = (jacobian @ belief.covariance() * jacobian).sum(1)
@@ -107,7 +107,7 @@ def relative_std(belief: RigBelief) -> Tensor:
 
 
 def change_sigma(std: Tensor, change: ChangeKind | None) -> float | None:
-    """Standard deviation of the worst direction of a kind of change, of a camera's (K,), in the unit of its event."""
+    """Standard deviation along the worst direction of a kind of change, from a camera's (K,), in the event's unit."""
     if change is None or change not in CHANGES:
         return None
     return float(std[CHANGES[change]].max()) * (math.degrees(1.0) if change == "rotation" else 1.0)

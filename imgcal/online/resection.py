@@ -1,4 +1,4 @@
-"""Find a camera again that may be anywhere: its neighbours know where the object was, snapshot after snapshot."""
+"""Find a camera that may be anywhere, given the object's pose in each snapshot by its neighbours."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from imgcal.geometry import RigidTransform, undistort_cpu
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
 TRIES = 1200
-"""Triples of blobs that are taken for triples of fiducials: some 300 tries find one that is right."""
+"""Number of blob triples to match with fiducial triples: about 300 tries find a correct one."""
 FIRST, SHORTLIST = 4, 128
-"""Snapshots, spread over all, by which all poses are judged, and how many of these are judged by the others, too."""
+"""Number of evenly spread snapshots that rate all poses, and number of poses to rate by all snapshots."""
 ROUGH, FINE = 6.0, 2.0
-"""Pixels between a blob and its fiducial: by a pose from three of them, and after a fit of all."""
+"""Maximum distance (px) between a blob and its fiducial: for a pose from three of them, and after a fit of all."""
 LEAST_MATCHES = 8
-"""Over all snapshots: four of one snapshot may agree by chance."""
+"""Minimum number of matches over all snapshots: four in one snapshot may agree by chance."""
 LEAST_AT_ONCE = 4
-"""In a single snapshot, of a camera whose place is known."""
+"""Minimum number of matches in a single snapshot of a camera with known pose."""
 LEAST_SHARE = 0.7
-"""Of what could be seen: the smaller of blobs and fiducials, snapshot by snapshot."""
+"""Minimum share of possible matches: per snapshot, the smaller of the numbers of blobs and fiducials."""
 LEAST_LEAD = 1.3
-"""Times as many matches as any pose that gives other labels."""
+"""Minimum ratio of matches to those of any pose that gives other labels."""
 
 
 @dataclass(frozen=True)
@@ -37,22 +37,22 @@ class Resected:
     """A camera that was found."""
 
     labels: NDArray[np.int64]  # (M,) fiducial of each blob of the last snapshot, -1 = none
-    camera: CameraRig  # alone, where it is now
+    camera: CameraRig  # the camera alone, in its present pose
 
 
 def resect_camera(
     blobs: Sequence[NDArray[np.float64]], points_rig: Tensor, camera: CameraRig, generator: np.random.Generator
 ) -> Resected | None:
-    """Label the blobs of the last snapshot by the one place of the camera that explains all snapshots.
+    """Label the blobs of the last snapshot by the only pose of the camera that explains all snapshots.
 
     Args:
         blobs: (M_s, 2) pixels for each of S snapshots.
-        points_rig: (S, N, 3) mm, where the fiducials were.
+        points_rig: (S, N, 3) mm, the fiducials.
         camera: a rig of one camera; only its lens is taken from it.
-        generator: chooses among triples where there are many.
+        generator: selects triples if there are many.
 
     Returns:
-        The camera where it is; None where no place explains enough, or several do.
+        The camera; None if no pose explains enough, or several do.
     """
     seen = [_ideal(uv, camera) for uv in blobs]
     points = points_rig.numpy()
@@ -82,11 +82,11 @@ def resect_camera(
 
 
 def labels_at(uv: NDArray[np.float64], points_rig: Tensor, camera: CameraRig) -> NDArray[np.int64] | None:
-    """Label the blobs (M, 2) of one snapshot by a camera's known place; None where it explains too few of them.
+    """Label the blobs (M, 2) of a snapshot by a camera with known pose; None if it explains too few of them.
 
     Args:
         uv: pixels.
-        points_rig: (N, 3) mm, where the fiducials are.
+        points_rig: (N, 3) mm, the fiducials.
         camera: a rig of one camera.
     """
     tolerance = FINE / float(camera.focal_length.mean())
@@ -99,14 +99,14 @@ def labels_at(uv: NDArray[np.float64], points_rig: Tensor, camera: CameraRig) ->
 def _promising(
     poses: NDArray[np.float64], points: NDArray[np.float64], seen: list[NDArray[np.float64]], tolerance: float
 ) -> NDArray[np.int64]:
-    """Rows of the poses that explain the most of a few snapshots."""
+    """Indices of the poses that explain the most of a few snapshots."""
     some = np.unique(np.linspace(0, len(seen) - 1, FIRST).astype(np.int64)).tolist()
     count = sum((_matches(poses, points[s], seen[s], tolerance) >= 0).sum(1) for s in some)
     return np.argsort(-np.asarray(count), kind="stable")[:SHORTLIST]
 
 
 def _ideal(uv: NDArray[np.float64], camera: CameraRig) -> NDArray[np.float64]:
-    """Take the lens out: (M, 2) on the z = 1 plane."""
+    """Undistort: (M, 2) on the z = 1 plane."""
     if not len(uv):
         return np.zeros((0, 2))
     at = (torch.from_numpy(uv)[None] - camera.principal_point[:, None]) / camera.focal_length[:, None]
@@ -117,7 +117,7 @@ def _ideal(uv: NDArray[np.float64], camera: CameraRig) -> NDArray[np.float64]:
 def _hypotheses(
     seen: list[NDArray[np.float64]], points: NDArray[np.float64], generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Poses (K, 3, 4), cam_from_rig, from three blobs of one snapshot each."""
+    """Poses (K, 3, 4), cam_from_rig, each from three blobs of one snapshot."""
     found = []
     triples = np.array([t for t in combinations(range(points.shape[1]), 3) if _spans(points[0, list(t)], points[0])])
     usable = [s for s, xy in enumerate(seen) if len(xy) >= 3]
@@ -136,14 +136,14 @@ def _hypotheses(
 
 
 def _ordered_triples(count: int, wanted: int, generator: np.random.Generator) -> NDArray[np.int64]:
-    """Three different blobs in every order, or so many at random where there are many."""
+    """Ordered triples of different blobs: all of them, or `wanted` random ones if there are more."""
     if count <= 8:
         return np.array(list(permutations(range(count), 3)))
     return np.array([generator.permutation(count)[:3] for _ in range(wanted)])
 
 
 def _spans(triangle: NDArray[np.float64], whole: NDArray[np.float64]) -> bool:
-    """Tell whether three points are far enough from one line to give a pose."""
+    """Tell whether three points are far enough from collinear to give a pose."""
     area = np.linalg.norm(np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0]))
     return bool(area > 0.05 * np.square(whole - whole.mean(0)).sum(1).mean())
 
@@ -151,7 +151,7 @@ def _spans(triangle: NDArray[np.float64], whole: NDArray[np.float64]) -> bool:
 def _matches(
     poses: NDArray[np.float64], points: NDArray[np.float64], xy: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.int64]:
-    """Fiducial (K, M) that is nearest to each blob and has it as nearest blob, within a tolerance; -1 = none."""
+    """Fiducial (K, M) that matches each blob: mutually nearest, within a tolerance; -1 = none."""
     at = points @ poses[:, :, :3].swapaxes(-1, -2) + poses[:, None, :, 3]  # (K, N, 3)
     front = at[..., 2] > 1.0
     where = np.where(front[..., None], at[..., :2] / np.maximum(at[..., 2:], 1.0), 1e6)
@@ -167,7 +167,7 @@ def _matches(
 def _fit(
     camera: CameraRig, points_rig: Tensor, blobs: Sequence[NDArray[np.float64]], labels: list[NDArray[np.int64]]
 ) -> CameraRig | None:
-    """Move the camera to where its labels fit best; None with too few."""
+    """Fit the camera's pose to its labels; None if there are too few."""
     snapshot = np.repeat(np.arange(len(labels)), [len(found) for found in labels])
     fiducial, uv = np.concatenate(labels), np.concatenate(list(blobs))
     rows = np.flatnonzero(fiducial >= 0)
@@ -178,12 +178,12 @@ def _fit(
     observations = Observations(
         given, torch.full_like(given[..., 0], 1.0), torch.ones_like(given[..., 0], dtype=torch.bool)
     )
-    held = torch.zeros(1, camera.num_parameters, dtype=points_rig.dtype)
+    fixed = torch.zeros(1, camera.num_parameters, dtype=points_rig.dtype)
     fit = estimate(
         observations,
         camera,
         CalibrationObject(cloud, torch.ones_like(cloud)),
-        prior_std=held,
+        prior_std=fixed,
         options=EstimationOptions(loss="cauchy"),
     )
     return replace(camera, cam_from_rig=camera.cam_from_rig @ fit.rig_from_object[0].reshape(1))

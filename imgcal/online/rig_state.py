@@ -1,4 +1,4 @@
-"""What is known of a running rig after a snapshot."""
+"""The state of a running rig after a snapshot."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from imgcal.types import CameraRig, Detections
 
 CameraHealth = Literal["ok", "doubtful", "relearning", "blind", "dirty", "defocused", "lost", "unseen"]
 UNTRUSTED: frozenset[CameraHealth] = frozenset({"doubtful", "lost"})
-"""Cameras whose labels say nothing of where the object is."""
+"""Cameras with this health do not count for the object's pose."""
 
 
 @dataclass(frozen=True)
 class RigState:
-    """A rig that is kept calibrated, as it is after a snapshot.
+    """A rig that is kept calibrated, after a snapshot.
 
-    Health of a camera: `ok`, what is said of it holds; `doubtful`, its last snapshots do not fit, and it is not decided
-    yet whether it moved; `relearning`, it has moved, and is not known again as well as before; `lost`, nothing comes
-    from it, or what it sees cannot be told apart: its values may hold no more; `unseen`, it has not seen the object
-    yet: the factory's values. The others are told by detectors that look at frames.
+    Health of a camera: `ok`, its values hold; `doubtful`, its last snapshots do not fit, and it is undecided whether it
+    moved; `relearning`, it has moved, and is not known as well yet as before; `lost`, it sends nothing, or its blobs
+    cannot be labelled, so its values may no longer hold; `unseen`, it has not seen the object yet and has the factory's
+    values. The other values come from tests of the images.
 
     Examples:
         >>> import torch, imgcal
@@ -46,31 +46,31 @@ class RigState:
 
     time: float  # s since the epoch
     snapshot: int  # number of the update
-    belief: RigBelief  # the rig, and how surely it is known
+    belief: RigBelief  # the rig and its uncertainty
     factory: CameraRig
     cameras: Mapping[str, CameraHealth]
-    sentence: str  # of state, for people
+    sentence: str  # description of the state
     refused: str | None  # why this snapshot taught nothing
     detections: Detections  # blobs of this snapshot, labelled where identified
-    lag: NDArray[np.float64]  # (M, 2) pixels to be added to these, where cameras expose later and the object moves
-    predicted: NDArray[np.float64]  # (C, N, 2) pixels where the rig puts the fiducials; nan where that is not known
-    residual: NDArray[np.float64]  # (C,) RMS pixels of this snapshot; nan where nothing was seen
+    lag: NDArray[np.float64]  # (M, 2) pixels to add to these: cameras may expose late while the object moves
+    predicted: NDArray[np.float64]  # (C, N, 2) pixels, predicted fiducials; nan if unknown
+    residual: NDArray[np.float64]  # (C,) RMS pixels of this snapshot; nan if nothing was seen
     rig_from_object: RigidTransform | None
-    events: tuple[Event, ...]  # that became known with this snapshot
-    clock_offset: NDArray[np.float64]  # (C,) s that a camera exposes later than most; nan = not known
+    events: tuple[Event, ...]  # that this snapshot has revealed
+    clock_offset: NDArray[np.float64]  # (C,) s, delay of a camera relative to most; nan = unknown
     clock_offset_sigma: NDArray[np.float64]  # (C,) s, one standard deviation
-    noise: NDArray[np.float64]  # (C,) pixels, that blobs have beyond what they say of themselves
-    shake: NDArray[np.float64]  # (C,) pixels, by which all that a camera sees is shifted alike, each time otherwise
-    lights: FoundLights | None = None  # which blobs show the same light; None = an object is known, or none was found
+    noise: NDArray[np.float64]  # (C,) pixels, noise of blobs beyond their own sigmas
+    shake: NDArray[np.float64]  # (C,) pixels, random shift shared by all blobs of a camera
+    lights: FoundLights | None = None  # which blobs show the same light; None = no lights found, or a known object
 
     @property
     def rig(self) -> CameraRig:
-        """The rig as it is now."""
+        """The rig as currently estimated."""
         return self.belief.rig
 
     @cached_property
     def object_pose(self) -> ObjectPose | None:
-        """The object's pose in this snapshot with its covariance; None = it was not seen, or not well enough."""
+        """The object's pose in this snapshot with its covariance; None = not seen, or not well enough."""
         if self.rig_from_object is None:
             return None
         trusted = np.array([health not in UNTRUSTED for health in self.cameras.values()])
@@ -78,7 +78,7 @@ class RigState:
 
     @cached_property
     def light_points(self) -> LightPoints | None:
-        """Where the lights are that were found in this snapshot; None = there are none, or an object is known."""
+        """Positions of the lights in this snapshot; None = there are none, or the object is known."""
         if self.lights is None:
             return None
         trusted = np.array([health not in UNTRUSTED for health in self.cameras.values()])
@@ -86,25 +86,25 @@ class RigState:
 
     @cached_property
     def gauge(self) -> Gauge:
-        """Which cameras are taken to have stood still since the factory calibration: what most agree on."""
+        """The cameras assumed to have stood still since the factory calibration: the largest group that agrees."""
         return Gauge.from_majority(self.rig, self.factory)
 
     @cached_property
     def moved(self) -> Tensor:
-        """Change of every parameter against the factory rig, a motion of the whole rig taken out: (C, K)."""
+        """Change of every parameter since the factory calibration, without a motion of the whole rig: (C, K)."""
         return self.gauge.difference(self.rig, self.factory)
 
     @cached_property
     def scale(self) -> tuple[float, float]:
-        """Size of the rig against the factory's, relative, and one standard deviation of it.
+        """Size of the rig relative to the factory's, and its standard deviation.
 
-        Lights of which nothing is known say nothing of it by themselves. It goes along with what they teach of the
-        cameras as far as a calibration has left both open together.
+        Unknown lights do not determine it. It changes with what they show about the cameras, as far as an earlier
+        calibration left a correlation between both.
         """
         now, before = (rig.positions - rig.positions.mean(0) for rig in (self.rig, self.factory))
         return float((now.norm() / before.norm()) - 1), self.belief.scale_std()
 
     @cached_property
     def std(self) -> Tensor:
-        """One standard deviation of `moved`, and so of the cameras against most of the others: (C, K)."""
+        """Standard deviation of `moved`, which is relative to most of the other cameras: (C, K)."""
         return self.gauge.spread(self.rig, self.belief.covariance())

@@ -1,4 +1,4 @@
-"""What watches a rig beside the filter: small tests that see every snapshot and say what became known."""
+"""Tests that run beside the filter: each sees every snapshot and reports events."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from imgcal.online.rig_state import RigState
 
 
 class SequentialTest(Protocol):
-    """Sees one snapshot after another; `RigKeeper` calls it, and saves it with the rest."""
+    """Sees the snapshots one by one; `RigKeeper` calls it, and saves it with its own state."""
 
     name: str
 
     def __call__(
         self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: MeasurementUpdate | None
     ) -> Iterable[Event]:
-        """Say what became known.
+        """Return new events.
 
         Args:
             state: after this snapshot, without events.
-            frames: by camera; None = blobs came.
-            absorbed: what the snapshot taught; None = nothing.
+            frames: by camera; None = the source is blobs.
+            absorbed: the update by the snapshot; None = it taught nothing.
         """
         ...
 
     def saved(self) -> dict[str, Any]:
-        """Give what must be kept, in plain values."""
+        """Return the state to save, as plain values."""
         ...
 
     def restored(self, values: dict[str, Any]) -> None:
-        """Take over what `saved` gave.
+        """Restore a state from `saved`.
 
         Raises:
-            ValueError, KeyError, TypeError: it is not that.
+            ValueError, KeyError, TypeError: the values are not such a state.
         """
         ...

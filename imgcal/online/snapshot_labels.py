@@ -1,4 +1,4 @@
-"""Which blob is which, in a snapshot of a rig that is kept calibrated: by the last pose, or by itself."""
+"""Label a snapshot of a rig that is kept calibrated: from the last pose, or independently."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from imgcal.online.snapshot_update import test_clocks, test_object
 from imgcal.types import Detections
 
 PATIENCE = 64
-"""Snapshots in a row in which no camera fits: the rig is not the one that is known, and is learnt anew."""
+"""Successive snapshots that fit in no camera, after which the rig is relearnt from the factory calibration."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Labelled:
     """A snapshot with labels."""
 
     checked: Checked
-    astray: frozenset[int]  # cameras that see what may be the object, and cannot tell what
+    astray: frozenset[int]  # cameras that see a possible object without labels
 
 
 def label_snapshot(
@@ -43,14 +43,14 @@ def label_snapshot(
     """Label a snapshot.
 
     Args:
-        memory: what is known.
-        labelling: what labels snapshots by themselves.
+        memory: the keeper's memory.
+        labelling: labels snapshots independently.
         usable: its blobs.
         name: its name.
-        frames: those that the blobs were found in; None = there are none.
+        frames: frames that the blobs were found in; None = there are none.
 
     Raises:
-        RefusedError: it cannot be told which blob is which, or labels fit in no camera.
+        RefusedError: the blobs cannot be labelled, or the labels fit in no camera.
     """
     if memory.lights is not None:
         return Labelled(*label_lights(memory, memory.lights, usable))
@@ -78,14 +78,14 @@ def label_snapshot(
         if memory.in_vain >= PATIENCE:
             memory.reset()
         raise RefusedError(
-            f"estimation: labels are {checked.usual:.1f} px off in most cameras: labels are wrong, or the whole "
-            "rig is another"
+            f"estimation: labels are {checked.usual:.1f} px off in most cameras: labels are wrong, or this is "
+            "a different rig"
         )
     return _search(memory, checked)
 
 
 def _follow(memory: KeeperMemory, labelling: Labelling, usable: Detections) -> Labelled | None:
-    """Label a snapshot by the last one's pose; None = it cannot be followed."""
+    """Label a snapshot by the last one's pose; None = not possible."""
     if not labelling.follows or labelling.slips or not memory.poses:
         return None
     pose = _extrapolate(memory)
@@ -102,7 +102,7 @@ def _follow(memory: KeeperMemory, labelling: Labelling, usable: Detections) -> L
 
 
 def _extrapolate(memory: KeeperMemory) -> RigidTransform:
-    """Where the object should be now: (1,)."""
+    """Predicted pose of the object: (1,)."""
     last_time, last = memory.poses[-1]
     first_time, first = memory.poses[-min(2, len(memory.poses))]
     share = 0.0 if last_time <= first_time else (memory.time - last_time) / (last_time - first_time)
@@ -112,21 +112,21 @@ def _extrapolate(memory: KeeperMemory) -> RigidTransform:
 
 
 def _check(memory: KeeperMemory, named: Detections, pose: RigidTransform) -> Checked:
-    """See which labels fit; cameras with moments of their own have no say in where the object is."""
+    """Find the labels that fit; unsynchronized cameras do not count for the object's pose."""
     given = memory.belief.rig, memory.obj_now, pose, memory.options
     every = check_labels(named, *given)
     if not memory.monitor.quarantine.cameras:
         return every
-    held = np.isin(named.camera, list(memory.monitor.quarantine.cameras))
-    others = check_labels(replace(named, fiducial=np.where(held, -1, named.fiducial)), *given)
-    fiducial = np.where(held, every.blobs.fiducial, others.blobs.fiducial)
+    quarantined = np.isin(named.camera, list(memory.monitor.quarantine.cameras))
+    others = check_labels(replace(named, fiducial=np.where(quarantined, -1, named.fiducial)), *given)
+    fiducial = np.where(quarantined, every.blobs.fiducial, others.blobs.fiducial)
     blobs, labels = replace(others.blobs, fiducial=fiducial), int((fiducial >= 0).sum())
     off = others.off | every.off & np.isin(np.arange(len(every.off)), list(memory.monitor.quarantine.cameras))
     return replace(others, blobs=blobs, given=every.given, off=off, labels=labels)
 
 
 def _search(memory: KeeperMemory, checked: Checked) -> Labelled:
-    """Look for the object in cameras that do not see it where it should be."""
+    """Search for the object in cameras that do not see it where it should be."""
     there = memory.surroundings
     if there is None:
         return Labelled(checked, frozenset())

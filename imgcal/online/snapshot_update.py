@@ -1,4 +1,4 @@
-"""Learn a labelled snapshot: what fits, what waits for the next one, what is asked again with another noise."""
+"""Learn from a labelled snapshot: absorb what fits, defer the rest, and repeat with a corrected noise level."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from imgcal.online.object_checks import ObjectChecks
 
 
 def learn_snapshot(memory: KeeperMemory, checked: Checked) -> MonitorUpdate:
-    """Absorb a snapshot; what a camera sees that does not fit for the first time waits for the next one.
+    """Absorb a snapshot; a camera that does not fit for the first time is left out until the next snapshot.
 
     Args:
-        memory: what is known, which changes.
+        memory: the keeper's memory; updated.
         checked: the snapshot of `memory.time`, with its labels.
 
     Returns:
-        What it taught, and what became known.
+        The update, and the changes found.
 
     Raises:
         RefusedError: see `RigMonitor.update`.
@@ -56,9 +56,9 @@ def learn_snapshot(memory: KeeperMemory, checked: Checked) -> MonitorUpdate:
         memory.looks[list(horizon.away)] = 0
         np.minimum(memory.looks, horizon.snapshots, out=memory.looks)
     seen = np.unique(checked.given.camera[checked.given.fiducial >= 0])
-    waits = {camera: since for camera, since in memory.off.items() if camera not in seen}  # for the next that it shows
+    waits = {camera: since for camera, since in memory.off.items() if camera not in seen}  # until seen again
     memory.off, memory.learnt, memory.in_vain = waits | off, time, 0
-    if found.slips:  # poses were off that have been found with blobs of another time
+    if found.slips:  # these poses were found with late blobs
         memory.poses.clear()
     memory.poses.append((time, found.update.rig_from_object))
     memory.labels = checked.labels
@@ -71,11 +71,11 @@ def learn_snapshot(memory: KeeperMemory, checked: Checked) -> MonitorUpdate:
 
 
 def test_object(memory: KeeperMemory, learnt: bool) -> MonitorUpdate | None:
-    """Ask whether labels do not fit because the object is not as its file says; what was learnt then.
+    """Test whether labels do not fit because the object differs from its file; return the update in that case.
 
     Args:
-        memory: what is known, which changes.
-        learnt: of the snapshots that have been learnt without those labels; else of those that were refused.
+        memory: the keeper's memory; updated.
+        learnt: test the snapshots absorbed without those labels; otherwise the refused ones.
     """
     doubted = memory.doubts.learnt if learnt else memory.doubts.refused
     snapshots = [(memory.observed(one.blobs), one.rig_from_object) for one in doubted]
@@ -89,18 +89,18 @@ def test_object(memory: KeeperMemory, learnt: bool) -> MonitorUpdate | None:
 
 
 def test_clocks(memory: KeeperMemory) -> bool:
-    """Ask whether labels fit in no camera because of some that are to be held then."""
+    """Test whether unsynchronized cameras are why labels fit nowhere, and quarantine those."""
     doubted = memory.doubts.refused
     snapshots = [(memory.observed(one.blobs), one.rig_from_object) for one in doubted]
-    held = memory.monitor.quarantine_doubtful(snapshots, [one.seconds for one in doubted])
-    if held:
-        memory.off |= dict.fromkeys(held, doubted[0].time)
+    quarantined = memory.monitor.quarantine_doubtful(snapshots, [one.seconds for one in doubted])
+    if quarantined:
+        memory.off |= dict.fromkeys(quarantined, doubted[0].time)
         memory.doubts = ObjectChecks(memory.obj.num_fiducials)
-    return bool(held)
+    return bool(quarantined)
 
 
 def _relearn(memory: KeeperMemory, found: MonitorUpdate) -> MonitorUpdate:
-    """Learn the first snapshots again, with the noise that they have shown."""
+    """Absorb the first snapshots again, with their measured noise."""
     estimation, horizon = memory.options.estimation, memory.horizon
     monitor = RigMonitor(RigFilter(memory.prior, memory.obj, memory.drift, estimation, horizon=horizon))
     for blobs, pose in memory.noise.first:

@@ -1,4 +1,4 @@
-"""What rigs, objects, poses, beliefs and blobs out of a state file must be: arrays that belong together."""
+"""Checks of rigs, objects, poses, beliefs and blobs from a state file: their arrays must be consistent."""
 
 from __future__ import annotations
 
@@ -90,4 +90,4 @@ CHECKS: dict[type, Callable[[Any], None]] = {
     Observations: _check_observations,
     Detections: _check_detections,
 }
-"""What to call with a value that has been read; raises `ValueError` or `InputError`."""
+"""Check to run on a value after reading; raises `ValueError` or `InputError`."""

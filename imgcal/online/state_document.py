@@ -1,13 +1,13 @@
-"""The state of a running rig as a document of plain values and arrays, and back, exactly: every bit of every number.
+"""The state of a running rig as a document of plain values and arrays, and back, bit for bit.
 
-Each class says what of it is saved: a dataclass all fields but those with the metadata `NOT_SAVED`; another class what
-its table `STATE` lists: key in the document -> attribute and type. So an attribute may be renamed and its key stays; a
-renamed field of a dataclass keeps its key by the metadata `{"key": ...}`. A document names no classes. Reading follows
-the types of the code, checks kinds and shapes, and runs nothing that a document could choose. Arrays and beliefs are
-stored once each and referred to by number, so that what was shared is shared again.
+Each class defines its saved values: a dataclass all fields except those with the metadata `NOT_SAVED`; another class
+those in its table `STATE`: key in the document -> attribute and type. An attribute can thus be renamed while its key
+stays; a renamed field of a dataclass keeps its key by the metadata `{"key": ...}`. A document names no classes. Reading
+follows the types in the code, checks kinds and shapes, and runs nothing that a document could choose. Arrays and
+beliefs are stored once each and referred to by number, so that shared values are shared again.
 
-A class that must derive something from its state has a method `resume`, which raises `ValueError` where values do not
-belong together.
+A class that must derive something from its state has a method `resume`, which raises `ValueError` if the values are
+inconsistent.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from imgcal.online.state_checks import CHECKS
 from imgcal.types import CalibrationObject, UnknownLights
 
 NOT_SAVED: Mapping[str, bool] = {"saved": False}
-"""Metadata of a field that the caller gives anew on resuming."""
+"""Metadata of a field that the caller provides on resuming."""
 VARIANTS: Mapping[type, Mapping[str, type]] = {CalibrationObject: {"body": CalibrationObject, "lights": UnknownLights}}
-"""Classes with subclasses that may be saved in their place, and what the document calls them."""
+"""Classes with subclasses that may be saved instead, and their names in the document."""
 DTYPES = {name: np.dtype(name) for name in ("float64", "float32", "int64", "int32", "bool", "uint8")}
 NUMBERS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 """Numbers that JSON does not have."""
@@ -45,13 +45,13 @@ class Entry(NamedTuple):
     """One value of a class's state."""
 
     key: str  # in the document
-    attribute: str  # dots lead to an attribute of an attribute
+    attribute: str  # dots separate nested attributes
     kind: Any  # its type
 
 
 @cache
 def state_entries(kind: type) -> tuple[Entry, ...]:
-    """The values of a class that are saved; see the module."""
+    """The saved values of a class; see the module's docstring."""
     table: Mapping[str, tuple[str, Any]] | None = vars(kind).get("STATE")
     if table is not None:
         return tuple(Entry(key, attribute, of) for key, (attribute, of) in table.items())
@@ -67,30 +67,30 @@ def state_entries(kind: type) -> tuple[Entry, ...]:
 
 
 def is_array(kind: Any) -> bool:
-    """Tell whether a type is that of an array or tensor."""
+    """Tell whether a type is an array or tensor."""
     return kind is torch.Tensor or kind is np.ndarray or get_origin(kind) is np.ndarray
 
 
 def is_union(kind: Any) -> bool:
-    """Tell whether a type is one of several."""
+    """Tell whether a type is a union."""
     return get_origin(kind) in (Union, UnionType)
 
 
 class StateWriter:
-    """Turns values into a document as they are now: `arrays` are copied, so that they may change afterwards."""
+    """Converts values into a document; `arrays` are copies, so the originals may change afterwards."""
 
     def __init__(self) -> None:
-        """Begin an empty document."""
+        """Start an empty document."""
         self._arrays: list[tuple[np.ndarray, bool]] = []
         self._beliefs: list[dict[str, Any]] = []
         self._numbers: dict[Any, int] = {}
-        self._alive: list[Any] = []  # its memory must not be given to anything else meanwhile
+        self._alive: list[Any] = []  # keeps memory addresses unique while writing
 
     def write(self, kind: Any, value: Any) -> Any:
-        """Write a value of a type.
+        """Write a value of a given type.
 
         Raises:
-            TypeError: it is of another type.
+            TypeError: the value is of another type.
         """
         origin, args = get_origin(kind), get_args(kind)
         if is_union(kind):
@@ -137,7 +137,7 @@ class StateWriter:
         return self._numbers[id(belief)]
 
     def _array(self, value: torch.Tensor | np.ndarray) -> int:
-        """The number of an array; the same memory, seen in the same way, has one number."""
+        """Return the number of an array; views of the same memory with the same layout share one number."""
         array = value.detach().numpy() if isinstance(value, torch.Tensor) else value
         if array.dtype.name not in DTYPES:
             raise TypeError(f"an array of {array.dtype} cannot be saved")
@@ -145,15 +145,15 @@ class StateWriter:
         if key not in self._numbers or not array.size:
             self._numbers[key] = len(self._arrays)
             self._alive.append(array)
-            by_columns = array.flags.f_contiguous and not array.flags.c_contiguous  # sums then go in the same order
+            by_columns = array.flags.f_contiguous and not array.flags.c_contiguous  # keeps the order of summation
             self._arrays.append((np.array(array.T if by_columns else array, order="C"), by_columns))
         return self._numbers[key]
 
     def write_plain(self, value: Any) -> Any:
-        """Write a value of no stated type: text, numbers, arrays, and lists, tuples and dictionaries of them.
+        """Write a value without a declared type: text, numbers, arrays, and lists, tuples and dictionaries of them.
 
         Raises:
-            TypeError: it is of another type.
+            TypeError: the value is of another type.
         """
         if isinstance(value, list):
             return [self.write_plain(item) for item in value]
@@ -166,7 +166,7 @@ class StateWriter:
         return self.write(None | bool | int | float | str | np.ndarray, value)
 
     def tables(self) -> dict[str, Any]:
-        """What the written values refer to; of an array: type, shape, base64 of its bytes, whether by columns."""
+        """The tables that values refer to; for an array: type, shape, base64 of its bytes, whether by columns."""
         arrays = [
             [array.dtype.name, list(array.shape), base64.b64encode(array.tobytes()).decode("ascii"), by_columns]
             for array, by_columns in self._arrays
@@ -175,13 +175,13 @@ class StateWriter:
 
 
 class StateReader:
-    """Makes the values of a document again."""
+    """Converts a document back into values."""
 
     def __init__(self, tables: Mapping[str, Any]) -> None:
-        """Read what values refer to.
+        """Read the tables that values refer to.
 
         Raises:
-            ValueError: it is not what `StateWriter.tables` gives.
+            ValueError: `tables` is not what `StateWriter.tables` returns.
         """
         try:
             self._arrays = [_array(*plain) for plain in tables["arrays"]]
@@ -192,17 +192,17 @@ class StateReader:
             raise ValueError(f"tables: {type(error).__name__}: {error}") from error
 
     def read(self, kind: Any, plain: Any, where: str, fresh: Any = None) -> Any:
-        """Read a value of a type.
+        """Read a value of a given type.
 
         Args:
             kind: the type.
-            plain: what the document says.
+            plain: the value in the document.
             where: its name, for messages.
-            fresh: what a new object has there: it is filled where it can change, and arrays are of the same shape.
+            fresh: the value in a new object: filled in if mutable; arrays must have the same shape.
 
         Raises:
-            ValueError: it is of another type or shape, or values do not belong together.
-            InputError: a rig or an object cannot be.
+            ValueError: the value is of another type or shape, or values are inconsistent.
+            InputError: a rig or an object is invalid.
         """
         origin, args = get_origin(kind), get_args(kind)
         if is_union(kind):
@@ -235,10 +235,10 @@ class StateReader:
         return self.read_object(kind, plain, where, fresh)
 
     def read_plain(self, plain: Any, where: str) -> Any:
-        """Read what `StateWriter.write_plain` wrote.
+        """Read a value written by `StateWriter.write_plain`.
 
         Raises:
-            ValueError: it is not that.
+            ValueError: it is no such value.
         """
         if isinstance(plain, list):
             return [self.read_plain(item, where) for item in plain]
@@ -254,7 +254,7 @@ class StateReader:
         return self.read(float | np.ndarray, plain, where)
 
     def read_object(self, kind: type, plain: Any, where: str, fresh: Any = None) -> Any:
-        """Read an object; `fresh` is filled with it where it can change, see `read`."""
+        """Read an object; a mutable `fresh` is filled in, see `read`."""
         if kind in VARIANTS and isinstance(plain, dict):
             found = VARIANTS[kind].get(str(plain.get("kind")))
             if found is None:
@@ -298,7 +298,7 @@ def _attribute(value: Any, path: str) -> Any:
 
 
 def _is_of(kind: Any, value: Any) -> bool:
-    """Tell whether a value is of a type, as far as its outermost part says."""
+    """Tell whether the outermost part of a value matches a type."""
     origin = get_origin(kind)
     if origin is Literal:
         return isinstance(value, str | int | NoneType) and value in get_args(kind)
@@ -315,7 +315,7 @@ def _is_of(kind: Any, value: Any) -> bool:
 
 
 def _fits(kind: Any, plain: Any) -> bool:
-    """Tell whether what a document says may be of a type, as far as its outermost part says."""
+    """Tell whether the outermost part of a document's value matches a type."""
     origin = get_origin(kind)
     if origin is Literal:
         return isinstance(plain, str | int | NoneType) and plain in get_args(kind)
@@ -343,7 +343,7 @@ def _fits(kind: Any, plain: Any) -> bool:
 
 
 def _describe(plain: Any) -> str:
-    """What a document says, in a few words."""
+    """Describe a value of a document in a few words."""
     if isinstance(plain, dict):
         return ", ".join(str(name) for name in plain)[:60] or "nothing"
     return f"a list of {len(plain)}" if isinstance(plain, list) else repr(plain)[:60]

@@ -1,4 +1,4 @@
-"""From frames or blobs to a recalibrated rig, and the checks that it must pass."""
+"""From frames or blobs to a recalibrated rig that has passed all checks."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""Which way round a board is whose images do not say it: the same for all cameras of a snapshot, or no rig is right."""
+"""Resolve the orientation of a symmetric board: all cameras of a snapshot must agree on it."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from imgcal.types import CalibrationObject, CameraRig, Detections
 
 
 def settle_turns(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Detections:
-    """Turn the labels of each camera so that all of a snapshot have the board the same way round.
+    """Turn the labels of each camera so that all cameras of a snapshot agree on the board's orientation.
 
-    Which way that is does not matter for the rig. It is the turn of the camera that comes first; the others follow, by
-    the factory rig, which knows the cameras' directions far better than half a turn.
+    Which orientation that is does not matter for the rig. The first camera's is used, and the others follow by the
+    factory rig, which knows the cameras' directions far better than half a turn.
 
     Args:
-        detections: points of a board, each image with labels of some turn.
+        detections: points of a board, with an arbitrary orientation in each image.
         rig: what is known before.
-        obj: the object; one without a board, or whose images say its turn, is left alone.
+        obj: the object; one without a board, or whose images show its orientation, is left alone.
     """
     if obj.board is None or len(obj.board.turns) == 1 or rig.num_cameras == 1:
         return detections
     cam_from_object, known = single_camera_poses(to_observations(detections, rig, obj), rig, obj)
-    rotation = rig.cam_from_rig.rotation.double().mT @ cam_from_object.rotation.double()  # of the board in the rig
+    rotation = rig.cam_from_rig.rotation.double().mT @ cam_from_object.rotation.double()  # board in the rig frame
     fiducial = detections.fiducial.copy()
     angles = [angle for angle, _ in obj.board.turns]
     for snapshot in range(len(known)):
@@ -43,10 +43,10 @@ def settle_turns(detections: Detections, rig: CameraRig, obj: CalibrationObject)
 
 
 def require_one_turn(cameras: CameraRig, obj: CalibrationObject) -> None:
-    """Raise `RefusedError` where nothing says how the turns of several cameras go together."""
+    """Raise `RefusedError` if the board's orientation in several cameras cannot be made consistent."""
     if obj.board is not None and len(obj.board.turns) > 1 and cameras.num_cameras > 1:
         raise RefusedError(
             f"object: a {obj.board} looks the same turned, so that without a factory calibration the images of several "
-            "cameras do not say which of its points are the same: use a ChArUco board, or one of an even and an odd "
+            "cameras do not show which of its points are the same: use a ChArUco board, or one of an even and an odd "
             "number of squares"
         )

@@ -1,4 +1,4 @@
-"""`Calibration`: a recalibrated rig, with what it was made from."""
+"""`Calibration`: a recalibrated rig and the data behind it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from imgcal.types import (
 
 @dataclass(frozen=True)
 class Bend:
-    """Deflection of the middle of a printed board along x and y: mm, positive = away from the viewer."""
+    """Deflection of a printed board's middle along x and y: mm, positive = away from the viewer."""
 
     x: float
     y: float
@@ -52,11 +52,11 @@ class Bend:
 
     @property
     def is_certain(self) -> bool:
-        """Tell whether the board is bent beyond doubt."""
+        """Tell whether the board is certainly bent."""
         return max(abs(self.x) / self.x_sigma, abs(self.y) / self.y_sigma) > CERTAIN
 
     def __str__(self) -> str:
-        """Say it in words."""
+        """Describe it in words."""
         how = "bent" if self.is_certain else "flat, as far as can be told"
         return (
             f"the board is {how}: its middle is off by {self.x:+.2g} +- {self.x_sigma:.1g} mm along x and "
@@ -66,7 +66,7 @@ class Bend:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A recalibrated rig, with what it was made from. Snapshots are those used, in order.
+    """A recalibrated rig and the data behind it. Snapshots are those used, in order.
 
     Examples:
         >>> import torch, imgcal
@@ -80,31 +80,31 @@ class Calibration:
         (0, (), ())
     """
 
-    estimate: Estimate  # without batch axes: the rig, the poses, and how well they are known
+    estimate: Estimate  # without batch axes: the rig, the poses, and their uncertainty
     labelled: Associations
     observations: Observations  # (S, C, N) as used: outliers not seen, sigma with the additive noise
-    additive_noise: float  # px, what the residuals hold beyond the blobs' own sigma
+    additive_noise: float  # px, noise of the residuals beyond the blobs' own sigma
     outliers: int  # labelled blobs left out
-    prior_scale: Mapping[str, float]  # by kind of value: factor by which the prior was too narrow, where it was
+    prior_scale: Mapping[str, float]  # by kind of value: factor by which the prior was too narrow, if it was
     factory: CameraRig
-    obj: CalibrationObject  # as it was given
-    shape: tuple[FiducialOffset, ...] = ()  # where each fiducial is instead; empty = the object was taken as exact
-    scale_sigma: float | None = None  # relative: an error of the object's scale four times as large would be noticed
-    bent_sigma: float | None = None  # how sure it is that the object is not as estimated; None = not asked
-    block_length: int = 0  # snapshots in the blocks whose scatter the covariance follows; 0 = that of the noise
-    initialization: Initialization | None = None  # what a network said, where one was asked
-    guess_used: bool = False  # its guess was nearer to the images than the factory calibration
+    obj: CalibrationObject  # as given
+    shape: tuple[FiducialOffset, ...] = ()  # estimated offset of each fiducial; empty = the object was taken as exact
+    scale_sigma: float | None = None  # relative: a scale error of the object four times as large would be noticed
+    bent_sigma: float | None = None  # significance of a deviation from the estimated object; None = not tested
+    block_length: int = 0  # snapshots per block whose scatter scales the covariance; 0 = scaled by the noise
+    initialization: Initialization | None = None  # a network's first guess, if one was used
+    guess_used: bool = False  # its guess fitted the images better than the factory calibration
     seconds: Mapping[str, float] = field(default_factory=dict)  # by stage
-    moved: tuple[MovedCamera, ...] = ()  # during the capture; snapshots used are those since then
-    from_scratch: bool = False  # there was no factory calibration: `factory` is a first rig made from the same data
-    late: tuple[LateCamera, ...] = ()  # whose frames, from some snapshot on, are of other moments: these took no part
-    unsynchronized: Unsynchronized | None = None  # cameras expose at moments of their own; None = no sign of it
-    repeats: Repeats = Repeats()  # exact copies of earlier images: these took no part
-    distance: KnownDistance | None = None  # of two cameras, which the scale rests on where nothing else knows it
-    lights: FoundLights | None = None  # of unknown markers: snapshots used are one marker at one moment each
+    moved: tuple[MovedCamera, ...] = ()  # during the capture; only snapshots after the moves are used
+    from_scratch: bool = False  # no factory calibration: `factory` is a first rig from the same data
+    late: tuple[LateCamera, ...] = ()  # whose frames, from some snapshot on, are of other moments; those are not used
+    unsynchronized: Unsynchronized | None = None  # unsynchronized cameras; None = no sign of them
+    repeats: Repeats = Repeats()  # exact copies of earlier images; not used
+    distance: KnownDistance | None = None  # between two cameras: defines the scale if nothing else does
+    lights: FoundLights | None = None  # unknown markers: each used snapshot is one marker at one moment
 
     def __repr__(self) -> str:
-        """Say what was found: the rig, its error before and after, how the fiducials were identified."""
+        """Summarize: the rig, its error before and after, how the fiducials were identified."""
         before, after = float(self.before.rms), float(self.rms)
         used = "{} of {} snapshots".format(*self.labelled.moment_counts)
         return (
@@ -114,7 +114,7 @@ class Calibration:
 
     @cached_property
     def rig(self) -> CameraRig:
-        """The recalibrated rig, with how well it is known: what a running rig begins with (`RigKeeper`)."""
+        """The recalibrated rig with its uncertainty: the start of a running rig (`RigKeeper`)."""
         return replace(self.estimate.rig, posterior=self.posterior)
 
     def posterior(self) -> RigPosterior:
@@ -127,12 +127,12 @@ class Calibration:
 
     @property
     def rig_from_object(self) -> RigidTransform:
-        """The object's pose in each snapshot: (S,); of several objects in each row, see `poses_by_object`."""
+        """The object's pose in each snapshot: (S,); if a row has several objects, see `poses_by_object`."""
         return self.estimate.rig_from_object
 
     @property
     def poses_by_object(self) -> Mapping[str, Mapping[str, RigidTransform]]:
-        """rig_from_object by the name of the object and of the snapshot, in the frame of the object's file."""
+        """rig_from_object by object name and snapshot name, in the frame of the object's file."""
         rows, poses, parts = self.labelled.used, self.rig_from_object, self.obj.each
         found: dict[str, dict[str, RigidTransform]] = {part.name: {} for part in parts}
         for row, part, rotation, translation in zip(
@@ -145,7 +145,7 @@ class Calibration:
 
     @property
     def points_object(self) -> Tensor:
-        """The fiducials as estimated: (N, 3) mm; as given where the object is exact."""
+        """The fiducials as estimated: (N, 3) mm; as given if the object is exact."""
         return self.estimate.points_object
 
     @property
@@ -160,12 +160,12 @@ class Calibration:
 
     @property
     def chi2_per_dof(self) -> Tensor:
-        """About 1 where residuals fit the noise and the prior: ()."""
+        """About 1 if residuals match the noise and the prior: ()."""
         return self.estimate.chi2_per_dof
 
     @cached_property
     def before(self) -> Estimate:
-        """The factory rig as it stands on the same observations: only the poses are fitted."""
+        """The factory rig on the same observations: only the poses are fitted."""
         return estimate(
             self.observations,
             self.factory,
@@ -176,7 +176,7 @@ class Calibration:
 
     @property
     def bend(self) -> Bend | None:
-        """How much a printed board is bent; None = it was taken as its file says."""
+        """Deflection of a printed board; None = assumed to be as in its file."""
         board, modes = self.obj.board, self.estimate.modes
         if board is None or modes is None:
             return None
@@ -187,7 +187,7 @@ class Calibration:
 
     @property
     def object(self) -> CalibrationObject:
-        """The object as it was estimated: its fiducials in their estimated places, taken as exact."""
+        """The object as estimated: its fiducials in their estimated positions, taken as exact."""
         board, bend = self.obj.board, self.bend
         if board is not None and bend is not None:
             board = replace(board, bend=(bend.x, bend.y), warp=max(bend.x_sigma, bend.y_sigma))
@@ -195,22 +195,22 @@ class Calibration:
 
     @property
     def displaced(self) -> tuple[FiducialOffset, ...]:
-        """Fiducials that are surely not in their places; what is known of lost ones rests on a few odd labels."""
+        """Fiducials that are certainly displaced, except lost ones, whose estimates rest on a few odd labels."""
         return tuple(d for d in find_displaced(self.shape, self.obj) if d.fiducial not in self.lost)
 
     @cached_property
     def lost(self) -> tuple[int, ...]:
-        """Fiducials that were hardly found where the others were."""
+        """Fiducials that were hardly found although the others were."""
         points = self.rig_from_object.apply(self.points_object)
         visible = self.rig.expand(len(points)).project(points, self.obj.radius).visible
         return find_lost_fiducials(self.observations.seen.numpy(), visible.numpy() & self.labelled.columns(self.obj))
 
     @property
     def untimed(self) -> tuple[str, ...]:
-        """Cameras whose frames may be of other moments than the others' without a trace: too little motion.
+        """Cameras with too little motion in view to detect frames of other moments.
 
-        None of several unknown markers: snapshots that took no part have judged every camera, and no marker can be
-        followed from one snapshot to the next.
+        Empty for several unknown markers: held-out snapshots have checked every camera, and no marker can be tracked
+        from one snapshot to the next.
         """
         if self.lights is not None and len(self.labelled.used) > self.labelled.moment_counts[0]:
             return ()
@@ -228,15 +228,15 @@ class Calibration:
 
     @cached_property
     def doubtful(self) -> tuple[DoubtfulCamera, ...]:
-        """Cameras that stop fitting at the end: where they were bumped there, the rig is not as it is now."""
+        """Cameras that stop fitting at the end: if they were bumped there, the present rig differs from this one."""
         names = tuple(snapshot.name for snapshot in self.labelled.snapshots)
         return doubtful_at_end(self.tally, self.rig.camera_names, names)
 
     @property
     def labelled_detections(self) -> Detections:
-        """All blobs with the labels that they got; those left out as outliers have the flag `BlobFlag.OUTLIER`.
+        """All blobs with their labels; outliers have the flag `BlobFlag.OUTLIER`.
 
-        The label of an unknown marker holds at its moment only.
+        The label of an unknown marker is valid at its moment only.
         """
         detections, used = self.labelled.detections, self.labelled.used
         row = np.full(len(self.labelled.snapshots), -1)
@@ -252,19 +252,19 @@ class Calibration:
 
     @cached_property
     def predicted_error(self) -> PredictedError:
-        """How good the rig is over the working volume."""
+        """Predicted error of the rig over the working volume."""
         return predicted_error(self.estimate)
 
     @cached_property
     def scale(self) -> Scale:
-        """What the size of the rig rests on, and what an error of the object's file would add to the predicted one."""
+        """What the rig's scale is based on, and the effect of an error in the object's file."""
         if self.distance is not None:
             return self.distance.scale
         return find_scale(self.estimate, self.obj, self.scale_sigma, self.predicted_error.volume)
 
     @property
     def detectors(self) -> Mapping[str, int]:
-        """Who found the fiducials, with the number of snapshots used: `classical` (blobs), or a proposer's name."""
+        """Number of used snapshots by the detector of their fiducials: `classical` (blobs), or a proposer's name."""
         return Counter(self.labelled.snapshots[s].found_by for s in self.labelled.used)
 
     @property

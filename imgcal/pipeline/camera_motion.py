@@ -1,4 +1,4 @@
-"""How far each camera has moved since the factory calibration, where most cameras are taken to have stood still."""
+"""How far each camera has moved since the factory calibration, assuming that most cameras stood still."""
 
 from __future__ import annotations
 
@@ -12,44 +12,44 @@ from imgcal.pipeline.calibration import Calibration
 from imgcal.types import MovedCamera
 
 MOVED = 3.0
-"""A value has moved when its change from the factory is larger than this many standard deviations."""
+"""A value has moved if its change from the factory is larger than this many standard deviations."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Changes of all cameras, a motion of the whole rig taken out."""
+    """Changes of all cameras, without a motion of the whole rig."""
 
     gauge: Gauge
     camera_names: tuple[str, ...]  # C
     change: Tensor  # (C, K) recalibrated minus factory, as `CameraRig.parameter_names`
-    std: Tensor  # (C, K) one standard deviation of it; zero where nothing can have changed
+    std: Tensor  # (C, K) one standard deviation of the change; zero for fixed values
 
     @property
     def rotation_deg(self) -> Tensor:
-        """Angle by which each camera has turned: (C,)."""
+        """Rotation angle of each camera: (C,)."""
         return self.change[:, :3].norm(dim=-1) * (180 / math.pi)
 
     @property
     def position_mm(self) -> Tensor:
-        """Distance by which each camera has been shifted: (C,)."""
+        """Displacement of each camera: (C,)."""
         return self.change[:, 3:6].norm(dim=-1)
 
     @property
     def moved(self) -> tuple[int, ...]:
-        """Cameras of which a rotation or a position has changed measurably, those that went farthest first."""
+        """Cameras whose rotation or position has changed significantly, largest change first."""
         beyond = ((self.change.abs() > MOVED * self.std) & (self.std > 0))[:, :6].any(dim=-1)
         far = self.rotation_deg + self.position_mm / 10
         return tuple(int(c) for c in far.argsort(descending=True) if beyond[c])
 
     @property
     def moves(self) -> tuple[MovedCamera, ...]:
-        """The same cameras with the change that is surest: a rotation (deg) or a position (mm)."""
+        """The same cameras with their most significant change: a rotation (deg) or a position (mm)."""
         return tuple(self._move(c) for c in self.moved)
 
     def _move(self, camera: int) -> MovedCamera:
         change, std = self.change[camera, :6].view(2, 3), self.std[camera, :6].view(2, 3)
         size = change.norm(dim=-1)
-        sigma = (change * std).norm(dim=-1) / size.clamp_min(1e-30)  # of the length, along the change itself
+        sigma = (change * std).norm(dim=-1) / size.clamp_min(1e-30)  # of the length, along the change
         turned = bool(size[0] * sigma[1] >= size[1] * sigma[0])
         row, unit = (0, 180 / math.pi) if turned else (1, 1.0)
         return MovedCamera(
@@ -62,7 +62,7 @@ class Motion:
 
     @property
     def sentence(self) -> str:
-        """Name them: "1 of 8 cameras moved relative to the others: mocap1 (2.01 deg, 15.2 mm)"."""
+        """Describe them: "1 of 8 cameras moved relative to the others: mocap1 (2.01 deg, 15.2 mm)"."""
         moved, count = self.moved, len(self.camera_names)
         if count == 1:
             return ""
@@ -80,8 +80,8 @@ def motion_since_factory(calibration: Calibration, gauge: Gauge | None = None) -
     """Compare a calibration with the factory rig.
 
     Args:
-        calibration: what was found.
-        gauge: which cameras are taken to have stood still; None = most of them, whichever.
+        calibration: the calibration.
+        gauge: the cameras assumed to have stood still; None = the largest group that agrees.
 
     Examples:
         >>> import torch, imgcal

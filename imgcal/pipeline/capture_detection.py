@@ -1,4 +1,4 @@
-"""Blobs of a capture on disk, snapshot by snapshot, so that never more than one of them is in memory."""
+"""Detect the blobs of a capture on disk, with only one snapshot in memory at a time."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def detect_capture(
         last: number of the snapshot to stop before; None = to the end.
         options: what counts as a blob.
         measurer: measures the blobs of frames again.
-        board: the printed board whose points are found instead of blobs.
+        board: a printed board, whose points are found instead of blobs.
         bar: wraps the loop over snapshots, for a progress bar.
 
     Returns:
         The blobs, and the frames of the first snapshot, for pictures.
 
     Raises:
-        InputError: a frame cannot be read, or the board is in none.
+        InputError: a frame cannot be read, or no frame shows the board.
     """
     names, masks = capture.snapshot_names[first:last], read_masks(capture)
     found: list[Blobs] = []
@@ -64,7 +64,7 @@ def detect_capture(
 
 
 def read_masks(capture: Capture) -> dict[str, NDArray[np.bool_]]:
-    """Read the masks of the cameras that have one: True where the image is to be ignored."""
+    """Read the cameras' masks, where present: True = ignore this pixel."""
     return {camera: mask for camera in capture.camera_names if (mask := capture.mask(camera)) is not None}
 
 
@@ -75,17 +75,17 @@ def capture_sight(
     first: int = 0,
     measurer: LearnedMeasurer | None = None,
 ) -> Sight:
-    """Let a detector other than blobs look at the frames of a capture.
+    """Prepare a detector other than blobs for the frames of a capture.
 
     Args:
         capture: the capture.
         detector: its name or file.
-        options: how blobs are found beside it.
+        options: how blobs are found as well.
         first: number of the first snapshot.
         measurer: reads the markers that a network finds.
 
     Raises:
-        InputError: no such detector.
+        InputError: there is no such detector.
     """
     proposer, where_blobs_fail = choose_proposer(detector, measurer)
     return Sight(proposer, lambda s: capture.frames_of(first + s), where_blobs_fail, options, read_masks(capture))

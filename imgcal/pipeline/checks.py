@@ -1,4 +1,4 @@
-"""What a calibration must pass before it is given to anybody: each check refuses with its reason, or does nothing."""
+"""Checks that a calibration must pass before it is returned: each raises its reason, or does nothing."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from imgcal.pipeline.label_counts import LabelCounts
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
 LEAST_EXPLAINED = 0.5
-"""Of what a camera sees of the object, the share that must be where the rest of the rig expects it."""
+"""Minimum share of a camera's view of the object that must be where the rest of the rig expects it."""
 SAME_PIXEL = 1e-3
-"""Pixels up to which two ways of projecting may differ."""
+"""Maximum difference (px) between two ways of projecting."""
 LEAST_SIGHT = 0.3
-"""Blobs that may be fiducials, in parts of the fiducials in view, from which a camera is said to see the object."""
+"""Minimum number of possible fiducials, as a share of those in view, for a camera to see the object."""
 
 
 def require_cameras(seen: NDArray[np.bool_], rig: CameraRig, options: PipelineOptions) -> None:
-    """Refuse where a camera has nothing that is `seen` (S, C, N)."""
+    """Refuse if a camera has nothing in `seen` (S, C, N)."""
     blind = [rig.camera_names[i] for i in np.flatnonzero(~seen.any(axis=(0, 2)))]
     if blind and (not options.blind_cameras or len(blind) == rig.num_cameras):
         raise RefusedError(
-            f"camera {', '.join(blind)}: found no fiducial in any snapshot, expected some; nothing can be said of it",
+            f"camera {', '.join(blind)}: found no fiducial in any snapshot, expected some; it cannot be calibrated",
             python="rig.select leaves a camera out, PipelineOptions(blind_cameras=True) keeps its factory values",
             command="--without leaves a camera out, --blind-cameras keeps its factory values",
         )
 
 
 def require_views(counts: LabelCounts, rig: CameraRig, least_share: float = LEAST_EXPLAINED) -> None:
-    """Refuse where a camera sees what may be the object, and hardly any of it where the rest of the rig expects it.
+    """Refuse if a camera sees a possible object, but hardly any of it where the rest of the rig expects it.
 
-    Labels that were never given count as much against a camera as those that were given and did not fit.
+    Missing labels count as much against a camera as labels that did not fit.
 
     Args:
         counts: what each camera saw.
-        rig: names the cameras.
-        least_share: of what a camera sees of the object, to be where it should be; zero = anything at all.
+        rig: for the names of the cameras.
+        least_share: share of a camera's view of the object that must be in place; zero = any.
     """
     kept, unexplained, expected = (count.sum(0) for count in (counts.kept, counts.unexplained, counts.expected))
     bad = (kept <= least_share * (kept + unexplained)) & (unexplained >= LEAST_SIGHT * np.maximum(expected, 1))
@@ -52,22 +52,22 @@ def require_views(counts: LabelCounts, rig: CameraRig, least_share: float = LEAS
         raise RefusedError(
             f"camera {which}: the other cameras put {expected[camera]} fiducials into the image of "
             f"{rig.camera_names[camera]}, found {kept[camera]} there, and {unexplained[camera]} blobs that belong to "
-            "nothing: the image may be mirrored or turned, the frames of another camera or moment, place or lens not "
-            "those of the rig file",
-            python="put that right, or leave the camera out of the rig (rig.select) and of the detections",
-            command=f"put that right, or leave out what is wrong: --without {which.replace(',', '')}",
+            "nothing: the image may be mirrored or turned, its frames may be of another camera or moment, or its pose "
+            "or lens may differ from the rig file",
+            python="correct this, or leave the camera out of the rig (rig.select) and of the detections",
+            command=f"correct this, or leave out what is wrong: --without {which.replace(',', '')}",
         )
 
 
 def require_fit(additive_noise: float, outlier_share: float, rms: float, options: PipelineOptions) -> None:
-    """Refuse where residuals (px) or the share of left-out labels are larger than noise makes them."""
+    """Refuse if residuals (px) or the share of left-out labels are larger than noise explains."""
     if additive_noise > options.largest_additive_noise:
         raise RefusedError(
-            f"estimation: the best rig misses the blobs by {rms:.2f} px (RMS), of which {additive_noise:.2f} px do not "
-            f"fit their noise, expected at most {options.largest_additive_noise:g}: the object is not as its file "
-            "says, labels are wrong, or the lenses are of another kind",
-            python="measure the object anew; where all is right, raise PipelineOptions.largest_additive_noise",
-            command="measure the object anew, and look at labels given in the input",
+            f"estimation: the best rig misses the blobs by {rms:.2f} px (RMS), of which {additive_noise:.2f} px are "
+            f"not noise of the blobs, expected at most {options.largest_additive_noise:g}: the object differs from its "
+            "file, labels are wrong, or the lenses are of another kind",
+            python="measure the object again; if all is right, raise PipelineOptions.largest_additive_noise",
+            command="measure the object again, and check labels given in the input",
         )
     if outlier_share > options.most_outliers:
         raise RefusedError(
@@ -81,9 +81,9 @@ def require_fit(additive_noise: float, outlier_share: float, rms: float, options
 def require_same_residuals(
     fit: Estimate, observations: Observations, seen: NDArray[np.bool_], obj: CalibrationObject
 ) -> None:
-    """Project the object with the rig that is about to be returned: the residuals must be those about to be reported.
+    """Project the object with the rig to be returned, and compare with the residuals to be reported.
 
-    Shares nothing with the solver. Should they differ, the solver's state and its report do not belong together.
+    Shares no code with the solver. A difference means that the solver's state and its report are inconsistent.
     """
     points = fit.rig_from_object.apply(fit.points_object.unsqueeze(-3)).to(fit.rig.focal_length)
     uv = fit.rig.expand(len(points)).project_values(points, obj.radius).uv  # (S, C, N, 2)
@@ -98,7 +98,7 @@ def require_same_residuals(
 def require_near_prior(
     fit: Estimate, prior: Tensor, rig: CameraRig, prior_scale: Mapping[str, float], options: PipelineOptions
 ) -> None:
-    """Refuse where a value, or a kind of values, is farther from the factory's than the `prior` (C, K) can bear."""
+    """Refuse if a value, or a kind of values, is farther from the factory's than the `prior` (C, K) allows."""
     offset, prior_std, std = (
         tensor.numpy() for tensor in (fit.solution.state.offset[0], fit.problem.prior_std[0], prior)
     )
@@ -111,7 +111,7 @@ def require_near_prior(
         found = (
             f"camera {rig.camera_names[camera]}: {name.replace('_', ' ')} would differ from its factory value by "
             f"{_format_value(change[camera, parameter], name)}, with a tolerance (prior) of "
-            f"{_format_value(std[camera, parameter], name)} and {options.largest_drift:g} times as much accepted"
+            f"{_format_value(std[camera, parameter], name)} and up to {options.largest_drift:g} times as much accepted"
         )
     elif kind and prior_scale[kind] > options.widest_prior:
         found = (
@@ -122,14 +122,14 @@ def require_near_prior(
     else:
         return
     raise RefusedError(
-        f"estimation: {found}: cameras may be exchanged, labels wrong, or the rig file that of another rig",
-        python="where the rig has really changed so much, give it a wider prior: replace(rig, prior=RigPrior(...))",
-        command="where the rig has really changed so much, write larger values under `prior` in the rig file",
+        f"estimation: {found}: cameras may be swapped, labels may be wrong, or the rig file belongs to another rig",
+        python="if the rig has really changed that much, give it a wider prior: replace(rig, prior=RigPrior(...))",
+        command="if the rig has really changed that much, write larger values under `prior` in the rig file",
     )
 
 
 def require_most_labels(labels: NDArray[np.bool_], kept: NDArray[np.bool_], rig: CameraRig) -> None:
-    """Refuse where most labels of one camera or one fiducial do not fit: they are not what they are said to be."""
+    """Refuse if most labels of one camera or one fiducial do not fit, so that they must be wrong."""
     before, after = labels.sum((0, 2)), kept.sum((0, 2))
     bad = np.flatnonzero((before >= 6) & (after < 0.5 * before)).tolist()
     if bad:
@@ -138,8 +138,8 @@ def require_most_labels(labels: NDArray[np.bool_], kept: NDArray[np.bool_], rig:
             f"estimation: camera {', '.join(which)}: {before[bad[0]] - after[bad[0]]} of {before[bad[0]]} labels in "
             f"{which[0]} do not fit what the other cameras see: its frames may be of another moment, or its labels of "
             "other fiducials",
-            python="put that right, or leave the camera out of the rig (rig.select) and of the detections",
-            command=f"put that right, or leave it out: --without {' '.join(which)}",
+            python="correct this, or leave the camera out of the rig (rig.select) and of the detections",
+            command=f"correct this, or leave it out: --without {' '.join(which)}",
         )
     before, after = labels.sum((0, 1)), kept.sum((0, 1))
     bad = np.flatnonzero((before >= 6) & (after < 0.5 * before)).tolist()
@@ -148,13 +148,13 @@ def require_most_labels(labels: NDArray[np.bool_], kept: NDArray[np.bool_], rig:
             f"estimation: fiducial {', '.join(map(str, bad))} (row of the object file): "
             f"{before[bad[0]] - after[bad[0]]} of {before[bad[0]]} labels of fiducial {bad[0]} do not fit: it "
             "has moved on the object, or labels are swapped",
-            python="measure it anew, or leave it out of the object",
-            command="measure it anew, or take its row out of the object file",
+            python="measure it again, or leave it out of the object",
+            command="measure it again, or take its row out of the object file",
         )
 
 
 def _format_value(value: float, name: str) -> str:
-    """Write a value of a parameter as people read it."""
+    """Format a parameter's value for people."""
     if name.startswith("rotation"):
         return f"{math.degrees(value):.3g} deg"
     if name.startswith("position"):

@@ -1,7 +1,7 @@
-"""Whether a camera's frames are of other moments than those of the rest: a frame was lost or repeated, or all are late.
+"""Detect cameras whose frames are of other moments than the rest's: a lost or repeated frame, or a late start.
 
-The rest of the rig says where the object was in every snapshot. A camera whose blobs, under one calibration of its own,
-are where the object was a snapshot earlier or later, and not where it is, has slipped; one that was bumped has not.
+The rest of the rig gives the object's pose in every snapshot. A camera has slipped if its blobs, under a calibration of
+its own, fit the pose of an earlier or later snapshot but not the current one. A bumped camera does not do that.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from imgcal.pipeline.label_counts import LabelCounts
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
 
 SLIPS = (-2, -1, 1, 2)
-"""Snapshots by which a camera may be early or late."""
+"""Numbers of snapshots by which a camera may be early or late."""
 LEAST_SNAPSHOTS = 3
-"""Labelled snapshots on which a slip rests."""
+"""Minimum number of labelled snapshots that support a slip."""
 BETTER = 5.0
-"""Times the RMS of the best slip, that without a slip must have."""
+"""Minimum ratio of the RMS without a slip to that of the best slip."""
 LEAST_BETTER = 1.0
-"""Pixels by which it must be better: a slow object does not show which moment it was."""
+"""Minimum improvement (px): a slow object does not show which moment it was."""
 MOST_ASKED = 2
-"""Cameras that are looked at."""
+"""Maximum number of cameras to test."""
 SIGMA = 0.5
-"""Pixels, of all labels alike: moments are told apart by much more."""
+"""Pixels, the same for all labels: moments differ by much more."""
 WINDOW = 40
-"""Snapshots before and after the first doubtful one that are looked at."""
+"""Number of snapshots before and after the first doubtful one to use."""
 MOST_STARTS = 12
-"""Snapshots at which a slip may begin that are tried at first; then those around the best."""
+"""Number of snapshots tried first as the start of a slip; then those around the best one."""
 MOST_FIDUCIALS = 24
-"""Of a large object, that are enough to tell one moment from another."""
+"""Number of a large object's fiducials that suffices to tell moments apart."""
 
 Calibrated = Callable[[Detections], tuple[list[int], RigidTransform]]
 
@@ -48,11 +48,11 @@ class LateCamera:
     """A camera whose frames are of another moment."""
 
     camera: str
-    snapshot: str  # the first one that is
-    by: int  # snapshots: +1 = its frame shows what the others see one snapshot later: one was lost before it
+    snapshot: str  # the first such snapshot
+    by: int  # +1 = its frame shows what the others see one snapshot later: a frame was lost
 
     def __str__(self) -> str:
-        """Say it in words."""
+        """Describe it in words."""
         count, when = abs(self.by), "later" if self.by > 0 else "earlier"
         many = f"{count} snapshots" if count > 1 else "one snapshot"
         cause = "lost" if self.by > 0 else "repeated, or it started late"
@@ -63,15 +63,15 @@ class LateCamera:
 
 
 def timing_motion(uv: Tensor, seen: Tensor, before: NDArray[np.int64]) -> Tensor:
-    """How far images would be off if a camera were late by one snapshot, and turned to make up for it: (C,) pixels.
+    """Residual image shift if a camera were late by one snapshot, and rotated to compensate: (C,) pixels.
 
-    A steady motion shifts all images of a late camera alike, as a turn of the camera does; only changes of the motion
-    tell them apart.
+    A steady motion shifts all images of a late camera alike, as a rotation of the camera does; only changes of the
+    motion distinguish them.
 
     Args:
         uv: (S, C, N, 2) pixels.
         seen: (S, C, N) bool.
-        before: (S,) number of the same object one snapshot earlier, -1 = there is none.
+        before: (S,) number of the same object's row one snapshot earlier, -1 = there is none.
     """
     rows = torch.from_numpy(np.flatnonzero(before >= 0))
     earlier = torch.from_numpy(before)[rows]
@@ -84,15 +84,15 @@ def timing_motion(uv: Tensor, seen: Tensor, before: NDArray[np.int64]) -> Tensor
 
 
 def suspects(counts: LabelCounts, names: tuple[str, ...], moved: Sequence[tuple[str, int]] = ()) -> dict[int, int]:
-    """Choose cameras that see the object, and often not where the others have it; those that are said to have moved.
+    """Choose cameras that often disagree with the others about the object, and those reported to have moved.
 
     Args:
         counts: of all snapshots and cameras.
         names: of the cameras.
-        moved: cameras that are said to have moved, and the snapshot from which on.
+        moved: cameras reported to have moved, and the snapshot of the move.
 
     Returns:
-        By camera, the number of the snapshot from which on it differs.
+        By camera, the number of the first snapshot that differs.
     """
     differs = (counts.unexplained > counts.kept) & (2 * counts.unexplained >= counts.expected)
     number = differs.sum(0)
@@ -111,7 +111,7 @@ def find_late_camera(
     around: int,
     calibrated: Calibrated,
 ) -> LateCamera | None:
-    """Ask whether one camera has slipped.
+    """Test whether one camera has slipped.
 
     Args:
         detections: blobs of all cameras.
@@ -119,10 +119,10 @@ def find_late_camera(
         obj: the calibration object.
         camera: its number.
         around: the first snapshot in which it differs.
-        calibrated: what the others say: from their blobs to the used snapshots and the object's poses in these.
+        calibrated: calibrates the others: from their blobs to the used snapshots and the object's poses in them.
 
     Returns:
-        What has happened to it; None where nothing has, or nobody can say.
+        The slip found; None if there is none, or the data cannot tell.
     """
     if rig.num_cameras < 3:
         return None
@@ -135,7 +135,7 @@ def find_late_camera(
         seen_alone = _label_camera(part.select(own), rig.select([camera]), obj, used, poses)
         view = _View(rig.select([camera]), obj.points.double()[chosen], poses, *(x[:, chosen] for x in seen_alone))
         found = _slip(view)
-    except RefusedError:  # of the others, or of this camera, not enough is seen
+    except RefusedError:  # the others, or this camera, do not see enough
         return None
     if found is None:
         return None
@@ -145,7 +145,7 @@ def find_late_camera(
 
 @dataclass(frozen=True)
 class _View:
-    """What one camera saw, labelled by itself, and where the others had the object."""
+    """A camera's own labels, and the object's poses by the others."""
 
     single: CameraRig  # the factory camera alone
     points: Tensor  # (N, 3) mm
@@ -154,7 +154,7 @@ class _View:
     seen: Tensor  # (U, N)
 
     def rms(self, start: int, by: int) -> float:
-        """RMS length (px) of the camera, fitted by itself, where from `start` on it shows what was `by` later."""
+        """RMS length (px) of the camera's own fit if, from `start` on, it shows what happened `by` snapshots later."""
         number = np.arange(len(self.uv))
         source = np.where(number >= start, number + by, number)
         valid = np.flatnonzero(self.seen.any(-1).numpy() & (source >= 0) & (source < len(number)))
@@ -164,12 +164,12 @@ class _View:
 
 
 def _slip(view: _View) -> tuple[int, int] | None:
-    """Find where and by how much a camera has slipped, if that explains what it saw, and nothing else does."""
+    """Find where and by how much a camera has slipped, if a slip, and nothing else, explains what it saw."""
     labelled = np.flatnonzero(view.seen.any(-1).numpy())
     if len(labelled) < 2 * LEAST_SNAPSHOTS:
         return None
     steady = view.rms(0, 0)
-    # The labels on either side of where it began fit one calibration of the camera only at the right place.
+    # Only with the right start do the labels before and after it fit one calibration of the camera.
     inner = labelled[LEAST_SNAPSHOTS : 1 - LEAST_SNAPSHOTS]
     coarse = inner[np.unique(np.linspace(0, len(inner) - 1, min(len(inner), MOST_STARTS)).round().astype(int))]
     tried = {(start, slip): view.rms(start, slip) for slip in SLIPS for start in [0, *coarse.tolist()]}
@@ -186,9 +186,9 @@ def _slip(view: _View) -> tuple[int, int] | None:
 def _label_camera(
     blobs: Detections, single: CameraRig, obj: CalibrationObject, used: list[int], poses: RigidTransform
 ) -> tuple[Tensor, Tensor]:
-    """Label what one camera saw by itself, near where the others had the object: uv (U, N, 2), seen (U, N).
+    """Label one camera's blobs by themselves, near the object's poses by the others: uv (U, N, 2), seen (U, N).
 
-    Labels that the blobs have count where there are any.
+    Labels of the input are used if there are any.
     """
     uv = torch.zeros(len(used), obj.num_fiducials, 2, dtype=torch.float64)
     seen = torch.zeros(len(used), obj.num_fiducials, dtype=torch.bool)
@@ -214,12 +214,12 @@ def _label_camera(
 
 
 def _fit(uv: Tensor, seen: Tensor, single: CameraRig, points_object: Tensor, poses: RigidTransform) -> Estimate:
-    """Fit one camera to known poses of the object: all fiducials of all snapshots are one still object in the rig."""
+    """Fit one camera to known poses of the object: all fiducials of all snapshots form one static object in the rig."""
     points = poses.apply(points_object).flatten(0, 1)
     cloud = CalibrationObject(points, torch.ones_like(points))
     seen = seen.flatten()
     sigma = torch.full((1, 1, len(seen)), SIGMA, dtype=torch.float64)
     observations = Observations(uv.flatten(0, 1)[None, None], sigma, seen[None, None])
     prior = (single.prior or RigPrior()).std(single).clone()
-    prior[:, :6] = 0.0  # the pose of the cloud says where the camera is
+    prior[:, :6] = 0.0  # the pose of the point cloud determines the camera's
     return estimate(observations, single, cloud, RigidTransform.identity(1, dtype=torch.float64), prior_std=prior)

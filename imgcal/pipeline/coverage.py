@@ -1,4 +1,4 @@
-"""What a calibration does not know because the object was not there: coverage, undetermined values, where to go."""
+"""Values that a calibration could not determine because the object was not there: coverage, and where to go."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from torch import Tensor
 from imgcal.pipeline.calibration import Calibration
 
 FIELDS = 8
-"""An image is divided into 8 x 8 fields to count how much of it was reached."""
+"""An image is divided into 8 x 8 fields to measure its coverage."""
 UNDETERMINED = 0.8
-"""A value is not determined by the data when its standard deviation is still this share of the prior's."""
+"""A value is undetermined by the data if its standard deviation is still this share of the prior's."""
 HELD = 1e-5
-"""A value whose prior is narrower is fixed: the data are not asked for it."""
+"""A value with a narrower prior is fixed, so it is not counted."""
 LITTLE = 0.5
-"""Share of its image that a camera has seen the object in, below which it is said where to go."""
+"""Coverage of an image below which advice is given."""
 LEAST_SEEN = 4
-"""Fiducials that two cameras must see where the object is sent."""
-MOST_POINTS = 64  # of the object, that are looked at
-STEPS = (-1.0, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0)  # half widths of what the cameras see, from where it was
+"""Number of fiducials that two cameras must see at a recommended place."""
+MOST_POINTS = 64  # maximum number of the object's fiducials to use
+STEPS = (-1.0, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0)  # half widths of the view, from the earlier place
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where the object would show something new."""
+    """A place where the object would add coverage."""
 
-    rig_from_centre: tuple[float, float, float]  # mm, the middle of the object in the rig's frame
-    offset: tuple[float, float, float]  # mm, from the middle of where it has been
-    fields: int  # of the images, of 64 in each, that it would reach for the first time
-    cameras: int  # whose fields these are
+    rig_from_centre: tuple[float, float, float]  # mm, centre of the object in the rig's frame
+    offset: tuple[float, float, float]  # mm, relative to the centre of its earlier places
+    fields: int  # number of new image fields, of 64 in each image
+    cameras: int  # number of cameras with such fields
 
     def __str__(self) -> str:
-        """Say it in words, along the axes of the rig."""
+        """Describe it in words, along the axes of the rig."""
         parts = [
             f"{value:+.0f} mm in {axis}" for axis, value in zip("xyz", self.offset, strict=True) if abs(value) >= 1
         ]
@@ -43,17 +43,17 @@ class Place:
 
 @dataclass(frozen=True)
 class Coverage:
-    """What is known of the lenses, and what is not."""
+    """What is known about the lenses, and what is not."""
 
     camera_names: tuple[str, ...]  # C
-    coverage: tuple[float, ...]  # C, share of each image's fields in which fiducials were used
-    undetermined: dict[str, tuple[str, ...]]  # parameter of the lens or sensor -> cameras in which it is the factory's
-    places: tuple[Place, ...]  # the one that shows most first
-    from_scratch: bool = False  # what stands where the data say nothing is no factory's
+    coverage: tuple[float, ...]  # C, share of each image's fields with fiducials
+    undetermined: dict[str, tuple[str, ...]]  # parameter of the lens or sensor -> cameras that keep the factory's
+    places: tuple[Place, ...]  # the most useful first
+    from_scratch: bool = False  # undetermined values are assumptions, not the factory's
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What is not known, in words; empty where the images were reached and all values are determined."""
+        """Describe what is not known; empty if the images were covered and all values are determined."""
         words, count = [], len(self.camera_names)
         if self.undetermined:
             by_cameras: dict[tuple[str, ...], list[str]] = {}
@@ -70,7 +70,7 @@ class Coverage:
 
     @property
     def advice(self) -> str:
-        """Where to move the object, in words; empty where nothing is missing."""
+        """Describe where to move the object; empty if nothing is missing."""
         if not self.sentences or not self.places:
             return ""
         places = "; ".join(map(str, self.places))
@@ -78,10 +78,10 @@ class Coverage:
 
 
 def measure_coverage(calibration: Calibration, std: Tensor) -> Coverage:
-    """Count what was reached, and look for places that would reach more.
+    """Measure the coverage, and find places that would increase it.
 
     Args:
-        calibration: what was found.
+        calibration: the calibration.
         std: (C, K) one standard deviation of each value.
 
     Examples:
@@ -99,7 +99,7 @@ def measure_coverage(calibration: Calibration, std: Tensor) -> Coverage:
     unknown = ((std > UNDETERMINED * prior) & (prior > HELD))[:, 6:]
     undetermined: dict[str, tuple[str, ...]] = {}
     for number, camera in unknown.mT.nonzero().tolist():
-        name = rig.parameter_names_of(camera)[6 + number]  # lenses differ in what a number means
+        name = rig.parameter_names_of(camera)[6 + number]  # the meaning of a number depends on the lens
         undetermined[name] = (*undetermined.get(name, ()), rig.camera_names[camera])
     reached = _fields(calibration.observations.uv, calibration.observations.seen, rig.image_size)
     shares = tuple(reached.double().mean(-1).tolist())
@@ -108,12 +108,12 @@ def measure_coverage(calibration: Calibration, std: Tensor) -> Coverage:
 
 
 def _fields(uv: Tensor, seen: Tensor, image_size: Tensor) -> Tensor:
-    """Mark the fields of each image that hold something seen: (S, C, N, 2), (S, C, N) -> (C, FIELDS^2) bool."""
+    """Mark the fields of each image that contain something seen: (S, C, N, 2), (S, C, N) -> (C, FIELDS^2) bool."""
     return _fields_each(uv, seen, image_size).any(0)
 
 
 def _fields_each(uv: Tensor, seen: Tensor, image_size: Tensor) -> Tensor:
-    """The same for each of the first axis: (K, C, FIELDS^2) bool."""
+    """The same for each element of the first axis: (K, C, FIELDS^2) bool."""
     place = ((uv + 0.5) / image_size[:, None] * FIELDS).clamp(0, FIELDS - 1).nan_to_num(0.0).long()
     number = place[..., 1] * FIELDS + place[..., 0]
     marked = torch.zeros(*number.shape[:-1], FIELDS**2, dtype=torch.int32)
@@ -121,7 +121,7 @@ def _fields_each(uv: Tensor, seen: Tensor, image_size: Tensor) -> Tensor:
 
 
 def _places(calibration: Calibration, reached: Tensor, count: int = 3) -> tuple[Place, ...]:
-    """Choose, one after the other, where the object would reach most fields that nothing has reached yet."""
+    """Choose places greedily: each reaches as many new fields as possible."""
     rig, poses = calibration.rig, calibration.rig_from_object
     of_largest = np.flatnonzero(calibration.obj.part_of == np.bincount(calibration.obj.part_of).argmax())
     fiducials = len(of_largest)
@@ -133,7 +133,7 @@ def _places(calibration: Calibration, reached: Tensor, count: int = 3) -> tuple[
     half = depth * float((rig.image_size[:, 0] / rig.focal_length[:, 0]).median()) / 2
     steps = torch.tensor(STEPS, dtype=torch.float64) * half
     offsets = torch.cartesian_prod(steps, steps, steps)  # (K, 3)
-    around = poses.rotation[0] @ (body - body.mean(0)).mT  # turned as in the first snapshot
+    around = poses.rotation[0] @ (body - body.mean(0)).mT  # oriented as in the first snapshot
     points = around.mT + (middle + offsets)[:, None]
     radius = None if calibration.obj.radius is None else calibration.obj.radius[chosen]
     projection = replace(rig, prior=None).expand(len(points)).project_values(points, radius)

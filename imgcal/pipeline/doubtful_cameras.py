@@ -1,4 +1,4 @@
-"""Cameras that stop fitting at the end of a capture: bumped, or mislabelled; too few snapshots are left to tell."""
+"""Cameras that stop fitting at the end of a capture, bumped or mislabelled: too few snapshots are left to tell."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ import numpy as np
 from imgcal.pipeline.label_counts import LabelCounts
 
 LEAST_BLOBS = 3
-"""Of one image, elsewhere than the rest of the rig expects them, from which on it does not fit."""
+"""Minimum number of blobs in the wrong place for an image not to fit."""
 LEAST_SHARE = 0.5
-"""Of the fiducials in view, that these are at least: clutter beside a hidden object is less."""
+"""Minimum share of the fiducials in view that these must be: clutter beside a hidden object is less."""
 
 
 @dataclass(frozen=True)
 class DoubtfulCamera:
-    """A camera that fits the rest of the rig no more in the last snapshots in which it sees the object."""
+    """A camera that no longer fits the rest of the rig in the last snapshots in which it sees the object."""
 
     camera: str
-    snapshots: tuple[str, ...]  # names, in the order of time
+    snapshots: tuple[str, ...]  # names, in chronological order
 
     def as_values(self) -> dict[str, str | list[str]]:
-        """The form that scripts read."""
+        """Values for scripts."""
         return {"camera": self.camera, "snapshots": list(self.snapshots)}
 
     def __str__(self) -> str:
-        """Say it in words."""
+        """Describe it in words."""
         return (
             f"camera {self.camera} stopped fitting at snapshot {self.snapshots[0]}: bumped, or mislabelled; the "
             "calibration holds before it"
@@ -36,12 +36,12 @@ class DoubtfulCamera:
 def doubtful_at_end(
     counts: LabelCounts, camera_names: tuple[str, ...], snapshot_names: tuple[str, ...]
 ) -> tuple[DoubtfulCamera, ...]:
-    """Find cameras none of whose labels fit in the last snapshots in which they see the object, while others do.
+    """Find cameras none of whose labels fit in the last snapshots in which they see the object, while others' do.
 
     Args:
         counts: of all snapshots and cameras.
         camera_names: C.
-        snapshot_names: S, in the order of time.
+        snapshot_names: S, in chronological order.
     """
     off = np.maximum(counts.unexplained, counts.outliers)
     others = (counts.kept >= LEAST_BLOBS).sum(1, keepdims=True) > 0

@@ -1,4 +1,4 @@
-"""One estimate over all snapshots whose blobs have labels, and the checks that it must pass."""
+"""Estimate a rig from all labelled snapshots, and check the result."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ from imgcal.types import (
 )
 
 LEAST_KEPT = 0.8
-"""Share of the snapshots that must keep a pose when outliers have been left out."""
+"""Share of the snapshots that must keep a pose after outliers have been left out."""
 
 
 def fit_steady(
@@ -60,26 +60,27 @@ def fit_steady(
     initializer: Initializer | None = None,
     prior_std: Tensor | None = None,
 ) -> Calibration:
-    """Do what `calibrate` does once blobs have labels: steady snapshots, the fit, all checks.
+    """Do what `calibrate` does with labelled blobs: select steady snapshots, fit, run all checks.
 
     Args:
         labelled: all snapshots.
-        given: the same as they came in, with the labels of the input alone.
+        given: the same data as given, with the labels of the input only.
         rig: what is known before, float64.
         obj: the calibration object.
-        options: how sure the result must be.
-        initializer: network whose first guess the estimate starts from.
-        prior_std: (C, K) how far values may be off, once cameras are known to be steady; None = as the rig says.
+        options: how certain the result must be.
+        initializer: network whose first guess starts the estimate.
+        prior_std: (C, K) standard deviations of the factory values once cameras are known to be steady; None = as in
+            the rig.
 
     Raises:
-        RefusedError: the data cannot decide.
+        RefusedError: the data are not sufficient.
     """
     arranged = arrange_labels(labelled, rig, obj)
     _require_any_view(arranged, rig, obj)
     steady = steady_part(arranged, given, rig, obj, options)
-    fits = steady.fits if prior_std is None else ()  # those have the rig's prior
+    fits = steady.fits if prior_std is None else ()  # they use the rig's prior
     fit = _fit(steady.arranged, rig, obj, options, _Known(initializer, prior_std=prior_std, fits=fits))
-    fit = replace(fit, moved=steady.moved)  # before its tally, which is kept with it
+    fit = replace(fit, moved=steady.moved)  # before its tally is computed and cached
     require_views(fit.tally, rig)
     return fit
 
@@ -94,16 +95,16 @@ def fit_labelled(
     latest: Calibration | None = None,
     prior_std: Tensor | None = None,
 ) -> Calibration:
-    """Estimate the rig from all labelled snapshots, leaving out what does not fit, and check that the rest does.
+    """Estimate the rig from all labelled snapshots without outliers, and check that the rest fits.
 
     Args:
         labelled: from `label`.
         rig: the factory calibration.
         obj: the calibration object.
-        options: how sure the result must be.
-        initializer: network whose first guess is the start, where it is nearer to the images than the factory rig.
-        latest: what the snapshot before gave, from the same factory calibration: a start that saves time.
-        prior_std: (C, K) how far the factory values may be off; None = as the rig says.
+        options: how certain the result must be.
+        initializer: network whose first guess is the start if it fits the images better than the factory rig.
+        latest: result for the previous snapshot, from the same factory calibration: a start that saves time.
+        prior_std: (C, K) standard deviations of the factory values; None = as in the rig.
 
     Raises:
         RefusedError: a camera saw nothing, the estimate has no minimum, or the residuals do not fit.
@@ -119,7 +120,7 @@ class _Known:
     initializer: Initializer | None = None
     latest: Calibration | None = None
     prior_std: Tensor | None = None
-    fits: tuple[Solution, ...] = ()  # of all labels, where they have been made already; see `SteadyPart`
+    fits: tuple[Solution, ...] = ()  # fits of all labels, if already made; see `SteadyPart`
 
 
 def _fit(
@@ -143,7 +144,7 @@ def _fit(
 def _fit_once(
     arranged: LabelledCapture, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions, known: _Known
 ) -> Calibration:
-    """Fit, unless without outliers some snapshots do not say where the object is."""
+    """Fit, unless some snapshots do not determine the object's pose without outliers."""
     labelled, observations, latest = arranged.labelled, arranged.observations, known.latest
     variance, labels = observations.sigma.numpy() ** 2, observations.seen.numpy()
     require_cameras(labels, rig, options)
@@ -158,7 +159,7 @@ def _fit_once(
     prior = (rig.prior or RigPrior()).std(rig) if known.prior_std is None else known.prior_std
     problem = make_problem(observations, rig, _adopt_tolerances(obj, latest), prior)
     guess = None if known.initializer is None else known.initializer.guess(observations, rig, obj)
-    guess_used = guess is not None and _nearer(guess, Prediction(rig, arranged.poses), observations, obj)
+    guess_used = guess is not None and _is_nearer(guess, Prediction(rig, arranged.poses), observations, obj)
     first = Start(initial_state(problem, arranged.poses, None), options.identity_error)
     if known.fits:
         first = replace(first, solution=known.fits[0], nearer=known.fits[-1].state)
@@ -214,13 +215,13 @@ def _adopt_tolerances(obj: CalibrationObject, latest: Calibration | None) -> Cal
 
 
 def _require_any_view(arranged: LabelledCapture, rig: CameraRig, obj: CalibrationObject) -> None:
-    """Refuse where a camera sees the object, and identity could not label any of it: worse than seeing nothing."""
+    """Refuse if a camera sees the object, but none of it could be labelled: worse than seeing nothing."""
     labels = arranged.observations.seen.numpy()
     require_views(count_labels(arranged.labelled, labels, arranged.poses, rig, obj), rig, least_share=0.0)
 
 
-def _nearer(guess: Initialization, factory: Prediction, observations: Observations, obj: CalibrationObject) -> bool:
-    """Tell whether the start that a guess gives, its mean rig, is nearer to the images than the factory calibration."""
+def _is_nearer(guess: Initialization, factory: Prediction, observations: Observations, obj: CalibrationObject) -> bool:
+    """Tell whether a guess, as the mean rig, fits the images better than the factory calibration."""
     start = Prediction(guess.rig, guess.rig_from_object)
     return bool(
         prediction_residual(start, observations, obj).norm() < prediction_residual(factory, observations, obj).norm()
@@ -228,5 +229,5 @@ def _nearer(guess: Initialization, factory: Prediction, observations: Observatio
 
 
 def finite(value: float) -> float | None:
-    """None for what is not known."""
+    """None for an unknown value."""
     return value if np.isfinite(value) else None

@@ -1,7 +1,7 @@
-"""Calibration without a factory calibration: a first rig from the data, and from there as ever.
+"""Calibration without a factory calibration: a first rig from the data, then the usual estimate.
 
-Labels, where the input has none, come first from single images: what one camera sees of the object says in most of them
-which blob is which fiducial. Cameras that are placed by these vote on all the rest.
+If the input has no labels, the first ones come from single images: in most of them, a camera's view of the object alone
+shows which blob is which fiducial. Cameras placed by these labels then vote on all the rest.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior, Volume
 
 ALONE = RigPrior(focal_length=0.05, principal_point=10.0, distortion=0.02, rotation=0.01, position=10.0)
-"""How far a camera may be off while its images are labelled one by one: what it does to the shape of an object."""
+"""How far a camera may be off while its images are labelled one by one, as far as this distorts the object's shape."""
 LEAST_BLOBS = 4
 LABELLED_ALONE = 12
-"""Snapshots for each camera that are labelled image by image."""
+"""Number of snapshots per camera that are labelled image by image."""
 MOST_ODD, LIKELY_ODD = 8, 1
-"""Blobs more or fewer than fiducials, beyond which all is alike; and up to which an image is easy to tell."""
+"""Difference between the numbers of blobs and fiducials: where to clip it, and up to which an image is easy."""
 PLACED = RigPrior(focal_length=0.005, principal_point=5.0, distortion=0.02, rotation=0.004, position=10.0)
-"""How far a rig that was made from these may be off, while all the others are labelled."""
-WIDE_ROTATION = 0.05  # rad: of the prior about the first rig, which was made from the same data: next to nothing
-WIDE_POSITION = 0.05  # the same in parts of the largest distance between cameras
+"""Prior of a rig made from these labels, for labelling all the others."""
+WIDE_ROTATION = 0.05  # rad: prior about the first rig, which came from the same data: nearly flat
+WIDE_POSITION = 0.05  # the same as a share of the largest distance between cameras
 FARTHEST_CENTRE = 5.0
-"""Prior standard deviations that the principal point of a lens may be off."""
+"""Maximum offset of a lens's principal point, in prior standard deviations."""
 LARGEST_FOCAL_STD = 0.02  # relative
 LARGEST_ROTATION_STD = 0.01  # rad
-LARGEST_POSITION_STD = 0.02  # of the largest distance between cameras
+LARGEST_POSITION_STD = 0.02  # share of the largest distance between cameras
 LARGEST_SPREAD = 2.0  # px, robust, of the first rig's residuals
 
 
@@ -66,26 +66,26 @@ def calibrate_from_scratch(
     progress: Progress | None = None,
     distance: tuple[str, str, float] | None = None,
 ) -> Calibration:
-    """Calibrate cameras of which nothing is known but images and a rough focal length.
+    """Calibrate cameras from images and rough focal lengths alone.
 
-    The object is moved through what the cameras see together; its known size gives the scale, and the rig's frame is
-    that of the first camera.
+    The object is moved through the cameras' common view; its known size gives the scale, and the rig's frame is that of
+    the first camera.
 
     Args:
         source: blobs, labelled or not, or frames in memory.
-        cameras: from `imgcal.formats.load_cameras`; a rig's places and its prior for them are not looked at.
+        cameras: from `imgcal.formats.load_cameras`; the poses of a rig and their prior are ignored.
         obj: the calibration object.
-        options: how sure the result must be.
+        options: how certain the result must be.
         detection: how blobs are found in frames.
         progress: wraps loops over snapshots.
-        distance: of unknown markers: names of two cameras and their distance, mm; None = the rig is known up to scale.
-            Its frame has the first of these in the origin, and the second on the x axis.
+        distance: for unknown markers: names of two cameras and their distance, mm; None = the rig is known up to scale.
+            The first camera is then the origin of the frame, and the second lies on the x axis.
 
     Returns:
-        As from `calibrate`; its `factory` is the first rig that was made from the data.
+        As for `calibrate`; its `factory` is the first rig made from the data.
 
     Raises:
-        RefusedError: the data cannot decide where the cameras are, or say too little about them.
+        RefusedError: the data do not determine the cameras' poses, or say too little about the cameras.
         InputError: the data do not belong to these cameras or this object.
 
     Examples:
@@ -138,7 +138,7 @@ def calibrate_from_scratch(
 
 
 def _for_what_comes_after(fit: Calibration, cameras: CameraRig, seconds: dict[str, float]) -> Calibration:
-    """Give the rig a name and a volume; what was known before is no prior for what comes after, the defaults are."""
+    """Give the rig a name, a volume and the default prior: the earlier prior does not apply to later calibrations."""
     volume = fit.predicted_error.volume
     box = Volume.box(_corner(volume.low), _corner(volume.high))
     rig = replace(fit.rig, name=cameras.name, prior=None, volume=box)
@@ -148,11 +148,11 @@ def _for_what_comes_after(fit: Calibration, cameras: CameraRig, seconds: dict[st
 def _fit(
     labelled: Associations, first: CameraRig, cameras: CameraRig, obj: CalibrationObject, options: PipelineOptions
 ) -> Calibration:
-    """Estimate all from the first rig, which has been made from the same data, and from what is known of lenses."""
+    """Estimate everything from the first rig, which came from the same data, with a prior for the lenses only."""
     start = replace(first, prior=_wide(first, cameras), distortion=first.distortion.clone())
-    start.distortion[:, K3 - 10] = cameras.distortion[:, K3 - 10]  # about which it has a prior that tells
+    start.distortion[:, K3 - 10] = cameras.distortion[:, K3 - 10]  # the only coefficient with an informative prior
     std = ordinary_lens(_wide(first, cameras).std(start))
-    std[0, :6] = 0.0  # whose frame is the rig's
+    std[0, :6] = 0.0  # this camera defines the rig's frame
     fit = fit_with_timing(labelled, labelled.detections, start, obj, options, prior_std=std)
     require_central(fit, cameras)
     require_determined(fit)
@@ -166,11 +166,11 @@ def label_images(
     options: PipelineOptions,
     progress: Progress | None = None,
 ) -> Detections:
-    """Label the blobs of single images, as many as it takes to place the cameras, by the object's own shape.
+    """Label the blobs of single images by the object's own shape, as many images as are needed to place the cameras.
 
     Returns:
-        The detections, with labels in images where one labelling fits and no other does (but for the object's own
-        symmetry, which each image resolves as it likes).
+        The detections, with labels in images in which exactly one labelling fits (up to the object's own symmetry,
+        which each image resolves independently).
     """
     snapshots, count = len(detections.snapshot_names), cameras.num_cameras
     rows = np.flatnonzero(detections.usable)
@@ -201,7 +201,7 @@ def label_images(
 def _label_image(
     blobs: Detections, camera: CameraRig, obj: CalibrationObject, options: PipelineOptions
 ) -> NDArray[np.int64]:
-    """Label the blobs of one image, or none of them."""
+    """Label the blobs of one image, all or none."""
     zeros = np.zeros(len(blobs), dtype=np.int64)
     image = replace(blobs, camera=zeros, snapshot=zeros, camera_names=camera.camera_names, snapshot_names=("0",))
     sigma = np.hypot(image.sigma, options.identity_error)
@@ -210,31 +210,31 @@ def _label_image(
 
 
 def _choose(blobs: NDArray[np.int64], fiducials: int) -> NDArray[np.bool_]:
-    """Choose images (S, C) to label, by their numbers of blobs: in each camera so many, spread over the capture.
+    """Choose images (S, C) to label by their numbers of blobs: a number per camera, spread over the capture.
 
-    First come those with as many blobs as the object has fiducials, in snapshots that several cameras see.
+    Images with as many blobs as the object has fiducials come first, in snapshots that several cameras see.
     """
     enough = blobs >= LEAST_BLOBS
     together = enough & (enough.sum(1, keepdims=True) >= min(2, blobs.shape[1]))
     odd = np.abs(blobs - fiducials)
     chosen = np.zeros_like(enough)
-    worth = np.where(together, odd, MOST_ODD).clip(max=MOST_ODD).mean(1)  # of a snapshot, the smaller the better
+    worth = np.where(together, odd, MOST_ODD).clip(max=MOST_ODD).mean(1)  # cost of a snapshot, the smaller the better
     stretches = np.array_split(np.arange(len(blobs)), LABELLED_ALONE)
     for camera in range(blobs.shape[1]):
         for stretch in stretches:
             there = stretch[together[stretch, camera]]
             if len(there):
                 chosen[there[(worth + odd[:, camera])[there].argmin()], camera] = True
-    # An image helps with what other cameras see at the same time, as far as that is easy to tell.
+    # An image is useful together with others of the same moment, so add those that are easy to label.
     return chosen | (together & chosen.any(1, keepdims=True) & (odd <= LIKELY_ODD))
 
 
 def _first_rig(labelled: Detections, cameras: CameraRig, obj: CalibrationObject) -> ColdStart:
-    """Place the cameras by what has labels."""
+    """Place the cameras by the labels."""
     if not (labelled.fiducial >= 0).any():
         raise RefusedError(
-            f"identity: in none of {len(labelled.snapshot_names)} snapshots does one camera alone say which blob is "
-            "which fiducial: show the whole object, and few other bright things; and is the field of view right?"
+            f"identity: in none of {len(labelled.snapshot_names)} snapshots can a single camera tell which blob is "
+            "which fiducial: show the whole object and few other bright things, and check the field of view"
         )
     first = cold_start(to_observations(labelled, cameras, obj), cameras, obj)
     if first.spread > LARGEST_SPREAD:
@@ -268,7 +268,7 @@ def _wide(rig: CameraRig, cameras: CameraRig) -> RigPrior:
 
 
 def require_central(fit: Calibration, cameras: CameraRig) -> None:
-    """Raise `RefusedError` where lenses would have to make up for an object that is not as its file says."""
+    """Raise `RefusedError` if lenses would have to compensate for an object that differs from its file."""
     assert cameras.prior is not None
     off = (fit.rig.principal_point - cameras.principal_point).norm(dim=-1)
     camera, usual = int(off.argmax()), cameras.prior.principal_point
@@ -276,13 +276,13 @@ def require_central(fit: Calibration, cameras: CameraRig) -> None:
         raise RefusedError(
             f"start without a factory calibration: the principal point of camera {cameras.camera_names[camera]} would "
             f"be {float(off[camera]):.0f} px from where it was expected, {float(off[camera]) / usual:.1f} times as far "
-            "as lenses are: the object's coordinates are not exact, or the size of the image is wrong; measure the "
-            "object anew"
+            "as usual: the object's coordinates are not exact, or the size of the image is wrong; measure the "
+            "object again"
         )
 
 
 def require_determined(fit: Calibration) -> None:
-    """Raise `RefusedError` where a camera is known so badly that the result would be a guess."""
+    """Raise `RefusedError` if a camera is known so badly that the result would be a guess."""
     rig = fit.rig
     std = fit.estimate.covariance(0).diagonal().clamp_min(0).sqrt().unflatten(0, (rig.num_cameras, -1))
     relative = torch.stack(
@@ -299,5 +299,5 @@ def require_determined(fit: Calibration) -> None:
         which = list_names(rig.camera_names[c] for c in bad[kind].nonzero().flatten().tolist())
         raise RefusedError(
             f"start without a factory calibration: the data say too little about the {what} of camera {which}: carry "
-            "the object through more of what it sees, nearer and farther, turned in all directions"
+            "the object through more of its view, nearer and farther, turned in all directions"
         )

@@ -1,6 +1,6 @@
-"""A network's first guess for captured snapshots: labelled fiducials in, a rig and poses to start the estimate from.
+"""A network's first guess for captured snapshots: from labelled fiducials to a rig and poses to start the estimate.
 
-Image networks never see a grey frame: the labelled fiducials are drawn anew, each in its own colour.
+Image networks never see a grey frame: the labelled fiducials are redrawn, each in its own colour.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from imgcal.synthesis import render_views
 from imgcal.types import CalibrationObject, CameraRig, Observations, Prediction, Symmetry, Views
 
 KINDS = ("points", "vit", "cnn")
-CHUNK = 32  # snapshots at once: their images take memory
+CHUNK = 32  # snapshots per batch: their images take memory
 
 
 @dataclass(frozen=True)
 class Initialization:
-    """What a network says about some snapshots of one rig."""
+    """A network's estimate for some snapshots of one rig."""
 
-    name: str  # of the network
+    name: str  # name of the network
     rig: CameraRig  # without batch axes: the mean over snapshots
     rig_from_object: RigidTransform  # (S,)
     residual: Tensor  # (S, C, N, 2) pixels, predicted by each snapshot's own rig minus observed; zero where not seen
@@ -36,19 +36,19 @@ class Initialization:
 
 @dataclass(frozen=True)
 class Initializer:
-    """A trained network, ready for a rig of some of its cameras and images of another size than in training."""
+    """A trained network for a rig with some or all of its cameras and images of any size."""
 
     name: str
     network: Network
-    trained: CameraRig  # factory rig of the training
-    cameras: tuple[int, ...] | None = None  # those that there are, in the order of the rig; None = all
+    trained: CameraRig  # factory rig used in training
+    cameras: tuple[int, ...] | None = None  # present cameras, in the order of the rig; None = all
 
     @torch.no_grad()
     def guess(self, observations: Observations, rig: CameraRig, obj: CalibrationObject) -> Initialization:
-        """Look at every snapshot on its own.
+        """Process every snapshot independently.
 
-        A symmetric object may have been labelled in a turn that the network has never seen: all turns are tried, and
-        each snapshot keeps the one that fits best.
+        A symmetric object may have been labelled in an orientation that the network never saw in training: all are
+        tried, and each snapshot keeps the one that fits best.
 
         Args:
             observations: (S, C, N) labelled fiducials, in the pixels of `rig`.
@@ -64,7 +64,7 @@ class Initializer:
         return Initialization(self.name, mean, guess.rig_from_object, residuals[best])
 
     def _show(self, observations: Observations, rig: CameraRig) -> Views:
-        """What all cameras of the training see: those that are not there see nothing."""
+        """Views of all cameras of the training rig; missing cameras see nothing."""
         cameras = self._present
         scale = self.trained.image_size[cameras].to(observations.uv) / rig.image_size
         snapshots, _, fiducials = observations.seen.shape
@@ -79,9 +79,9 @@ class Initializer:
         return list(range(self.trained.num_cameras) if self.cameras is None else self.cameras)
 
     def _turn(self, shown: Views, rig: CameraRig, obj: CalibrationObject, motion: Symmetry) -> Prediction:
-        """What the network says of an object turned by a symmetry, turned back: (S,), in the pixels of `rig`."""
+        """Prediction for an object turned by a symmetry, turned back: (S,), in the pixels of `rig`."""
         assert shown.uv is not None and shown.seen is not None
-        source = torch.from_numpy(np.argsort(motion.permutation))  # fiducial whose image each label gets
+        source = torch.from_numpy(np.argsort(motion.permutation))  # fiducial whose image each label receives
         views = zip(shown.uv[:, :, source].split(CHUNK), shown.seen[:, :, source].split(CHUNK), strict=True)
         said = Prediction.cat([self._predict(*chunk, obj) for chunk in views]).to(rig.focal_length.dtype)
         turn = RigidTransform(torch.from_numpy(motion.rotation), torch.from_numpy(motion.translation))
@@ -98,7 +98,7 @@ class Initializer:
 
 
 def prediction_residual(prediction: Prediction, observations: Observations, obj: CalibrationObject) -> Tensor:
-    """Predicted minus observed: (S, C, N, 2) pixels, zero where not seen; one rig (S,) a snapshot or one for all."""
+    """Predicted minus observed: (S, C, N, 2) pixels, zero where not seen; one rig per snapshot (S,) or one for all."""
     poses = prediction.rig_from_object
     rigs = prediction.rig.expand(len(observations.uv))
     uv = rigs.project(poses.apply(obj.points.to(poses.rotation)), obj.radius).uv
@@ -111,10 +111,10 @@ def load_initializer(
     """Find the network for a rig and an object.
 
     Args:
-        name: one of `KINDS`, for the shipped networks, or a file that `imgcal train` wrote, or its folder.
+        name: one of `KINDS`, for the shipped networks, or a file written by `imgcal train`, or its folder.
         rig: the factory rig: all cameras of the training or some of them; its images may be smaller or larger.
-        obj: the object; the radius of its fiducials does not matter to a first guess.
-        trusted: encoders of yours that a file may name, whose code then runs; see `load_checkpoint`.
+        obj: the object; the radius of its fiducials does not matter for a first guess.
+        trusted: your encoders that a file may name, and whose code then runs; see `load_checkpoint`.
 
     Raises:
         InputError: no such file, or no network for this rig and object.

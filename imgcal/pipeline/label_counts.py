@@ -1,4 +1,4 @@
-"""How much of what each camera saw, and of what it should have seen, the rest of the rig can explain."""
+"""Count how much of what each camera saw, and should have seen, the rest of the rig can explain."""
 
 from __future__ import annotations
 
@@ -12,38 +12,38 @@ from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig
 
 MARGIN = 0.05
-"""Of the image's width and height, from its border: as far a camera that has drifted may miss what it should see."""
+"""Margin at the image border, as a share of its size: a camera that has drifted may miss what should be there."""
 
 DOUBTFUL = 0.25
-"""Share of what a camera sees of the object that is not where it should be, from which on it is said: partly hidden
-markers and false blobs beside them leave a tenth in good captures."""
+"""Share of a camera's view of the object in the wrong place that is reported: partly hidden markers and false blobs
+beside them leave a tenth in good captures."""
 
 LEAST_FOUND, LEAST_SHARE = 4, 0.4
-"""Labels of one camera that fit, and their share of the fiducials in view, from which on the pattern was found: so
-many do not fit a rig and each other by chance, whatever else the frame shows."""
+"""Number of a camera's fitting labels, and their share of the fiducials in view, that show that the pattern was found:
+so many never fit by chance, whatever else the frame shows."""
 
 WHOLE = 0.7
-"""Share of the fiducials in view with a label that fits, from which on what else a frame shows is not the object."""
+"""Share of the fiducials in view with a fitting label at which the other blobs of a frame are not the object."""
 
 PLACED = 3.0
-"""Pixels from where the rig sees a fiducial, up to which a blob without a label is taken for it: it may have none
-because too few others are in view, or because they have merged."""
+"""Maximum distance (px) between a fiducial and an unlabelled blob that is counted as its image: too few others in view,
+or a merger, may have prevented the label."""
 
 Counts = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class LabelCounts:
-    """Blobs and fiducials counted by snapshot (all of them, S) and camera (C)."""
+    """Numbers of blobs and fiducials, by snapshot (all S) and camera (C)."""
 
     blobs: Counts  # (S, C) found
-    usable: Counts  # (S, C) of these, not merged, at the border or masked
+    usable: Counts  # (S, C) those not merged, at the border or masked
     labelled: Counts  # (S, C) blobs with a fiducial
     kept: Counts  # (S, C) labels that fit
-    placed: Counts  # (S, C) blobs without a label that are where fiducials without one should be, merged ones included
-    expected: Counts  # (S, C) fiducials in view of the factory camera, given where the rest of the rig sees the object
-    found: NDArray[np.bool_]  # (S, C) the pattern was looked for in the frame itself, and is there
-    crowd: Counts  # (S, C) false blobs as usual: as many are no witness
+    placed: Counts  # (S, C) unlabelled blobs where unlabelled fiducials should be, including merged ones
+    expected: Counts  # (S, C) fiducials in view of the factory camera, given the object's pose
+    found: NDArray[np.bool_]  # (S, C) the pattern was searched for in the frame itself, and found
+    crowd: Counts  # (S, C) usual number of false blobs, which do not count
 
     @property
     def outliers(self) -> Counts:
@@ -52,14 +52,14 @@ class LabelCounts:
 
     @property
     def unexplained(self) -> Counts:
-        """Blobs that may be fiducials in view, and are not where these should be: (S, C).
+        """Blobs that may be fiducials in view, but are not where these should be: (S, C).
 
-        False blobs beside fiducials that were all found are no witness against a camera, nor are fiducials in view that
-        are hidden: each counts as far as there is something of the other. Where the pattern was found in the frame
-        itself, fiducials are missing because they are hidden: false blobs elsewhere are not what they would be. Where
-        it was looked for in vain, only blobs beyond the usual number of false ones may be the object. The same where
-        blobs alone decide, if that camera has shown the object in another snapshot: what it showed besides, it shows
-        where the object is hidden.
+        False blobs next to a completely found object do not count against a camera, nor do hidden fiducials: the count
+        is limited by both the spare blobs and the missing fiducials. If the pattern was found in the frame itself,
+        fiducials are missing because they are hidden, so false blobs elsewhere cannot be them. If it was searched for
+        in vain, only blobs beyond the usual number of false ones may be the object. The same holds for blobs alone if
+        that camera has shown the whole object in another snapshot: the extra blobs there also appear when the object is
+        hidden.
         """
         spare = np.maximum(self.usable - self.crowd, 0)
         explained = self.kept + self.placed
@@ -70,15 +70,15 @@ def count_labels(
     labelled: Associations, kept: NDArray[np.bool_], poses: RigidTransform, factory: CameraRig, obj: CalibrationObject,
     rig: CameraRig | None = None,
 ) -> LabelCounts:  # fmt: skip
-    """Count.
+    """Count blobs, labels and fiducials.
 
     Args:
         labelled: all snapshots, S.
-        kept: (U, C, N) labels that fit, of the used snapshots.
+        kept: (U, C, N) labels that fit, in the used snapshots.
         poses: (U,) rig_from_object of the used snapshots.
-        factory: the rig that says what is in view: it has not been spoilt by wrong labels.
+        factory: the rig that defines what is in view: wrong labels have not affected it.
         obj: N fiducials.
-        rig: as estimated; None = not yet, and what has no label counts as being elsewhere.
+        rig: as estimated; None = not yet, and unlabelled blobs count as being in the wrong place.
     """
     labelled = replace(labelled, detections=labelled.repeated())
     detections, used = labelled.detections, labelled.used
@@ -113,7 +113,7 @@ def count_labels(
 
 
 def _count_placed(labelled: Associations, poses: RigidTransform, rig: CameraRig, obj: CalibrationObject) -> Counts:
-    """Count blobs without a label that are where fiducials without one are seen, alone or several in one: (S, C)."""
+    """Count unlabelled blobs at the images of unlabelled fiducials, single or merged: (S, C)."""
     detections, used = labelled.detections, labelled.used
     points = poses.apply(obj.points.to(rig.focal_length))
     image = rig.expand(len(points)).project_values(points, obj.radius)
@@ -137,13 +137,13 @@ def _count_placed(labelled: Associations, poses: RigidTransform, rig: CameraRig,
 
 
 def _usual_false_blobs(false: Counts) -> Counts:
-    """How many false blobs (S, C) a frame of a snapshot may well have: (S, 1)."""
+    """Number of false blobs (S, C) that is normal in a frame of each snapshot: (S, 1)."""
     usual = np.median(false, axis=1, keepdims=True)
     return np.floor(usual + 2 * np.sqrt(usual)).astype(np.int64)
 
 
 def _usual_extra_blobs(false: Counts, whole: NDArray[np.bool_]) -> Counts:
-    """How many blobs (S, C) each camera usually has besides the `whole` object (S, C): (C,); 0 = it never was."""
+    """Usual number of blobs (S, C) per camera beside the `whole` object (S, C): (C,); 0 = it never was whole."""
     usual = np.nanmedian(np.where(whole, false, np.nan)[:, whole.any(0)], axis=0)
     counts = np.zeros(whole.shape[1], dtype=np.int64)
     counts[whole.any(0)] = np.floor(usual)

@@ -1,4 +1,4 @@
-"""Labelled snapshots as estimates take them: arranged densely, each with a pose to begin with."""
+"""Labelled snapshots as estimates need them: dense arrays, and an initial pose for each."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from imgcal.types import CalibrationObject, CameraRig, Observations
 
 @dataclass(frozen=True)
 class LabelledCapture:
-    """Labelled snapshots, all used ones of which say where the object is: S of them."""
+    """Labelled snapshots, S of which are used and determine the object's pose."""
 
     labelled: Associations
     observations: Observations  # (S, C, N)
     poses: RigidTransform  # (S,) rig_from_object, the first guess
 
     def drop_snapshots(self, rows: Sequence[int], rig: CameraRig, obj: CalibrationObject) -> LabelledCapture:
-        """Refuse some of the used snapshots, by their numbers among these."""
+        """Refuse some of the used snapshots, by their index among these."""
         return arrange_labels(drop_snapshots(self.labelled, rows), rig, obj)
 
 
 def arrange_labels(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> LabelledCapture:
-    """Take blobs of several fiducials out, and snapshots whose labels lie on one line; find poses that are missing.
+    """Remove merged blobs and snapshots whose labels are collinear; find missing poses.
 
     Raises:
-        RefusedError: none is left.
+        RefusedError: no snapshot is left.
     """
     observations, poses = accepted_observations(labelled, rig, obj)
     try:

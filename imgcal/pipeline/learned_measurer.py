@@ -1,4 +1,4 @@
-"""Blobs measured again by a network: half-hidden and unevenly lit markers, where a fitted ellipse is off."""
+"""Measure blobs again by a network: half-hidden and unevenly lit markers, for which a fitted ellipse is off."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from imgcal.io import model_file, nearest, shipped_names
 from imgcal.networks import Measurer, cut_patches, load_measurer, normalize_crops
 from imgcal.types import UNUSABLE, BlobFlag, BlobKind, Detections
 
-REDUCED = 3.5  # patch pixels that radii are reduced to, as `cut_patches` does
-LEAST_SIGMA = 0.02  # patch pixels: what the network cannot know better
-FARTHEST = 1.5  # radii that a centre may be moved by
-LIKELY, SURE = 0.5, 0.8  # probability of a kind: to learn a size from whole ones, and to flag others
-SMALLEST = 0.5  # share of the markers' radius that a part of a marker may measure
-SEVERAL = 4  # whole markers that tell how large a camera sees them
+REDUCED = 3.5  # radius in patch pixels after scaling by `cut_patches`
+LEAST_SIGMA = 0.02  # patch pixels: limit of the network's accuracy
+FARTHEST = 1.5  # maximum displacement of a centre, in radii
+LIKELY, SURE = 0.5, 0.8  # probability of a kind: to learn sizes from whole markers, and to flag others
+SMALLEST = 0.5  # minimum radius of a part of a marker, as a share of the markers' radius
+SEVERAL = 4  # minimum number of whole markers for a camera's typical radius
 
 
 Columns = TypeVar("Columns", Blobs, Detections)
@@ -29,20 +29,20 @@ Columns = TypeVar("Columns", Blobs, Detections)
 
 @dataclass(frozen=True)
 class Remeasured:
-    """What a network says of K blobs."""
+    """A network's measurements of K blobs."""
 
     uv: NDArray[np.float64]  # (K, 2) pixels
     sigma: NDArray[np.float64]  # (K,) pixels
     kind: NDArray[np.float64]  # (K, 4) probabilities of BlobKind
-    radius: NDArray[np.float64]  # (K,) pixels, that the markers were expected to have
+    radius: NDArray[np.float64]  # (K,) pixels, expected radius of the markers
 
 
 @dataclass(frozen=True)
 class LearnedMeasurer:
-    """Measures blobs again, and says which of them are whole markers, parts of markers, merged, or none.
+    """Measures blobs again, and classifies them as whole markers, parts of markers, merged, or none.
 
-    A fitted ellipse is as exact as the noise allows where a marker is whole and even: those keep their centres. Partial
-    ones get the network's, with its sigma; merged ones and what is no marker are flagged.
+    A fitted ellipse is as accurate as the noise allows if a marker is whole and evenly lit: those keep their centres.
+    Partial ones get the network's centre and sigma; merged ones and non-markers are flagged.
     """
 
     network: Measurer
@@ -50,10 +50,10 @@ class LearnedMeasurer:
 
     @classmethod
     def load(cls, path: str) -> LearnedMeasurer:
-        """Read one: a file, the folder of a run, or the name of a shipped one.
+        """Load one: a file, the folder of a run, or the name of a shipped one.
 
         Raises:
-            InputError: no such file, or something else in it.
+            InputError: there is no such file, or it contains something else.
         """
         file = model_file(path)
         if not file.is_file():
@@ -68,20 +68,20 @@ class LearnedMeasurer:
         """Measure the blobs of one snapshot again.
 
         Args:
-            frames: camera name -> frame (H, W), in the order that `blobs.camera` counts.
-            blobs: what was found in them.
+            frames: camera name -> frame (H, W), in the order of `blobs.camera`.
+            blobs: the blobs found in them.
             options: how they were found.
         """
         if not len(blobs.uv):
             return blobs
-        said = self.measure(frames, blobs, options)
-        moved = np.linalg.norm(said.uv - blobs.uv, axis=1)
-        taken = (said.kind.argmax(1) == BlobKind.PARTIAL) & (moved < FARTHEST * said.radius)
+        output = self.measure(frames, blobs, options)
+        moved = np.linalg.norm(output.uv - blobs.uv, axis=1)
+        taken = (output.kind.argmax(1) == BlobKind.PARTIAL) & (moved < FARTHEST * output.radius)
         flags = blobs.flags.copy()
-        flags[said.kind[:, BlobKind.MERGED] > SURE] |= np.uint8(BlobFlag.MERGED)
-        flags[said.kind[:, BlobKind.FALSE] > SURE] |= np.uint8(BlobFlag.REFLECTION)
-        uv = np.where(taken[:, None], said.uv, blobs.uv)
-        sigma = np.where(taken, said.sigma, blobs.sigma)
+        flags[output.kind[:, BlobKind.MERGED] > SURE] |= np.uint8(BlobFlag.MERGED)
+        flags[output.kind[:, BlobKind.FALSE] > SURE] |= np.uint8(BlobFlag.REFLECTION)
+        uv = np.where(taken[:, None], output.uv, blobs.uv)
+        sigma = np.where(taken, output.sigma, blobs.sigma)
         return replace(blobs, uv=uv, sigma=sigma, flags=flags)
 
     def of_snapshots(
@@ -90,8 +90,8 @@ class LearnedMeasurer:
         """Measure the blobs of several snapshots again.
 
         Args:
-            frames: those of a snapshot by its number: camera name -> frame.
-            blobs: what was found in them.
+            frames: frames of a snapshot by its number: camera name -> frame.
+            blobs: the blobs found in them.
             options: how they were found.
         """
         uv, sigma, flags = blobs.uv.copy(), blobs.sigma.copy(), blobs.flags.copy()
@@ -106,7 +106,7 @@ class LearnedMeasurer:
     def measure(
         self, frames: Mapping[str, Frame | None], blobs: Blobs | Detections, options: DetectionOptions
     ) -> Remeasured:
-        """Ask the network about blobs, twice: parts of markers are as large as the whole ones; see `__call__`."""
+        """Run the network on blobs, and again with the radius of whole markers for parts of markers; see `__call__`."""
         radius = np.nan_to_num(blobs.radius, nan=REDUCED).clip(1.0)
         first = self._ask(frames, blobs, radius, options)
         whole = (first.kind[:, BlobKind.WHOLE] > LIKELY) & ((blobs.flags & int(UNUSABLE)) == 0)
@@ -121,10 +121,10 @@ class LearnedMeasurer:
         radius: NDArray[np.float64],
         options: DetectionOptions,
     ) -> Remeasured:
-        """Ask the network about blobs whose markers have these radii (K,)."""
+        """Run the network on blobs whose markers have these radii (K,)."""
         names = list(frames)
         scale = np.clip(np.round(radius / REDUCED), 1, 64).astype(np.int64)
-        # Blobs of one camera and one scale are cut out together: each row of `cut_patches` is such a group.
+        # Cut out blobs of one camera and one scale together: each row of `cut_patches` is such a group.
         groups, group = np.unique(np.stack([blobs.camera, scale], axis=1), axis=0, return_inverse=True)
         group = group.reshape(-1)
         place = _places(group)
@@ -137,15 +137,15 @@ class LearnedMeasurer:
         )
         rows, columns = torch.from_numpy(group), torch.from_numpy(place)
         reduced = torch.from_numpy(radius / scale).float()
-        said = self.network(normalize_crops(patches[rows, columns]), reduced)
+        output = self.network(normalize_crops(patches[rows, columns]), reduced)
         corner, by = placement.corner[rows, columns], placement.scale[rows, columns]
-        sigma = (said.log_sigma.double().exp().square() + LEAST_SIGMA**2).sqrt() * by
-        uv = corner + by[:, None] * (said.offset.double() + placement.size / 2)
-        return Remeasured(uv.numpy(), sigma.numpy(), said.kind.softmax(-1).double().numpy(), radius)
+        sigma = (output.log_sigma.double().exp().square() + LEAST_SIGMA**2).sqrt() * by
+        uv = corner + by[:, None] * (output.offset.double() + placement.size / 2)
+        return Remeasured(uv.numpy(), sigma.numpy(), output.kind.softmax(-1).double().numpy(), radius)
 
 
 def _usual(radius: NDArray[np.float64], whole: NDArray[np.bool_], camera: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Radius (K,) that whole markers have in each blob's camera, or in all together where it shows few; nan = none."""
+    """Radius (K,) of whole markers in each blob's camera, or in all cameras if it shows few; nan = unknown."""
     usual = np.full(len(radius), np.median(radius[whole]) if whole.any() else np.nan)
     for one in np.unique(camera[whole]):
         here = whole & (camera == one)

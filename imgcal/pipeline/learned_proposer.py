@@ -1,12 +1,12 @@
-"""A network that finds fiducials in frames: a proposer for frames in which blobs fail.
+"""A network that finds fiducials in frames: a proposer for frames in which blob detection fails.
 
-It looks where candidates of the pose put the object, in all cameras. Where it sees too little it turns the candidate
-and lets the evidence of all cameras together decide. What it then claims is turned into a rig and a pose, and it looks
-again, with windows that are now centred: cameras that see well so help those that do not. Its claims are proposals:
-identity and the most probable rig judge them like blobs.
+It searches, in all cameras, around the images of candidate poses. If it finds too little, it rotates the candidate, and
+the evidence of all cameras together decides. A rig and a pose are fitted to the claims, and the search is repeated with
+better centred windows, so that good views help bad ones. The claims are proposals: identification and estimation judge
+them like blobs.
 
-Objects of many small markers are looked at in tiles. Inside a lattice neighbours look alike one step aside: all tiles
-of a camera decide together by which step most of its markers are there, and where that is close the camera is left out.
+Objects of many small markers are processed in tiles. Within a lattice, neighbours look alike one step aside. All tiles
+of a camera decide jointly which step shows most of its markers; if the decision is close, the camera is left out.
 """
 
 from __future__ import annotations
@@ -43,26 +43,26 @@ from imgcal.networks import (
 from imgcal.pipeline.network_pass import CHANCE, NetworkPass
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
-LEAST_PROBABILITY = 0.5  # of a claim
-LEAST_SEEN = 0.5  # share of what is asked for, below which other poses are tried
-CONVINCING = 0.35  # share of what is in view: a wrong pose shows less of its object by chance
-LEAST_CLAIMS = 6  # in all cameras together, to fit a pose to
-TURNS_DEG = (7.0, 13.0)  # of the candidate about each axis, where it shows too little
-LOOKS = 3  # first the candidate, then what its claims make of it
-LEAST_MEASURED = 0.01  # patch pixels: what the measurer cannot know better
-LEAST_PRESENT = 0.1  # probability by the network that a fiducial shows, below which it is not measured
-GATES = (8.0, 2.5)  # px that a measured place may be off the fitted rig, once and again
-LARGEST_REACH = 3.0  # px: larger sigmas give no right to be farther off
-LEAST_IN_CAMERA = 3  # fiducials that fit, below which a camera says nothing
-LEAST_SIGMA = 0.1  # crop pixels: what the network cannot know better
+LEAST_PROBABILITY = 0.5  # minimum probability of a claim
+LEAST_SEEN = 0.5  # share of the searched fiducials below which other poses are tried
+CONVINCING = 0.35  # share of the fiducials in view: a wrong pose shows less by chance
+LEAST_CLAIMS = 6  # minimum number of claims in all cameras for a fit
+TURNS_DEG = (7.0, 13.0)  # rotations of a candidate about each axis if it shows too little
+LOOKS = 3  # passes: at the candidate, then at the fits to its claims
+LEAST_MEASURED = 0.01  # patch pixels: limit of the measurer's accuracy
+LEAST_PRESENT = 0.1  # minimum probability that a fiducial is visible for it to be measured
+GATES = (8.0, 2.5)  # px: maximum error of a measurement relative to the fit, in two rounds
+LARGEST_REACH = 3.0  # px: sigmas beyond this do not widen the gate
+LEAST_IN_CAMERA = 3  # minimum number of fitting fiducials for a camera to count
+LEAST_SIGMA = 0.1  # crop pixels: limit of the network's accuracy
 ROBUST = EstimationOptions(loss="cauchy", threshold=2.0, max_iterations=30, tolerance=1e-2)
-MODEL_ERROR = 0.3  # px: what a measured place may be off beyond its own sigma
-OUTLIER = 5.0  # standard deviations of a claim from the fitted rig, at which it is dropped
-LARGEST_SIGMA = 20.0  # px: where a claim is too vague to be one
-TILES_AT_ONCE = 8  # more leave the caches, and fill the memory
-STEPS = 9  # displacements of a camera that are compared: none, and the steps of a lattice around it
-SAME_PLACE = 4.0  # crop pixels within which two of them claim one place for a fiducial
-LEAST_AHEAD = 2.0  # markers that the best one shows more than the next, below which none is known
+MODEL_ERROR = 0.3  # px: error of a measurement beyond its own sigma
+OUTLIER = 5.0  # standard deviations from the fit at which a claim is dropped
+LARGEST_SIGMA = 20.0  # px: a claim with a larger sigma is too vague
+TILES_AT_ONCE = 8  # more would not fit into the caches and the memory
+STEPS = 9  # compared displacements of a camera: none, and the lattice steps around it
+SAME_PLACE = 4.0  # crop pixels within which two displacements give the same place
+LEAST_AHEAD = 2.0  # minimum lead, in markers, of the best displacement
 
 Fit = tuple[CameraRig, RigidTransform]
 """The most probable rig, and poses (1,)."""
@@ -70,18 +70,18 @@ Fit = tuple[CameraRig, RigidTransform]
 
 @dataclass(frozen=True)
 class LearnedProposer:
-    """Proposes what a query network sees."""
+    """Proposes the fiducials found by a query network."""
 
     network: InfraredNetwork
-    measurer: Measurer | None = None  # reads markers, too; None = all are fitted: those of a camera share one shape
-    finder: Proposer | None = None  # asked for a pose where none is known, or the known ones show too little
+    measurer: Measurer | None = None  # reads markers, too; None = all are fitted with one shape per camera
+    finder: Proposer | None = None  # gives a pose if none is known, or the known ones show too little
     name: str = "learned"
 
     @torch.no_grad()
     def propose(self, snapshot: Snapshot) -> Proposal:
-        """Look at one snapshot: around known poses, and if they show too little, where the finder sees the object.
+        """Search one snapshot around known poses and, if they show too little, around the finder's pose.
 
-        Where what the network says is refused, what the finder has measured itself is proposed.
+        What the finder has measured itself is behind the proposal, for where the network's is refused.
         """
         near = self._around(snapshot) if snapshot.candidates else None
         if self.finder is None:
@@ -97,9 +97,10 @@ class LearnedProposer:
         return replace(best, otherwise=lambda: replace(found, found_by=finder.name))
 
     def _at_origin(self, snapshot: Snapshot) -> Proposal | None:
-        """Look where many captures have their object, if it is one of many small markers: the finder gives up on these.
+        """Search at the rig's origin, the usual place, for an object of many small markers: the finder cannot find
+        these.
 
-        Others are searched for everywhere.
+        Other objects are searched for everywhere.
         """
         origin = RigidTransform.identity(dtype=snapshot.rig.focal_length.dtype)
         size = self.network.config.crop
@@ -109,7 +110,7 @@ class LearnedProposer:
         return None if proposal.reason else proposal
 
     def _convinces(self, proposal: Proposal, snapshot: Snapshot) -> bool:
-        """Tell whether so much is seen that the object cannot well be elsewhere."""
+        """Tell whether so much is visible that the object cannot be elsewhere."""
         if proposal.rig_from_object is None:
             return False
         points = proposal.rig_from_object.apply(snapshot.obj.points)
@@ -137,15 +138,15 @@ class LearnedProposer:
 def load_proposer(
     network: str | Path = "ir-cnn", measurer: str | Path | None = "measurer-cnn", finder: Proposer | None = None
 ) -> LearnedProposer:
-    """Read networks for the frames of any rig and any object.
+    """Load networks that work for any rig and any object.
 
     Args:
         network: name of a shipped query network, its file, or the folder of the run that trained it.
-        measurer: the same of a measurer, for markers that it says it knows better; None = all markers are fitted.
-        finder: asked for a pose where none is known.
+        measurer: the same for a measurer, used for markers where it is more accurate; None = all markers are fitted.
+        finder: gives a pose if none is known.
 
     Raises:
-        InputError: no such file, or something else in it.
+        InputError: there is no such file, or it contains something else.
     """
     reader = None if measurer is None else load_measurer(model_file(measurer)).network
     read = load_infrared(model_file(network)).network
@@ -160,10 +161,10 @@ class _View:
     network: InfraredNetwork
     measurer: Measurer | None
     snapshot: Snapshot
-    frames: Mapping[str, Frame | None]  # without what is masked
+    frames: Mapping[str, Frame | None]  # with masked parts painted over
     tiles: Tiles
     features: Tensor  # (T, D, G, G)
-    most: float = math.inf  # log odds: what is known of whole steps of a pattern bounds what is known of the rest
+    most: float = math.inf  # upper limit of the log odds, from the choice of pattern steps
 
     @classmethod
     def of(cls, network: InfraredNetwork, measurer: Measurer | None, snapshot: Snapshot) -> _View:
@@ -177,13 +178,13 @@ class _View:
         return cls(network, measurer, snapshot, frames, tiles, features)
 
     def expected(self, rig: CameraRig, poses: RigidTransform) -> Expectation:
-        """Where poses (H,) put the fiducials."""
+        """Project the fiducials at poses (H,)."""
         return Expectation.of(rig, self.snapshot.obj, poses, self.tiles.usual)
 
     def ask(
         self, rig: CameraRig, poses: RigidTransform, window: int | None = None, aside: Tensor | None = None
     ) -> NetworkPass:
-        """Ask for all fiducials at poses (H,), or so many crop pixels (C, 2) aside."""
+        """Search for all fiducials at poses (H,), optionally displaced by crop pixels (C, 2)."""
         count, placement = len(poses.rotation), self.tiles.placement
         shift = None
         if aside is not None:
@@ -194,7 +195,7 @@ class _View:
         return NetworkPass(rig, poses, self.tiles, evidence, claim(evidence, queries.asked), asked)
 
     def _search(self, queries: Queries, count: int, window: int | None) -> Evidence:
-        """Ask for queries (H T, n) of so many poses."""
+        """Search for queries (H T, n) of `count` poses."""
         if not self.tiles.divided:
             return self.network.search(self.features.repeat(count, 1, 1, 1), queries, window)
         parts = [
@@ -204,10 +205,10 @@ class _View:
         return Evidence.cat(parts)
 
     def align(self, pose: RigidTransform) -> tuple[_View, NetworkPass]:
-        """Find by how much each camera sees the object (1,) aside, by which of the steps of its pattern.
+        """Find by which step of its pattern the object (1,) is displaced in each camera.
 
         Returns:
-            The view, without cameras in which steps cannot be told apart, and a look from there.
+            The view, without cameras whose step is ambiguous, and a pass with these displacements.
         """
         rig, window = self.snapshot.rig, self.network.config.close_window
         steps = self.ask(rig, pose).displacements(STEPS)
@@ -219,7 +220,7 @@ class _View:
         both = seen & seen[best, cameras]
         near = SAME_PLACE * self._join(self.tiles.placement.scale[:, None].expand_as(self.tiles.counts))
         one = both & ((uv - uv[best, cameras]).norm(dim=-1) < near)
-        # Steps from which the same markers are seen in the same places are no rivals.
+        # Steps that show the same markers in the same places are not rivals.
         rivals = found.masked_fill(2 * one.sum(-1) > both.sum(-1), 0.0)
         ahead = found.amax(0) - rivals.amax(0)
         sure = ahead >= LEAST_AHEAD
@@ -228,7 +229,7 @@ class _View:
         return view, view.ask(rig, pose, window, steps[best, cameras])
 
     def near(self, poses: RigidTransform) -> NetworkPass:
-        """Of poses (H,), and where these show too little of others near them, the one that shows most."""
+        """The best of poses (H,); if it shows too little, also try rotated ones."""
         rig = self.snapshot.rig
         looks = self.best(rig, poses)
         if float(looks.found[0]) < LEAST_SEEN * looks.count:
@@ -237,12 +238,12 @@ class _View:
         return looks
 
     def best(self, rig: CameraRig, poses: RigidTransform) -> NetworkPass:
-        """Of poses (H,) the one that shows most in all cameras together."""
+        """The pose, of (H,), that shows most in all cameras together."""
         looks = self.ask(rig, poses)
         return looks if len(poses.rotation) == 1 else self.ask(rig, poses[looks.found.argmax()[None]])
 
     def observations(self, looks: NetworkPass) -> Observations:
-        """What the first pose claims, in image pixels: (1, C, N)."""
+        """Claims at the first pose, in image pixels: (1, C, N)."""
         claims, placement = looks.claims, self.tiles.placement
         scale = placement.scale[:, None]
         uv = placement.to_image(claims.place.to(placement.corner))
@@ -255,12 +256,12 @@ class _View:
         return self.tiles.join(values, self.snapshot.rig.num_cameras, self.snapshot.obj.num_fiducials)
 
     def measure(self, looks: NetworkPass, expected: Expectation, gate: float) -> Observations:
-        """Measure all fiducials where a fitted rig has them (1, C, N), at full scale, as far as the network sees them.
+        """Measure all fiducials at full scale where a fitted rig predicts them (1, C, N), if the network sees them.
 
         Args:
-            looks: what was claimed: it stands where nothing can be measured.
-            expected: by rig and pose.
-            gate: pixels that a place may be off, beyond what its sigma explains.
+            looks: claims to keep where nothing can be measured.
+            expected: predictions by the fitted rig and pose.
+            gate: maximum error in pixels, in addition to what its sigma explains.
         """
         claimed = self.observations(looks)
         shown = self._join(looks.asked[0] & (looks.evidence.present.sigmoid() > LEAST_PRESENT))
@@ -271,12 +272,12 @@ class _View:
         sigma = torch.where(good, sigma, claimed.sigma[0])
         reach = torch.hypot(OUTLIER * sigma.clamp(max=LARGEST_REACH), sigma.new_tensor(gate))
         seen = (good | claimed.seen[0]) & ((expected.uv[0] - uv).norm(dim=-1) < reach)
-        # What fits in hardly any place of a camera may do so by chance.
+        # A few fits in a camera may be chance.
         seen &= seen.sum(-1, keepdim=True) >= LEAST_IN_CAMERA
         return Observations(uv[None], sigma[None], seen[None])
 
     def _read(self, uv: Tensor, radius: Tensor, seen: Tensor, last: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """Places (C, N, 2), sigmas and whether they are any good (C, N); in the end each by who knows it better."""
+        """Measurements (C, N, 2), sigmas and validity (C, N); in the last round, the more accurate source of each."""
         if self.measurer is None:
             return self._fit(uv, radius, seen)
         read = self._by_network(uv, radius)
@@ -288,7 +289,7 @@ class _View:
         return place, sigma, read[2] | good
 
     def _by_network(self, uv: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Ask the measurer; the same."""
+        """The same by the measurer."""
         assert self.measurer is not None
         names, shape = self.snapshot.rig.camera_names, radius.shape
         patches, placement = cut_patches(self.frames, names, uv, radius, inverted=self._dark)
@@ -300,7 +301,7 @@ class _View:
         return placement.to_image(offset)[..., 0, :], sigma, good
 
     def _fit(self, uv: Tensor, radius: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Fit the markers of each camera together; the same."""
+        """The same by fitting the markers of each camera together."""
         place, sigma, good = uv.clone(), torch.full_like(radius, torch.inf), torch.zeros_like(seen)
 
         def fit(camera: int) -> None:
@@ -320,7 +321,7 @@ class _View:
         return self.snapshot.detection.polarity == "dark"
 
     def fit(self, looks: NetworkPass, observations: Observations) -> Fit | None:
-        """The most probable rig and pose (1,) that observations (1, C, N) speak for; None = they are too few."""
+        """Fit a rig and a pose (1,) to observations (1, C, N); None = too few."""
         if int(observations.seen.sum()) < LEAST_CLAIMS:
             return None
         snapshot = self.snapshot
@@ -334,7 +335,7 @@ class _View:
         return fitted.rig, fitted.rig_from_object
 
     def proposal(self, looks: NetworkPass, fitted: Fit | None) -> Proposal:
-        """Measure what agrees with the rig and pose that the claims speak for: labelled blobs."""
+        """Measure the fiducials that agree with the fitted rig and pose, as labelled blobs."""
         snapshot, observations = self.snapshot, self.observations(looks)
         margin = min(looks.margin, self.most)
         for gate in GATES:
@@ -354,14 +355,14 @@ class _View:
 
 
 def _mask_frame(frame: np.ndarray | None, mask: np.ndarray | None) -> np.ndarray | None:
-    """Paint over where not to look, with what most of the frame looks like."""
+    """Paint over the masked parts with the frame's typical value."""
     if frame is None or mask is None:
         return frame
     return np.where(mask, np.median(frame[::8, ::8]).astype(frame.dtype), frame)
 
 
 def _turn_pose(pose: RigidTransform, obj: CalibrationObject) -> RigidTransform:
-    """Turn a pose about the object's centre, about each axis both ways: (H,)."""
+    """Rotate a pose about the object's centre, in both directions about each axis: (H,)."""
     axes = torch.cat((torch.eye(3), -torch.eye(3))).to(pose.rotation)
     vectors = torch.cat([axes * math.radians(angle) for angle in TURNS_DEG])
     centre = obj.points.mean(0).to(pose.rotation)

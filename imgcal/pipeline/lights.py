@@ -1,8 +1,8 @@
-"""Unknown markers: every blob may be one. Which blobs belong together, and whether that can be true.
+"""Unknown markers: any blob may be one. Find which blobs belong together, and verify the result.
 
-That labels fit the rig which was made from them proves nothing: dense markers fit many rigs. What proves it are moments
-that took no part, seen by cameras that took no part: the markers that the other cameras find there must be where blobs
-of the camera are, far oftener than by chance, and near misses must be few.
+It proves nothing that labels fit the rig made from them: dense markers fit many rigs. The proof is in held-out moments
+and cameras: the markers found by the other cameras must coincide with blobs of the camera far more often than by
+chance, and near misses must be rare.
 """
 
 from __future__ import annotations
@@ -33,96 +33,96 @@ from imgcal.messages import list_names
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
 
 HELD_OUT = 4
-"""Every so many-th moment takes no part in the rig that is tried."""
+"""One moment in so many is held out from the trial rig."""
 MOST_ROWS = 500
-"""Markers in a fit on the way: those that most cameras see, evenly over the moments."""
+"""Maximum number of markers in an intermediate fit: those that most cameras see, evenly over the moments."""
 LEAST_ROWS = 12
-"""Markers below which a fit on the way says nothing."""
+"""Minimum number of markers for an intermediate fit."""
 FINEST = 0.4
-"""px: what rig and blobs may be off in the end, while blobs are told apart."""
+"""px: final error of rig and blobs in the association."""
 AFTER_ALIGNMENT = 3.0
-"""px: the same when the rig has been aligned to blobs without labels."""
+"""px: the same after the rig has been aligned to unlabelled blobs."""
 NARROWER = 0.55
-"""By how much each round looks narrower at least."""
+"""Maximum ratio of this error between successive rounds."""
 JOINED, LOST = 3, 0.6
-"""Times that cameras are brought back, and the share of the usual part of their markers below which they are lost."""
+"""Number of times that lost cameras are realigned, and the share of the usual number of markers that defines them."""
 SPREAD = (0.0, 0.0, 0.5, 0.5)
-"""Of the rigs from which the search begins, in standard deviations of the prior about the factory's; each looks at
-other moments."""
+"""Spread of the rigs at which the search starts, in standard deviations of the factory's prior; each start uses other
+moments."""
 STARTS = len(SPREAD)
 NEAR, FAR = 4.0, 24.0
-"""Standard deviations up to which a blob is where a marker was predicted, and up to which it is a near miss."""
+"""Standard deviations within which a blob is at a predicted marker, and within which it is a near miss."""
 LEAST_PREDICTED = 10
-"""Markers predicted for one camera from which on it can be judged."""
+"""Minimum number of predicted markers for judging a camera."""
 LEAST_SHARE = 0.25
-"""Of the predicted markers of a camera: those with a blob in their place, chance apart."""
+"""Minimum share of a camera's predicted markers with a blob in place, corrected for chance."""
 LEAST_NEAR = 0.8
-"""Of the blobs beside predicted markers, chance apart: those that are in their place."""
+"""Minimum share, among blobs near predicted markers, of those in place; corrected for chance."""
 SAME_RIG = 1.0
-"""px: median distance of images up to which two rigs are one."""
+"""px: median image distance below which two rigs are the same."""
 MOST_TESTED = 40
-"""Held-out moments that are looked at camera by camera."""
+"""Maximum number of held-out moments to test, camera by camera."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well markers that the other cameras find are where each camera has blobs, in moments that took no part."""
+    """How well markers found by the other cameras coincide with each camera's blobs, in held-out moments."""
 
-    predicted: NDArray[np.int64]  # (C,) markers in view of the camera, found by others
-    found: NDArray[np.float64]  # (C,) share of these with a blob in their place, chance apart
-    near_misses: NDArray[np.float64]  # (C,) share of these with a blob beside their place, chance apart
+    predicted: NDArray[np.int64]  # (C,) markers in view of the camera, found by the others
+    found: NDArray[np.float64]  # (C,) share of these with a blob in place, corrected for chance
+    near_misses: NDArray[np.float64]  # (C,) share of these with a blob nearby, corrected for chance
 
     @property
     def judged(self) -> NDArray[np.bool_]:
-        """Tell which cameras can be judged: (C,)."""
+        """Which cameras can be judged: (C,)."""
         return self.predicted >= LEAST_PREDICTED
 
     @property
     def agrees(self) -> NDArray[np.bool_]:
-        """Tell which cameras agree with the others: (C,)."""
+        """Which cameras agree with the others: (C,)."""
         near = self.found >= LEAST_NEAR * (self.found + np.maximum(self.near_misses, 0))
         return self.judged & (self.found >= LEAST_SHARE) & near
 
     @property
     def score(self) -> float:
-        """One number to compare rigs by: mean share found, camera by camera; 0 for those that cannot be judged."""
+        """One number for comparing rigs: mean share found over the cameras; 0 for those that cannot be judged."""
         return float(np.where(self.judged, self.found - np.maximum(self.near_misses, 0), 0.0).mean())
 
 
 @dataclass(frozen=True)
 class FoundLights:
-    """Unknown markers of some moments, as the estimate takes them: a row is one marker at one moment."""
+    """Unknown markers of some moments as the estimate needs them: a row is one marker at one moment."""
 
-    labelled: Associations  # its snapshots are the rows, and each is named after its moment
+    labelled: Associations  # its snapshots are the rows, each named after its moment
     detections: Detections  # all blobs of all moments
-    blob: NDArray[np.int64]  # (K,) which of these each blob of `labelled` is
+    blob: NDArray[np.int64]  # (K,) index, in `detections`, of each blob of `labelled`
     background: NDArray[np.bool_]  # (M,) blobs that never move in their image
     agreement: Agreement
-    starts: int  # that were tried; 0 = the rig was right as it was given
+    starts: int  # number of starts tried; 0 = the given rig was right
 
     @property
     def background_of(self) -> NDArray[np.int64]:
-        """Blobs of each camera that never move: (C,)."""
+        """Number of blobs of each camera that never move: (C,)."""
         return self._count(self.background)
 
     @property
     def left_over_of(self) -> NDArray[np.int64]:
-        """Blobs of each camera that move and are in no marker: (C,)."""
+        """Number of blobs of each camera that move and are in no marker: (C,)."""
         free = self.detections.usable & ~self.background
         free[self.blob] = False
         return self._count(free)
 
     @property
     def note(self) -> str:
-        """What is left out as background, in words; empty where nothing is."""
+        """Describe what is left out as background; empty if nothing is."""
         counts = self.background_of
         parts = [f"{counts[c]} in {name}" for c, name in enumerate(self.detections.camera_names) if counts[c]]
         return f"blobs that never move are taken for background and left out: {', '.join(parts)}" if parts else ""
 
     def to_moments(self, rows: Detections) -> Detections:
-        """Put the blobs of rows, some of them without their labels, back among all others.
+        """Merge the blobs of rows, possibly without labels, with all others.
 
-        A label is the number of a marker at its moment: what has the same one at another moment is not the same marker.
+        A label is the number of a marker at its moment: the same number at another moment is not the same marker.
         """
         fiducial, flags = np.full(len(self.detections), -1), self.detections.flags.copy()
         names = [snapshot.name for snapshot in self.labelled.snapshots]
@@ -140,16 +140,16 @@ class FoundLights:
 def find_lights(
     detections: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions = PipelineOptions()
 ) -> FoundLights:
-    """Find the markers of each moment from a factory rig that may be off by more than markers are apart.
+    """Find the markers of each moment with a factory rig that may be off by more than the spacing of the markers.
 
     Args:
-        detections: blobs of all moments; labels are not looked at.
+        detections: blobs of all moments; labels are ignored.
         rig: the factory rig, float64.
         obj: one point.
-        options: how sure the result must be.
+        options: how certain the result must be.
 
     Raises:
-        RefusedError: the blobs cannot decide which of them belong together.
+        RefusedError: the blobs cannot be associated.
     """
     background = background_rows(detections)
     moving = detections.select(~background)
@@ -162,9 +162,9 @@ def find_lights(
 
 
 def rows_of_lights(lights: Lights, detections: Detections, rig: CameraRig) -> Associations:
-    """Make a row of each marker at each moment; it has the name of the moment, and only the marker's blobs.
+    """Make a row for each marker at each moment, with the moment's name and the marker's blobs only.
 
-    A moment without any marker is a row that was refused.
+    A moment without a marker becomes a refused row.
     """
     empty = np.setdiff1d(np.arange(len(detections.snapshot_names)), lights.moment)
     moments = np.concatenate((lights.moment, empty))
@@ -190,15 +190,15 @@ def rows_of_lights(lights: Lights, detections: Detections, rig: CameraRig) -> As
 
 
 def even_error(rig: CameraRig, pixels: float = FINEST) -> NDArray[np.float64]:
-    """Let every camera be off by the same, px: (C,)."""
+    """Assume the same error for every camera, px: (C,)."""
     return np.full(rig.num_cameras, pixels)
 
 
 def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> tuple[CameraRig, Agreement, int]:
-    """Find the rig on which moments and cameras that took no part agree.
+    """Find the rig on which held-out moments and cameras agree.
 
     Raises:
-        RefusedError: there is none, or another one explains the blobs as well.
+        RefusedError: there is none, or another one explains the blobs equally well.
     """
     learnt, tested = split_moments(detections)
     std = (rig.prior or RigPrior()).std(rig)
@@ -223,13 +223,13 @@ def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject
 NO_MARKER = "no moving blobs of three cameras agree on a place"
 """Why a moment has no marker."""
 NOTHING = (
-    "unknown markers: no blobs of three cameras agree on places: the rig is farther off than its prior says, or the "
+    "unknown markers: no blobs of three cameras agree on places: the rig is farther off than its prior allows, or the "
     "markers are too many or too few"
 )
 
 
 def split_moments(detections: Detections) -> tuple[Detections, Detections]:
-    """Part blobs by moments: those from which a rig is made, and those that take no part.
+    """Split blobs by moments: those for making the rig, and the held-out ones.
 
     Raises:
         RefusedError: there are too few moments.
@@ -237,17 +237,17 @@ def split_moments(detections: Detections) -> tuple[Detections, Detections]:
     held = np.arange(len(detections.snapshot_names)) % HELD_OUT == HELD_OUT - 1
     if held.sum() < 2:
         raise RefusedError(
-            f"unknown markers: found {len(held)} snapshots, expected at least {2 * HELD_OUT}: some must take no part, "
-            "to prove the others right"
+            f"unknown markers: found {len(held)} snapshots, expected at least {2 * HELD_OUT}: some are held out "
+            "to verify the result"
         )
     return detections.select(~held[detections.snapshot]), detections.select(held[detections.snapshot])
 
 
 def require_agreement(agreement: Agreement, rig: CameraRig) -> None:
-    """Refuse where moments and cameras that took no part do not agree.
+    """Refuse if held-out moments and cameras do not agree.
 
     Raises:
-        RefusedError: says which cameras, and how far they are from it.
+        RefusedError: names the cameras, and how far they are from agreement.
     """
     if not bool(agreement.agrees.all()):
         raise RefusedError(_why(agreement, rig))
@@ -259,7 +259,7 @@ def _why(agreement: Agreement | None, rig: CameraRig) -> str:
     unjudged = [rig.camera_names[c] for c in np.flatnonzero(~agreement.judged)]
     if unjudged and not (agreement.judged & ~agreement.agrees).any():
         return (
-            f"unknown markers: camera {list_names(unjudged)}: in the snapshots that took no part, the other "
+            f"unknown markers: camera {list_names(unjudged)}: in the held-out snapshots, the other "
             "cameras find "
             f"too few markers in its view to judge it by (expected {LEAST_PREDICTED}): capture more, or leave it out"
         )
@@ -267,17 +267,17 @@ def _why(agreement: Agreement | None, rig: CameraRig) -> str:
     worst = int(bad[np.argmin(agreement.found[bad])])
     return (
         f"unknown markers: camera {list_names([rig.camera_names[c] for c in bad])}: of {agreement.predicted[worst]} "
-        f"markers that the other cameras find in view of {rig.camera_names[worst]}, in snapshots that took no part, "
+        f"markers that the other cameras find in view of {rig.camera_names[worst]}, in held-out snapshots, "
         f"{100 * max(agreement.found[worst], 0):.0f} % have a blob in their place and "
         f"{100 * max(agreement.near_misses[worst], 0):.0f} % one beside it: which blobs belong together cannot be "
-        "decided; show fewer markers at once, or give a rig that is nearer"
+        "decided; show fewer markers at once, or give a more accurate rig"
     )
 
 
 def _refine_start(
     detections: Detections, factory: CameraRig, first: CameraRig, obj: CalibrationObject, seed: int
 ) -> CameraRig | None:
-    """Follow one start: align the rig without labels, then label and fit by turns, narrower each time."""
+    """Refine one start: align the rig without labels, then alternate labelling and fitting with a shrinking error."""
     std = (factory.prior or RigPrior()).std(factory)
     now, _ = align_rig(detections, factory, std, first, seed)
     error = min(AFTER_ALIGNMENT, float(np.median(image_error(factory, std))))
@@ -293,16 +293,16 @@ def narrow(
     error: float,
     joined: int,
 ) -> CameraRig | None:
-    """Label and fit by turns, looking narrower each time.
+    """Alternate labelling and fitting with a shrinking error.
 
     Args:
         detections: blobs of many moments.
         factory: the rig that the prior is about.
         std: (C, K) the prior.
-        now: where to begin.
+        now: the initial rig.
         obj: one point.
-        error: px, what that may be off.
-        joined: times that cameras which show few of the markers are brought back.
+        error: px, error of the initial rig.
+        joined: number of times that cameras which show few of the markers are realigned.
 
     Returns:
         The rig; None = too few markers are found.
@@ -357,11 +357,11 @@ def _fit(
 
 
 def measure_agreement(detections: Detections, rig: CameraRig) -> Agreement:
-    """Compare what each camera sees with what all the others say that it should.
+    """Compare each camera's blobs with the markers found by all the others.
 
     Args:
-        detections: blobs of moments that took no part in the rig.
-        rig: to be judged.
+        detections: blobs of held-out moments.
+        rig: the rig to judge.
     """
     moments = np.unique(detections.snapshot)
     some = moments[np.linspace(0, len(moments) - 1, min(len(moments), MOST_TESTED)).astype(int)]

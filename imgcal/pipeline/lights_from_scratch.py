@@ -1,8 +1,8 @@
-"""Calibration without a factory calibration from one light that was moved around, or from several unknown markers.
+"""Calibration without a factory calibration from one moving light, or from several unknown markers.
 
-Images that show one moving blob place the cameras; with the rig that they give, all other blobs are put together, and
-moments and cameras that took no part must agree, as with a factory calibration. The rig has no scale until somebody
-gives the distance of two cameras.
+Images of a single moving blob place the cameras. With the resulting rig all other blobs are associated, and held-out
+moments and cameras must agree, as with a factory calibration. The rig has no scale until the distance between two
+cameras is given.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from imgcal.pipeline.scale import KnownDistance
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
 
 WIDE_ROTATION, WIDE_POSITION = 0.2, 0.2
-"""Of the prior about a first rig that was made from the same data: rad, and parts of the largest distance."""
+"""Prior about a first rig that came from the same data: rad, and share of the largest distance."""
 LARGEST_FOCAL_STD, LARGEST_ROTATION_STD, LARGEST_POSITION_STD = 0.08, 0.06, 0.1
-"""What a result may leave open: relative, rad, and parts of the largest distance between cameras. The direction of a
-long lens and its principal point are nearly one: an error of 30 px is as good as one of 0.025 rad."""
+"""Maximum uncertainty of a result: relative, rad, and share of the largest distance between cameras. The direction of a
+long lens and its principal point are almost interchangeable: 30 px act like 0.025 rad."""
 LEAST_ALONE = 24
-"""Moments at which two cameras see one moving blob each."""
+"""Minimum number of moments at which two cameras see one moving blob each."""
 
 
 def check_distance(distance: tuple[str, str, float], cameras: CameraRig) -> KnownDistance:
-    """Return the distance between two cameras that somebody gives, if it can be one.
+    """Validate a given distance between two cameras.
 
     Raises:
-        InputError: a camera that does not exist, twice the same, or no length.
+        InputError: an unknown camera, the same camera twice, or an invalid length.
     """
     first, second, length = distance
     for name in (first, second):
@@ -67,21 +67,21 @@ def calibrate_lights_from_scratch(
     options: PipelineOptions,
     distance: tuple[str, str, float] | None = None,
 ) -> Calibration:
-    """Do what `calibrate_from_scratch` does where nothing is known of the markers.
+    """Do what `calibrate_from_scratch` does, for unknown markers.
 
     Args:
-        detections: blobs; labels are not looked at.
+        detections: blobs; labels are ignored.
         cameras: images and rough lenses, with a prior, float64.
         obj: one point.
-        options: how sure the result must be.
+        options: how certain the result must be.
         distance: names of two cameras and their distance, mm; None = the rig is known up to scale.
 
     Returns:
-        The rig in a frame in which the first of the two cameras is in the origin, and the second one on the x axis.
+        The rig in a frame with the first of the two cameras at the origin, and the second one on the x axis.
 
     Raises:
-        RefusedError: the blobs cannot decide.
-        InputError: no such distance.
+        RefusedError: the blobs are not sufficient.
+        InputError: the distance is invalid.
     """
     known = None if distance is None else check_distance(distance, cameras)
     names = cameras.camera_names
@@ -119,10 +119,10 @@ def calibrate_lights_from_scratch(
 
 
 def _pair_observations(detections: Detections, cameras: CameraRig) -> Observations:
-    """What images with one usable blob show, of the moments at which two such images are.
+    """Images with a single usable blob, for the moments that have two such images.
 
     Raises:
-        RefusedError: there are few.
+        RefusedError: there are too few.
     """
     moments, count = len(detections.snapshot_names), cameras.num_cameras
     rows = np.flatnonzero(detections.usable)
@@ -163,7 +163,7 @@ def _wide(rig: CameraRig, pair: tuple[int, int], lenses: RigPrior) -> torch.Tens
 
 
 def _require_determined(fit: Calibration, reference: int) -> None:
-    """Raise `RefusedError` where a camera is known so badly that the result would be a guess."""
+    """Raise `RefusedError` if a camera is known so badly that the result would be a guess."""
     rig = fit.rig
     std = fit.estimate.covariance(reference).diagonal().clamp_min(0).sqrt().unflatten(0, (rig.num_cameras, -1))
     relative = torch.stack(
@@ -179,5 +179,5 @@ def _require_determined(fit: Calibration, reference: int) -> None:
     what = ("focal length", "direction", "position")[kind]
     raise RefusedError(
         f"start without a factory calibration: the data say too little about the {what} of camera "
-        f"{rig.camera_names[camera]}: carry the light through more of what it sees, nearer and farther"
+        f"{rig.camera_names[camera]}: carry the light through more of its view, nearer and farther"
     )

@@ -1,4 +1,4 @@
-"""Whether all cameras stood still during a capture, before one rig is estimated from it."""
+"""Check that all cameras stood still during a capture, before one rig is estimated from it."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ from imgcal.pipeline.labelled_capture import LabelledCapture, arrange_labels
 from imgcal.types import CalibrationObject, CameraRig, Detections, MovedCamera, MovedError
 
 MEDIAN = 1.386
-"""Of a squared length with unit variance on both axes."""
+"""Median of a squared 2D length with unit variance on both axes."""
 LEAST_AGREEMENT = 0.9
-"""Of the labels of the other cameras, where a snapshot has been labelled twice."""
+"""Minimum share of the other cameras' labels that must agree when a snapshot is labelled again."""
 MOST_MIXED = 0.2
-"""Share of snapshots of the other kind on either side of the time at which a camera was lost."""
+"""Maximum share of snapshots of the other kind before and after the time at which a camera was lost."""
 LEAST_CHANCE = 0.05
-"""That what a camera does not agree with falls so cleanly on one side of a moment; of those that disagree at all."""
+"""Maximum probability that chance separates a camera's wrong snapshots so cleanly, over all cameras that have any."""
 EARLIER = "taken before a camera moved"
 """Why snapshots before the last move are refused."""
-MOST_MOVES = 8  # parts of a capture that are looked at, one after the other
+MOST_MOVES = 8  # maximum number of parts of a capture
 
 Bools = NDArray[np.bool_]
 
@@ -47,9 +47,9 @@ Bools = NDArray[np.bool_]
 class SteadyPart:
     """Snapshots during which no camera moved."""
 
-    arranged: LabelledCapture  # those before the last move refused
-    moved: tuple[MovedCamera, ...] = ()  # in the order of time
-    fits: tuple[Solution, ...] = ()  # of one rig to all labels: with the noise that identity allows, with their own
+    arranged: LabelledCapture  # snapshots before the last move are refused
+    moved: tuple[MovedCamera, ...] = ()  # in chronological order
+    fits: tuple[Solution, ...] = ()  # of one rig to all labels: with the noise for identification, with their own noise
 
 
 def steady_part(
@@ -59,14 +59,14 @@ def steady_part(
 
     Args:
         arranged: all snapshots.
-        detections: the same as they were given, with the labels of the input alone.
+        detections: the same as given, with the labels of the input only.
         rig: the factory calibration.
         obj: the calibration object.
-        options: whether to go on when a camera has moved.
+        options: whether to continue when a camera has moved.
 
     Raises:
-        MovedError: a camera has moved, and the options do not say what then.
-        RefusedError: after the last move no snapshot could be decided.
+        MovedError: a camera has moved, and the options do not say how to continue.
+        RefusedError: no snapshot after the last move could be identified.
     """
     found, fits = _moves(arranged, rig, obj, options)
     if not found:
@@ -90,18 +90,18 @@ def _are_explained(
     moves: tuple[MovedCamera, ...], detections: Detections, first: int, rig: CameraRig, obj: CalibrationObject,
     options: PipelineOptions,
 ) -> bool:  # fmt: skip
-    """Tell whether cameras that were lost at a moment fit the others on either side of it, by themselves.
+    """Tell whether cameras that were lost at a moment fit the others before and after it, each part by itself.
 
-    A motion whose size is known has been measured on both sides. Of a camera that fits on one side only, nothing says
-    that it moved: its labels or frames may be wrong on the other.
+    A motion of known size has been measured on both sides. If a camera fits on one side only, nothing shows that it
+    moved: its labels or frames may be wrong on the other side.
 
     Args:
-        moves: what was found.
-        detections: as they were given.
+        moves: the moves found.
+        detections: as given.
         first: number of the first snapshot after the last move.
         rig: the factory calibration.
         obj: the calibration object.
-        options: how sure identity must be.
+        options: how certain identification must be.
     """
     lost = [rig.camera_names.index(move.camera) for move in moves if move.size is None]
     for begin, end in ((0, first), (first, len(detections.snapshot_names))) if lost else ():
@@ -116,14 +116,14 @@ def _are_explained(
 
 
 def _prepend_earlier(part: Associations, labelled: Associations, first: str) -> Associations:
-    """Put the snapshots before a part of a capture, which begins with the snapshot `first`, back, refused."""
+    """Restore the snapshots before the part that begins with the snapshot `first`, as refused ones."""
     rows = labelled.detections.snapshot_names.index(first)
     moment = int(labelled.moments[rows])
     earlier = tuple(
         s if s.status == "refused" else replace(s, status="refused", reason=EARLIER, rig_from_object=None)
         for s in labelled.snapshots[:rows]
     )
-    # Rows of several objects were made anew; those of unknown markers are what they were.
+    # Rows of several objects were newly made; those of unknown markers are unchanged.
     later = tuple(
         replace(s, moment=labelled.snapshots[row].moment) if s.moment < 0 else replace(s, moment=moment + s.moment)
         for row, s in enumerate(part.snapshots, rows)
@@ -140,17 +140,17 @@ def _prepend_earlier(part: Associations, labelled: Associations, first: str) -> 
 def list_moves(
     labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
 ) -> tuple[MovedCamera, ...]:
-    """Say which cameras moved between two snapshots, in the order of time."""
+    """List the cameras that moved between two snapshots, in chronological order."""
     return _moves(arrange_labels(labelled, rig, obj), rig, obj, options)[0]
 
 
 def _moves(
     arranged: LabelledCapture, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
 ) -> tuple[tuple[MovedCamera, ...], tuple[Solution, ...]]:
-    """Do the work of `list_moves`, and give the fits of all labels, too.
+    """Do the work of `list_moves`, and return the fits of all labels, too.
 
-    A camera that has moved far is not labelled any more by what identity has learnt from the snapshots before. Such
-    snapshots are labelled afresh, so that how far it moved can be measured.
+    After a large move, identification that relies on earlier snapshots no longer labels the camera. Such snapshots are
+    labelled independently, so that the size of the move can be measured.
     """
     labelled = arranged.labelled
     if len(labelled.used) < 2 * LEAST_SNAPSHOTS:
@@ -173,13 +173,13 @@ class _Fit:
     problem: Problem
     state: State
     tally: LabelCounts
-    fits: tuple[Solution, ...]  # with the noise that identity allows, with that of the residuals
+    fits: tuple[Solution, ...]  # with the noise for identification, with that of the residuals
 
 
 def _fit(arranged: LabelledCapture, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> _Fit:
-    """Estimate one rig, no label left out, with the noise that the residuals show.
+    """Estimate one rig from all labels, with the noise that the residuals show.
 
-    Where one rig cannot fit, this is slow to settle, and need not: what it leaves is asked for steps.
+    If one rig cannot fit, this converges slowly, and need not converge: its residuals are then tested for steps.
     """
     observations = arranged.observations
     own, seen = observations.sigma.square(), observations.seen
@@ -201,7 +201,7 @@ def _fit(arranged: LabelledCapture, rig: CameraRig, obj: CalibrationObject, opti
 
 
 def _find_unlabelled(counts: LabelCounts) -> Bools:
-    """Snapshots in which most of what a camera may see of the object has no label: (S, C)."""
+    """Snapshots in which most of a camera's possible view of the object has no label: (S, C)."""
     in_view = np.minimum(counts.expected, counts.usable)
     return (in_view > 0) & (2 * counts.labelled < in_view)
 
@@ -209,7 +209,7 @@ def _find_unlabelled(counts: LabelCounts) -> Bools:
 def _label_again(
     labelled: Associations, lost: Bools, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
 ) -> Associations:
-    """Label the snapshots in which cameras are `lost` (S, C) without what the others have taught; take those labels."""
+    """Label the snapshots in which cameras are `lost` (S, C) independently of the others, and take those labels."""
     detections, moments = labelled.detections, labelled.moments
     asked = np.isin(moments, moments[lost.any(1)])
     rows = np.flatnonzero(asked[detections.snapshot])
@@ -222,7 +222,7 @@ def _label_again(
     old, new = detections.fiducial[rows], again.fiducial
     snapshot = _row_of(labelled, detections.snapshot[rows], new, obj)
     here = (snapshot >= 0) & lost[snapshot, detections.camera[rows]]
-    # A symmetric object may have been labelled in another turn, which the labels of the other cameras show.
+    # A symmetric object may have another orientation in the new labels; the other cameras' labels show that.
     both = (old >= 0) & (new >= 0) & ~here
     count = len(labelled.snapshots)
     same = np.bincount(snapshot[both & (old == new)], minlength=count)
@@ -236,7 +236,7 @@ def _label_again(
 def _row_of(
     labelled: Associations, row: NDArray[np.int64], fiducial: NDArray[np.int64], obj: CalibrationObject
 ) -> NDArray[np.int64]:
-    """Number of the row (M,) to which blobs of some rows belong with other labels; -1 = that object has none."""
+    """Row (M,) for the blobs of some rows after relabelling; -1 = there is no row for that object."""
     if not obj.parts:
         return row
     table = np.full((int(labelled.moments[-1]) + 1, len(obj.parts)), -1, dtype=np.int64)
@@ -245,10 +245,10 @@ def _row_of(
 
 
 def _find_gone(counts: LabelCounts, labelled: Associations, rig: CameraRig, known: set[str]) -> list[MovedCamera]:
-    """Cameras that saw the object where it is at first, and then elsewhere, or the other way round.
+    """Find cameras that first saw the object in the right place and later in a wrong one, or vice versa.
 
-    That snapshots in which a camera agrees and in which it does not are parted so cleanly by a moment has a probability
-    when nothing but chance decides which are which.
+    The probability that a moment separates the agreeing from the disagreeing snapshots so cleanly follows from random
+    order.
     """
     moves = []
     agrees, differs = counts.kept > counts.unexplained, counts.unexplained > counts.kept

@@ -1,4 +1,4 @@
-"""One look of a query network at the frames of a snapshot, and what can be read off it."""
+"""One pass of a query network over a snapshot's frames, and the conclusions from it."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from imgcal.geometry import RigidTransform
 from imgcal.networks import Claims, Evidence, Tiles
 from imgcal.types import CameraRig
 
-CHANCE = 0.05  # probability that a window is not what the network takes it for
+CHANCE = 0.05  # probability that the network mistakes a window
 
 
 @dataclass(frozen=True)
 class NetworkPass:
-    """What one look says: H poses, C cameras, T tiles of up to n fiducials."""
+    """Result of one pass: H poses, C cameras, T tiles of up to n fiducials."""
 
-    rig: CameraRig  # that was looked with
+    rig: CameraRig  # rig of the predictions
     poses: RigidTransform  # (H,)
     tiles: Tiles
     evidence: Evidence  # (H T, n)
@@ -29,22 +29,22 @@ class NetworkPass:
 
     @cached_property
     def found(self) -> Tensor:
-        """How many fiducials each pose shows, expected: (H,)."""
+        """Expected number of visible fiducials at each pose: (H,)."""
         return (self.claims.probability.view(self.asked.shape) * self.tiles.counts).sum((1, 2))
 
     @cached_property
     def found_in_camera(self) -> Tensor:
-        """How many fiducials the only pose shows in each camera, expected: (C,)."""
+        """Expected number of visible fiducials in each camera at the only pose: (C,)."""
         return self.tiles.sum_by_camera(self.claims.probability, self.rig.num_cameras)
 
     @cached_property
     def count(self) -> int:
-        """How many fiducials the first pose puts in view."""
+        """Number of fiducials in view at the first pose."""
         return int((self.asked[0] & self.tiles.counts).sum())
 
     @cached_property
     def joint(self) -> Tensor:
-        """Log odds of the displacements that all fiducials of a camera may share, by cell: (C, K, K), of one pose."""
+        """Log odds, by cell, of displacements shared by all fiducials of a camera, at one pose: (C, K, K)."""
         logits, asked = self.evidence.logits, self.asked.flatten(0, 1)
         size = logits.shape[-1]
         probability = functional.avg_pool2d(logits.flatten(2).softmax(-1).unflatten(2, (size, size)), 3, 1, 1) * 9
@@ -55,7 +55,7 @@ class NetworkPass:
 
     @cached_property
     def margin(self) -> float:
-        """Log odds of the first pose's displacements being none against the best other one, camera by camera."""
+        """Log odds of zero displacement at the first pose against the best other displacement, over the cameras."""
         joint = self.joint.clone()
         size = joint.shape[-1]
         middle = slice(size // 2 - 3, size // 2 + 3)
@@ -64,7 +64,7 @@ class NetworkPass:
         return float((here - joint.amax((1, 2)).clamp(min=0)).sum())
 
     def displacements(self, most: int) -> Tensor:
-        """The likeliest displacements of each camera, local maxima: (most, C, 2) crop pixels."""
+        """Most probable displacements of each camera, local maxima: (most, C, 2) crop pixels."""
         highest = functional.max_pool2d(self.joint, 5, stride=1, padding=2) == self.joint
         best = self.joint.masked_fill(~highest, -torch.inf).flatten(1).topk(most).indices.T
         cells = self.evidence.cells[0, 0].flatten(0, 1)

@@ -1,4 +1,4 @@
-"""What a calibration says about the object, and where the data cannot carry it."""
+"""A calibration's estimates of the object, and checks that the data support them."""
 
 from __future__ import annotations
 
@@ -10,54 +10,54 @@ from imgcal.estimation import BENT, SNAPSHOTS_TO_BEND, Estimate, FiducialOffset,
 from imgcal.types import CalibrationObject
 
 CERTAIN = 4.0
-"""Standard deviations from which a fiducial is named as displaced."""
+"""Significance, in standard deviations, at which a fiducial is reported as displaced."""
 TOLERATED = 4.6
-"""Times the tolerance of each coordinate: a displacement within it is longer once in ten thousand."""
+"""Multiple of the tolerance per coordinate; chance exceeds it once in ten thousand."""
 MOST_DISPLACED = 0.15
-"""Of the object's size: a fiducial that is farther from its place belongs to another object."""
+"""Maximum displacement as a share of the object's size: beyond it, the fiducial belongs to another object."""
 LEAST_KNOWN = 0.005
-"""Of the object's size: standard deviation of a displaced fiducial above which the data cannot carry it."""
+"""Maximum standard deviation of a displaced fiducial, as a share of the object's size."""
 LEAST_EXPECTED = 6
-"""Views of a fiducial from which its absence is no chance."""
+"""Number of expected views at which a fiducial's absence is not chance."""
 LOST = 0.5
-"""Share of what is usual, below which a fiducial counts as lost."""
+"""Share of the usual number of views below which a fiducial counts as lost."""
 IN_PLACE = 1e-4
-"""Of the object's size: a fiducial that is nearer to its place is in it."""
+"""Displacement, as a share of the object's size, that counts as none."""
 
 
 def object_offsets(
     fit: Estimate, shape: ShapeEvidence | ScaleEvidence | None, obj: CalibrationObject
 ) -> tuple[FiducialOffset, ...]:
-    """Say how far each fiducial is from its place, and refuse where the data do not carry that.
+    """Return each fiducial's offset, and refuse if the data do not support it.
 
     Args:
         fit: the estimate.
-        shape: what its residuals still say about the object; None = not asked.
-        obj: the object as its file has it.
+        shape: evidence of its residuals about the object; None = not tested.
+        obj: the object as in its file.
 
     Returns:
-        One offset a fiducial; empty where the object was taken as exact.
+        One offset per fiducial; empty if the object was taken as exact.
 
     Raises:
-        RefusedError: the object is not what its file says, and what it is instead cannot be said.
+        RefusedError: the object differs from its file, and the data cannot tell how.
     """
     measure = {
-        "python": "measure it anew, or take more snapshots; where fiducials may be off, say so: "
+        "python": "measure it again, or take more snapshots; if fiducials may be off, say so: "
         "replace(obj, tolerance=...)",
-        "command": "measure it anew, or take more snapshots; where fiducials may be off, say so: "
+        "command": "measure it again, or take more snapshots; if fiducials may be off, say so: "
         "--object-tolerance MM, or a column `tolerance`",
     }
-    # Of a few snapshots nobody can tell whether it is the lenses instead: then they would disagree.
+    # With few snapshots, the lenses might be the cause instead: then these would disagree.
     few = fit.problem.uv.shape[1] < SNAPSHOTS_TO_BEND
     if few and shape is not None and shape.bent_sigma() >= 2 * BENT:
         raise RefusedError(
-            "estimation: the object is not as its file says, and other places of its fiducials do not explain the "
+            "estimation: the object differs from its file, and other positions of its fiducials do not explain the "
             "images either",
             **measure,
         )
     if fit.problem.object_prior_std is None:
         return ()
-    places = (fit.problem.points + fit.problem.centroid).double().numpy()  # bent as its modes are
+    places = (fit.problem.points + fit.problem.centroid).double().numpy()  # including the bending modes
     found = offsets(fit, places)
     learnt = fit.problem.object_prior_std[0, :-1:3].numpy()
     granted = obj.granted.double().numpy()
@@ -81,7 +81,7 @@ def object_offsets(
 
 
 def find_lost_fiducials(seen: NDArray[np.bool_], in_view: NDArray[np.bool_]) -> tuple[int, ...]:
-    """Choose the fiducials that were hardly found where all the others were: missing, hidden, or somewhere else.
+    """Find the fiducials that were hardly seen although all the others were: missing, hidden, or elsewhere.
 
     Args:
         seen: (S, C, N) labels that fit.
@@ -95,7 +95,7 @@ def find_lost_fiducials(seen: NDArray[np.bool_], in_view: NDArray[np.bool_]) -> 
 
 
 def find_displaced(found: tuple[FiducialOffset, ...], obj: CalibrationObject) -> tuple[FiducialOffset, ...]:
-    """Choose the fiducials that are farther from their places than chance and their tolerance explain."""
+    """Find the fiducials that are farther from their places than chance and their tolerance explain."""
     granted = obj.granted.double().numpy()
     return tuple(
         offset

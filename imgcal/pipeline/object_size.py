@@ -1,7 +1,7 @@
-"""Was it the same object all the time? Each snapshot measures its size by itself, the rig being known.
+"""Check that the object was not exchanged: each snapshot measures its size by itself, with the rig known.
 
-A calibration from two objects of slightly different size fits neither of them: the rig is a compromise, and the
-residuals look like bent fiducials or a narrow prior. The size that snapshots measure tells: it steps at one moment.
+A calibration from two objects of slightly different size fits neither: the rig is a compromise, and the residuals look
+like bent fiducials or a narrow prior. The sizes measured in the snapshots show it: they have a step at one moment.
 """
 
 from __future__ import annotations
@@ -20,36 +20,36 @@ from imgcal.estimation import Estimate, correlation_time
 Floats = NDArray[np.float64]
 
 SURE = 8.0
-"""Standard deviations by which the size must step, among all moments when it may."""
+"""Significance of the step, in standard deviations, over all its possible moments."""
 LEAST_STEP = 1e-3
-"""Of the size: lenses that are not known exactly make it seem to change by less."""
+"""Minimum relative step: inexact lenses make the size seem to change by less."""
 LEAST_SNAPSHOTS = 3
-"""Before and after the step."""
+"""Minimum number of snapshots before and after the step."""
 LARGEST_SHARE = 0.5
-"""Of the variance of the sizes, what may be left once they are explained by the step: the rest has other causes."""
+"""Maximum share of the variance of the sizes that the step may leave: otherwise there are other causes."""
 UNKNOWN_SIZE = 0.1
-"""Relative standard deviation from which on a snapshot says nothing about the size: one camera alone."""
+"""Relative standard deviation at which a snapshot says nothing about the size: a single camera."""
 WAY = 1e-3
 """Step of the differences, mm."""
 
 
 @dataclass(frozen=True)
 class SizeStep:
-    """From one moment on, the object is larger or smaller."""
+    """A change of the object's size at one moment."""
 
-    first: int  # snapshot, of those with a pose
+    first: int  # index among snapshots with a pose
     change: float  # relative
-    sigma: float  # one standard deviation of it
+    sigma: float  # one standard deviation of the change
 
 
 def measure_sizes(fit: Estimate) -> tuple[Floats, Floats]:
-    """Measure the object's size in each snapshot, all cameras being where the estimate has them.
+    """Measure the object's size in each snapshot, with the cameras of the estimate.
 
     Args:
         fit: the estimate of one rig from S snapshots.
 
     Returns:
-        (S,) relative to that of the estimate's object, and (S,) the standard deviation that noise gives it.
+        (S,) sizes relative to the estimate's object, and (S,) their standard deviations by noise.
     """
     seen = fit.problem.root_weight[0] > 0
     weight = torch.where(seen, fit.problem.root_weight[0].square(), 0.0)
@@ -66,7 +66,7 @@ def measure_sizes(fit: Estimate) -> tuple[Floats, Floats]:
 
 
 def find_step(size: Floats, sigma: Floats) -> SizeStep | None:
-    """Find the moment from which on sizes (S,) of standard deviations (S,) differ; None = it is one size."""
+    """Find the moment at which sizes (S,) with standard deviations (S,) change; None = there is none."""
     known = np.flatnonzero((sigma > 0) & (sigma < UNKNOWN_SIZE))
     if len(known) < 2 * LEAST_SNAPSHOTS:
         return None
@@ -95,10 +95,10 @@ def require_one_size(fit: Estimate, names: tuple[str, ...]) -> None:
 
     Args:
         fit: the estimate.
-        names: of its snapshots.
+        names: of the snapshots.
 
     Raises:
-        RefusedError: there is a moment from which on the object has another size.
+        RefusedError: the object's size changes at some moment.
     """
     if len(names) < 2 * LEAST_SNAPSHOTS:
         return
@@ -114,7 +114,7 @@ def require_one_size(fit: Estimate, names: tuple[str, ...]) -> None:
 
 
 def _differences(fit: Estimate) -> Tensor:
-    """Derivatives (S, C, N, 2, 7) of the images by turn (rad), way (mm) and relative growth of the object."""
+    """Derivatives (S, C, N, 2, 7) of the images by rotation (rad), translation (mm) and growth of the object."""
     points = fit.points_object - fit.points_object.mean(0)
     arms = points @ fit.rig_from_object.rotation.mT  # (S, N, 3), from the centroid, in the rig frame
     places = fit.rig_from_object.apply(fit.points_object)

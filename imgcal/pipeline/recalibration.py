@@ -1,6 +1,6 @@
-"""From blobs to a recalibrated rig: labels, then one estimate over all snapshots, then the checks that it must pass.
+"""From blobs to a recalibrated rig: labels, then one estimate over all snapshots, then checks.
 
-`calibrate` is what the command of the same name does, on values in memory: it neither reads nor writes files.
+`calibrate` does what the command of that name does, on values in memory: it neither reads nor writes files.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from imgcal.types import (
 )
 
 FOUND = RigPrior(focal_length=5e-4, principal_point=0.5, distortion=0.01, rotation=5e-4, position=0.5)
-"""How far a rig that was just found may be off, where labels of sticks are completed: about a pixel."""
+"""Prior of a rig that was just found, for completing the labels of sticks: about a pixel."""
 
 
 def calibrate(
@@ -61,19 +61,19 @@ def calibrate(
         source: blobs, labelled or not, or frames in memory (see `imgcal.detect`).
         rig: the factory calibration, without batch axes.
         obj: the calibration object; or several, any of which may be in view of any snapshot.
-        options: how sure the result must be.
+        options: how certain the result must be.
         detection: how blobs are found in frames.
-        initializer: network whose first guess the estimate starts from (`load_initializer`).
+        initializer: network whose first guess starts the estimate (`load_initializer`).
         progress: wraps the loop over snapshots, for a progress bar.
-        detector: who finds the fiducials in frames: `classical` (blobs), `matched` (a matched filter for frames in
-            which blobs fail), `auto` (the filter where blobs decide nothing, or the calibration from them is refused),
-            or a `Proposer`; a `Sight` brings frames that are not in memory. Blobs that contradict count, decide what a
-            proposer finds nothing in, and identity and all checks decide as ever.
+        detector: what finds the fiducials in frames: `classical` (blobs), `matched` (a matched filter for frames in
+            which blobs fail), `auto` (the filter if blobs are not sufficient, or the calibration from them is
+            refused), or a `Proposer`; a `Sight` brings frames that are not in memory. Blobs that contradict count,
+            blobs decide if a proposer finds nothing, and identification and all checks apply as usual.
         measurer: measures the blobs of frames again (`LearnedMeasurer.load`): half-hidden and unevenly lit markers;
             also those that `learned` finds.
 
     Raises:
-        RefusedError: the data cannot decide; the message says why.
+        RefusedError: the data are not sufficient; the message says why.
         InputError: the data do not belong to this rig or object: other cameras, frames of another size.
 
     Examples:
@@ -109,13 +109,13 @@ def calibrate(
                 fit = _labelled_again(fit, given, rig, obj, options)
     except RefusedError as error:
         if sight is not None and labelled is not None and sight.where_blobs_fail and _used_blobs(labelled):
-            # They told the pose, and failed all the same.
+            # Blobs gave a pose, but the calibration failed.
             with contextlib.suppress(RefusedError):
                 sight = replace(sight, where_blobs_fail=False)
                 return calibrate(
                     detections, rig, obj, options, initializer=initializer, progress=progress, detector=sight
                 )
-        # The extent of what is seen says nothing of a light, and little of a stick.
+        # The extent of the view says nothing for a light, and little for a stick.
         if obj.pose_rank == 6 and not obj.parts:
             require_units(error, detections, rig, obj)
         if labelled is not None:
@@ -138,7 +138,7 @@ def _calibrate_lights(
     options: PipelineOptions,
     detecting: float,
 ) -> Calibration:
-    """Calibrate from unknown markers; `detecting` has taken so many seconds."""
+    """Calibrate from unknown markers; `detecting`: seconds that detection took."""
     started = time.perf_counter()
     with require_solvable():
         lights = find_lights(detections, rig, obj, options)
@@ -153,16 +153,16 @@ def _calibrate_lights(
 
 
 def as_one(obj: CalibrationObject | Sequence[CalibrationObject]) -> CalibrationObject:
-    """One object, or several put together."""
+    """One object, or several combined."""
     return obj if isinstance(obj, CalibrationObject) else CalibrationObject.of_several(obj)
 
 
 def _labelled_again(
     fit: Calibration, given: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
 ) -> Calibration:
-    """Label once more with the rig that was found, and estimate that anew from the factory calibration.
+    """Label once more with the rig that was found, and repeat the estimate from the factory calibration.
 
-    A camera shows little of a stick: a marker whose neighbour is hidden has a label only where the rig is known.
+    A camera shows little of a stick: a marker with a hidden neighbour can be labelled only if the rig is known.
     """
     if fit.labelled.identity == "coded" or fit.moved or fit.unsynchronized is not None:
         return fit
@@ -182,10 +182,10 @@ def fit_with_timing(
     initializer: Initializer | None = None,
     prior_std: Tensor | None = None,
 ) -> Calibration:
-    """Do what `fit_steady` does; where the cameras are not synchronized, with the noise that this makes.
+    """Do what `fit_steady` does; if the cameras are not synchronized, with the additional noise.
 
     Raises:
-        RefusedError: the data cannot decide.
+        RefusedError: the data are not sufficient.
     """
     refusal: RefusedError | None = None
     try:
@@ -208,7 +208,7 @@ def fit_with_timing(
 
 
 def _used_blobs(labelled: Associations) -> bool:
-    """Tell whether blobs decided about some snapshot, of which nobody has looked at the frames then."""
+    """Tell whether some snapshot was identified from blobs alone, without a look at its frames."""
     snapshots = (labelled.snapshots[number] for number in labelled.used)
     return any(snapshot.found_by == "classical" and snapshot.status != "coded" for snapshot in snapshots)
 
@@ -221,7 +221,7 @@ def require_same_moments(
     obj: CalibrationObject,
     options: PipelineOptions,
 ) -> None:
-    """Raise another refusal where a camera whose frames are of other moments is behind one.
+    """Replace a refusal if its cause is a camera whose frames are of other moments.
 
     Args:
         error: the refusal.
@@ -229,7 +229,7 @@ def require_same_moments(
         labelled: the same with all labels.
         rig: as for `late_cameras`.
         obj: the calibration object.
-        options: how sure a result must be.
+        options: how certain a result must be.
     """
     arranged = arrange_labels(labelled, rig, obj)
     labels = arranged.observations.seen.numpy()
@@ -240,7 +240,7 @@ def require_same_moments(
         raise RefusedError(
             str(slipped),
             python="give the frames of each moment, or leave the camera out (rig.select)",
-            command=f"export its frames anew, or leave it out: --without {slipped.camera}",
+            command=f"export its frames again, or leave it out: --without {slipped.camera}",
         ) from error
 
 
@@ -253,16 +253,16 @@ def late_cameras(
     moved: tuple[tuple[str, int], ...] = (),
     labelled: Associations | None = None,
 ) -> tuple[LateCamera, ...]:
-    """Find cameras that do not agree with the others because their frames are of other moments.
+    """Find cameras that disagree with the others because their frames are of other moments.
 
     Args:
         detections: all blobs, with the labels of the input alone.
-        counts: what is explained of them.
-        rig: what was known before, or nearly: its prior bounds how blobs are labelled.
+        counts: how much of them is explained.
+        rig: approximate rig; its prior bounds the labelling of blobs.
         obj: the calibration object.
-        options: how sure a result must be.
-        moved: cameras that are said to have moved, and the number of the snapshot from which on.
-        labelled: rows that `counts` are of, where several objects were in view; the one seen most often is asked.
+        options: how certain a result must be.
+        moved: cameras reported to have moved, and the number of the snapshot of the move.
+        labelled: rows of `counts` if several objects were in view; the one seen most often is used.
     """
     asked = suspects(counts, rig.camera_names, moved)
     if obj.parts and asked and labelled is not None:
@@ -287,7 +287,7 @@ def _of_part(detections: Detections, obj: CalibrationObject, part: int) -> tuple
 
 
 def _given_labels(labelled: Associations) -> Detections:
-    """All blobs, also those that a proposer measured, with the labels of the input alone."""
+    """All blobs, also those measured by a proposer, with the labels of the input only."""
     coded = np.array([snapshot.status == "coded" for snapshot in labelled.snapshots])
     detections = labelled.detections
     return replace(detections, fiducial=np.where(coded[detections.snapshot], detections.fiducial, -1))

@@ -1,7 +1,7 @@
-"""Images and blobs that are exact copies of earlier ones: a stalled grabber, rows written twice. They count once.
+"""Exact copies of earlier images and blobs, from a stalled grabber or rows written twice: each counts once.
 
-Noise differs from image to image, so that a copy brings no evidence of its own; counted as independent, it makes the
-result look surer than it is.
+Noise differs from image to image, so a copy adds no evidence. If copies counted as independent, the result would seem
+more certain than it is.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from imgcal.association import Associations
 from imgcal.types import Detections
 
 LEAST_BLOBS = 2
-"""Of an image that can be a copy: a single blob may well be at the same place again, a reflection for example."""
+"""Minimum number of blobs in a copied image: a single blob, such as a reflection, may recur at the same place."""
 
 
 @dataclass(frozen=True)
 class Repeats:
     """Copies that were left out."""
 
-    rows: int = 0  # blobs that stand twice in one image
-    images: int = 0  # images of one camera, with the same blobs as an earlier one
-    snapshots: tuple[tuple[str, str], ...] = ()  # all images of which are copies: their names, and those of the first
+    rows: int = 0  # blobs listed twice in one image
+    images: int = 0  # images with the same blobs as an earlier one of their camera
+    snapshots: tuple[tuple[str, str], ...] = ()  # snapshots of copies only: their names, and those of the originals
 
     @property
     def values(self) -> dict[str, Any]:
-        """The form that scripts read."""
+        """Values for scripts."""
         return {"rows": self.rows, "images": self.images, "snapshots": dict(self.snapshots), "note": str(self)}
 
     def __str__(self) -> str:
-        """One line for people; empty where there are none."""
+        """Summary for people; empty if there are none."""
         parts = []
         if self.images:
             whole = f", {len(self.snapshots)} whole snapshots among them" if self.snapshots else ""
@@ -44,13 +44,13 @@ class Repeats:
 
 
 def drop_repeats(detections: Detections) -> tuple[Detections, Repeats]:
-    """Leave out blobs that are bit-identical copies of others.
+    """Remove blobs that are bit-identical copies of others.
 
     Args:
-        detections: all blobs, snapshots in the order of time.
+        detections: all blobs, snapshots in chronological order.
 
     Returns:
-        The others, with the names of all snapshots, and what was left out.
+        The other blobs, with the names of all snapshots, and what was removed.
     """
     u, v = detections.uv.T
     order = np.lexsort((detections.fiducial, v, u, detections.camera, detections.snapshot))
@@ -81,7 +81,7 @@ def drop_repeats(detections: Detections) -> tuple[Detections, Repeats]:
 
 
 def _are_equal(uv: NDArray[np.float64], camera: NDArray[np.int64], begins: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Find images (I,), each from a row of `begins` on, that may be copies: the sums of their blobs are the same."""
+    """Find images (I,), starting at the rows `begins`, that may be copies: their blobs have equal sums."""
     if not len(begins):
         return begins
     sizes = np.diff(np.append(begins, len(uv)))
@@ -91,7 +91,7 @@ def _are_equal(uv: NDArray[np.float64], camera: NDArray[np.int64], begins: NDArr
 
 
 def name_repeats(labelled: Associations, repeats: Repeats) -> Associations:
-    """Give copies of whole snapshots as the reason why these were refused."""
+    """Record, for snapshots that are whole copies, that this is why they were refused."""
     first = dict(repeats.snapshots)
     snapshots = tuple(
         replace(snapshot, reason=f"a copy of snapshot {first[snapshot.name]}")

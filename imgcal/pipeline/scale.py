@@ -1,7 +1,7 @@
-"""What the size of a recalibrated rig rests on, and what an error of the object's file would do to it.
+"""What the scale of a recalibrated rig is based on, and the effect of an error in the object's file.
 
-Images alone know no lengths: the scale is that of the object's file, unless the file grants it a tolerance and the
-cameras' factory positions know it better. Residuals cannot show an error of it, so that no predicted error has it in.
+Images alone do not determine lengths. The scale comes from the object's file, unless the file gives it a tolerance and
+the cameras' factory positions know it better. Residuals cannot show its error, so predicted errors do not include it.
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ from imgcal.estimation import Estimate, WorkingVolume, camera_covariance, predic
 from imgcal.types import CalibrationObject
 
 NOTICED = 4.0
-"""Standard deviations of the cameras' factory positions from which an error of the object's scale is refused."""
+"""Significance, relative to the cameras' factory positions, at which an error of the object's scale is refused."""
 MOST_NOTICED = 0.5
-"""Relative error of the scale above which nothing is said about when it would be noticed."""
+"""Relative error of the scale above which no statement is made about when it would be noticed."""
 PERCENT = 0.01
 
 
 @dataclass(frozen=True)
 class KnownDistance:
-    """The distance of two cameras that gives a rig its scale."""
+    """The distance between two cameras that defines a rig's scale."""
 
     first: str  # camera
     second: str
     length: float  # mm
-    is_given: bool  # by somebody who measured it; else nothing is known of the scale
+    is_given: bool  # it was measured; otherwise the scale is unknown
 
     @property
     def scale(self) -> Scale:
-        """What the size of the rig rests on."""
+        """What the rig's scale is based on."""
         source: Literal["distance", "none"] = "distance" if self.is_given else "none"
         return Scale(source, 0.0 if self.is_given else math.inf, None, None, None, distance=self)
 
     def __str__(self) -> str:
-        """Say it in words."""
+        """Describe it in words."""
         if self.is_given:
             return f"scale rests on the distance of {self.first} and {self.second}, {self.length:g} mm, taken as exact"
         return (
@@ -49,17 +49,17 @@ class KnownDistance:
 
 @dataclass(frozen=True)
 class Scale:
-    """Where the scale comes from, and how far it can be trusted."""
+    """The source of the scale, and its reliability."""
 
     source: Literal["object", "cameras", "distance", "none"]
-    sigma: float  # relative, one standard deviation, given what is granted to the object's file
+    sigma: float  # relative, one standard deviation, given the tolerance of the object's file
     noticed_from: float | None  # relative error of the object's scale that would be noticed; None = none would
-    px_per_percent: float | None  # median error that 1 % of the object adds over the working volume; None = unknown
+    px_per_percent: float | None  # median error over the working volume per 1 % of the object's scale; None = unknown
     mm_per_percent: float | None
-    distance: KnownDistance | None = None  # of two cameras, where there was no factory calibration
+    distance: KnownDistance | None = None  # between two cameras, without a factory calibration
 
     def __str__(self) -> str:
-        """One sentence for people; empty where the cameras know an object's scale: the prediction has its error."""
+        """One sentence for people; empty if the cameras determine the scale: the predicted error then includes it."""
         if self.distance is not None:
             return str(self.distance)
         if self.source == "cameras" and self.px_per_percent is None:
@@ -76,7 +76,7 @@ class Scale:
 
     @property
     def values(self) -> dict[str, Any]:
-        """The form that scripts read."""
+        """Values for scripts."""
         return {
             "from": self.source,
             "sigma_percent": _finite(100 * self.sigma),
@@ -88,12 +88,12 @@ class Scale:
 
 
 def find_scale(estimate: Estimate, obj: CalibrationObject, scale_sigma: float | None, volume: WorkingVolume) -> Scale:
-    """Say where the scale of an estimate comes from.
+    """Find the source of an estimate's scale.
 
     Args:
         estimate: without batch axes.
-        obj: the object as its file has it.
-        scale_sigma: relative, how well the cameras' factory positions know the object's scale; None = not at all.
+        obj: the object as in its file.
+        scale_sigma: relative standard deviation of the object's scale by the factory positions; None = unknown.
         volume: where the rig is used.
     """
     if obj.pose_rank == 3:
@@ -112,7 +112,7 @@ def find_scale(estimate: Estimate, obj: CalibrationObject, scale_sigma: float | 
 
 
 def _position_sigma(estimate: Estimate) -> float:
-    """How well the estimate knows the size of the rig: relative, one standard deviation."""
+    """Relative standard deviation of the rig's size in the estimate."""
     parts = estimate.problem.prior_std.shape[1:]
     covariance = camera_covariance(estimate, curved=False).unflatten(0, parts).unflatten(-1, parts)
     away = estimate.rig.positions - estimate.rig.positions.mean(0)

@@ -1,4 +1,4 @@
-"""How well a rig that is held fixed explains what its cameras saw: `score`, as the command of that name."""
+"""Measure how well a fixed rig explains what its cameras saw: `score`, as the command of that name."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
 OUTLYING = 10.0
-"""Times the median distance: of noise alone, one in 10^30 is so far off."""
+"""Multiple of the median distance; noise alone exceeds it once in 10^30."""
 ROUNDS = 5
 LEAST_POINTS, LEAST_OF_LIGHT = 6, 2
-"""Of a snapshot, for its pose; and where it shows one point."""
+"""Minimum number of points in a snapshot for a pose; the same for one light."""
 
 
 def rms_length(residual: Tensor, seen: Tensor) -> float | None:
-    """RMS length (px) of the seen residuals, as OpenCV's calibrateCamera defines it; None where nothing was seen.
+    """RMS length (px) of the seen residuals, as in OpenCV's calibrateCamera; None if nothing was seen.
 
     Args:
         residual: (..., 2) pixels.
@@ -38,12 +38,12 @@ def rms_length(residual: Tensor, seen: Tensor) -> float | None:
 
 @dataclass(frozen=True)
 class RigScore:
-    """Reprojection errors of a rig that is held fixed; only the object's poses are fitted."""
+    """Reprojection errors of a fixed rig; only the object's poses are fitted."""
 
     labelled: Associations
     residual: Tensor  # (S, C, N, 2) pixels
     seen: Tensor  # (S, C, N) bool
-    lights: FoundLights | None = None  # of unknown markers: S is one marker at one moment each
+    lights: FoundLights | None = None  # unknown markers: S counts single markers at one moment
 
     @property
     def distances(self) -> Tensor:
@@ -54,8 +54,8 @@ class RigScore:
     def outliers(self) -> Tensor:
         """Mark the seen fiducials that are `OUTLYING` times as far off as most of their camera's: (S, C, N) bool.
 
-        Half-hidden and merged markers are, whatever the rig; a median does not see them, an RMS hardly anything else.
-        A camera that is off as a whole has no outliers: it is in the RMS.
+        Half-hidden and merged markers are outliers, whatever the rig. A median ignores them; they dominate an RMS. A
+        camera that is off as a whole has no outliers: it shows in the RMS.
         """
         distance = torch.where(self.seen, self.residual.norm(dim=-1), torch.nan)
         own = distance.movedim(1, 0).flatten(1).nanmedian(dim=1).values.nan_to_num(0.0)
@@ -63,7 +63,7 @@ class RigScore:
         return distance > limit[:, None]
 
     def __repr__(self) -> str:
-        """Give the robust figures first."""
+        """Summarize, with the robust figures first."""
         distances, outliers = self.distances, self.outliers
         rms, most = rms_length(self.residual, self.seen & ~outliers), float(distances.median())
         return (
@@ -85,14 +85,14 @@ def score(
 
     Args:
         source: blobs, labelled or not, or frames in memory (see `imgcal.detect`).
-        rig: the rig to be scored; its prior is used for identity only.
+        rig: the rig to score; its prior is used for identification only.
         obj: the calibration object; or several, any of which may be in view of any snapshot.
-        options: how sure identity must be.
+        options: how certain identification must be.
         progress: wraps the loop over snapshots.
         detection: how blobs are found in frames.
 
     Raises:
-        RefusedError: no snapshot could be decided.
+        RefusedError: no snapshot could be identified.
         InputError: the data do not belong to this rig or object: other cameras, frames of another size.
 
     Examples:
@@ -144,7 +144,7 @@ def _fit_poses(labelled: Associations, rig: CameraRig, obj: CalibrationObject, o
         points = poses.apply(obj.points.to(rig.focal_length))
         residual = rig.expand(len(points)).project_values(points, obj.radius).uv - observations.uv
         scored = RigScore(labelled, torch.where(observations.seen[..., None], residual, 0.0), observations.seen)
-        # The poses, too, are those of most fiducials: what is far off must not pull them.
+        # Most fiducials determine the poses, too: outliers must not pull them.
         kept = observations.seen & ~scored.outliers
         if bool((kept == even.seen).all()) or bool((kept.flatten(1).sum(1) < least).any()):
             break

@@ -1,6 +1,6 @@
-"""What a program hands over, frames or blobs, compared with the rig and the object before anything is made of it.
+"""Validate frames or blobs from a program against the rig and the object before use.
 
-Files are checked where they are read, line by line; this is the same for values in memory.
+Files are checked line by line on reading; this is the same for values in memory.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from imgcal.types import BLOB_RADIUS, SIGMA, CalibrationObject, CameraRig, Detec
 Frames = Mapping[str, Frame | Sequence[Frame | None] | None]
 DETECTORS = ("classical", "matched", "auto", "learned", "both")
 DetectorName = str
-"""One of `DETECTORS`, or a query network: its file, the folder of the run that trained it, a shipped one's name."""
+"""One of `DETECTORS`, or a query network: its file, the folder of its training run, or the name of a shipped one."""
 Detector = DetectorName | Proposer | Sight
-"""Who finds the fiducials in frames: blobs (classical), a matched filter, or the filter where blobs decide nothing
-(auto); a network, or the network where blobs decide nothing (both); something else that proposes labels; or one of them
-with frames that are not in memory. Blobs decide where nobody else can."""
+"""What finds the fiducials in frames: blobs (classical), a matched filter, or the filter if blobs are not sufficient
+(auto); a network, or the network if blobs are not sufficient (both); another proposer of labels; or one of them with
+frames that are not in memory. Blobs decide if the others cannot."""
 ROWS = tuple(field.name for field in fields(Detections) if not field.name.endswith("_names"))
 
 
@@ -38,10 +38,10 @@ def find_blobs(
     options: DetectionOptions,
     measurer: LearnedMeasurer | None = None,
 ) -> Detections:
-    """Take blobs as they are, or find them in frames, and measure these again; cameras are numbered as in the rig.
+    """Take blobs as they are, or find them in frames and measure them again; number cameras as in the rig.
 
     Raises:
-        InputError: neither blobs nor frames, or they are not of this rig and object.
+        InputError: neither blobs nor frames, or not of this rig and object.
     """
     if isinstance(source, Detections):
         if measurer is not None:
@@ -66,16 +66,16 @@ def make_sight(
     detection: DetectionOptions,
     measurer: LearnedMeasurer | None = None,
 ) -> Sight | None:
-    """Say who looks at frames in memory, and at which; None = blobs alone decide.
+    """Combine a detector with frames in memory; None = blobs alone decide.
 
     Args:
-        detector: who it is.
+        detector: the detector.
         source: the frames.
-        detection: how blobs are found beside it.
+        detection: how blobs are found as well.
         measurer: reads the markers that a network finds.
 
     Raises:
-        InputError: no such detector, or no frames to look at.
+        InputError: there is no such detector, or there are no frames.
     """
     if isinstance(detector, Sight) or detector == "classical":
         return None if isinstance(detector, str) else detector
@@ -88,14 +88,14 @@ def make_sight(
 def choose_proposer(
     detector: DetectorName | Proposer, measurer: LearnedMeasurer | None = None
 ) -> tuple[Proposer, bool]:
-    """Give who looks, and whether only where blobs decide nothing.
+    """Return the proposer, and whether to use it only if blobs are not sufficient.
 
     Args:
-        detector: its name, or itself.
-        measurer: reads the markers that a network finds, where it is named here.
+        detector: its name, or the proposer itself.
+        measurer: reads the markers of a network given by name.
 
     Raises:
-        InputError: no such detector.
+        InputError: there is no such detector.
     """
     if not isinstance(detector, str):
         return detector, False
@@ -114,15 +114,15 @@ def _reading(proposer: LearnedProposer, measurer: LearnedMeasurer | None) -> Lea
 
 
 def _read_memory(source: Frames) -> Callable[[int], Mapping[str, Frame | None]]:
-    """Frames of one snapshot after another, of cameras that have one frame or many."""
+    """Return a function that gives the frames of a snapshot; a camera may have one frame or many."""
     series = {name: entry if isinstance(entry, Sequence) else (entry,) for name, entry in source.items()}
     return lambda number: {name: frames[number] if number < len(frames) else None for name, frames in series.items()}
 
 
 def check_frames(frames: object, rig: CameraRig) -> dict[str, Any]:
-    """Return frames by camera, in grey, if all of them are of the rig's cameras and sizes, and explain otherwise.
+    """Return grey frames by camera if all fit the rig's cameras and sizes; otherwise raise an explanation.
 
-    Frames of three equal channels, as OpenCV reads grey videos, are grey: the same that files may be.
+    Frames of three equal channels, as OpenCV reads grey videos, count as grey, as in files.
     """
     if not isinstance(frames, Mapping):
         raise InputError(f"found a {type(frames).__name__}, expected Detections or frames: {{camera name: frame}}")
@@ -142,7 +142,7 @@ def check_frames(frames: object, rig: CameraRig) -> dict[str, Any]:
 
 
 def _check_frame(frame: Any, camera: str, width: int, height: int, rig: CameraRig) -> Any:
-    """Look at what is a frame; detection explains what is none."""
+    """Check the size of a frame; detection explains other faults."""
     if not isinstance(frame, np.ndarray):
         return frame
     if frame.ndim == 3:
@@ -156,11 +156,11 @@ def _check_frame(frame: Any, camera: str, width: int, height: int, rig: CameraRi
 
 
 def check_detections(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Detections:
-    """Return detections with their cameras numbered as in the rig, if they can be of this rig and object.
+    """Return detections with cameras numbered as in the rig, if they fit this rig and object.
 
     Raises:
-        InputError: columns that do not belong together, a camera, fiducial or pixel that does not exist, or a standard
-            deviation that is none.
+        InputError: inconsistent columns, a camera, fiducial or pixel that does not exist, or an invalid standard
+            deviation.
     """
     count = np.shape(detections.uv)[:1]
     for name in ROWS:

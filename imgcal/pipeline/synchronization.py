@@ -1,8 +1,8 @@
-"""Whether cameras expose at moments of their own, as webcams do: what moves fits no rig then, the faster the worse.
+"""Detect cameras that are not synchronized, such as webcams: moving points then fit no rig, the faster the worse.
 
-Each image by itself is sound. Against the other cameras it is shifted as a whole, by as much as the object moved
-between their exposures, this way in one snapshot and that way in the next. Wrong lenses, objects and noise know no
-speed.
+Each image by itself is correct. Relative to the other cameras it is shifted as a whole, by the object's motion between
+their exposures, in varying directions from snapshot to snapshot. Wrong lenses, wrong objects and noise do not depend on
+the speed.
 """
 
 from __future__ import annotations
@@ -21,48 +21,48 @@ from imgcal.estimation import estimate
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
 LEAST_VIEWS = 40
-"""Images with a speed, on which the verdict rests."""
+"""Minimum number of images with a known speed."""
 LEAST_POINTS = 3
 CHANCE = 1e-4
-"""Probability of such a rank correlation between shift and speed where there is none."""
+"""Probability of such a rank correlation between shift and speed by chance."""
 FASTER = 1.4
-"""Times the shift of the slow third of the images, that of the fast third must be at least."""
+"""Minimum ratio of shifts of the fastest third of the images to the slowest third."""
 LEAST_SHIFT = 0.3
-"""Pixels, RMS, that the fast third must be shifted by."""
+"""Minimum RMS shift (px) of the fastest third."""
 NOTICEABLE = 0.25
-"""Pixels of additive noise from which a calibration that succeeded is looked at."""
+"""Additive noise (px) at which a successful calibration is tested, too."""
 
 
 @dataclass(frozen=True)
 class Unsynchronized:
-    """Cameras whose exposures are apart in time."""
+    """Cameras that expose at different times."""
 
-    share: float  # of the time between snapshots, RMS: how far their moments are apart, at least
+    share: float  # RMS difference of exposure times, as a share of the snapshot interval; a lower bound
     still: float  # px, RMS shift of an image of an object at rest
     slow: float  # px, RMS shift of the slow third of the images
     fast: float  # the same of the fast third
     speed: float  # px from snapshot to snapshot, of the fast third
 
     def __str__(self) -> str:
-        """Say it in words."""
+        """Describe it in words."""
         return (
             "the cameras are not synchronized: whole images are shifted against the other cameras, by "
             f"{self.slow:.2g} px (RMS) where the object moves slowly and {self.fast:.2g} px where it moves fast "
             f"({self.speed:.2g} px from snapshot to snapshot), as if exposures were about {self.share:.2g} snapshots "
-            "apart; the error that is left is time, not noise of the images: trigger the cameras together, or hold the "
+            "apart; the remaining error is timing, not image noise: trigger the cameras together, or hold the "
             "object still for each snapshot"
         )
 
     @property
     def values(self) -> dict[str, Any]:
-        """The form that scripts read."""
+        """Values for scripts."""
         return vars(self) | {"note": str(self)}
 
 
 def find_unsynchronized(
     labelled: Associations, rig: CameraRig, obj: CalibrationObject
 ) -> tuple[Unsynchronized, Detections] | None:
-    """Ask labelled snapshots whether the cameras expose together.
+    """Test, with labelled snapshots, whether the cameras expose together.
 
     Args:
         labelled: all snapshots.
@@ -70,8 +70,8 @@ def find_unsynchronized(
         obj: the calibration object.
 
     Returns:
-        What was found, and the detections with as much sigma as their moments add, so that an estimate of them is as
-        uncertain as it should be; None where the cameras are synchronized, or nothing can be said.
+        The finding, and the detections with sigmas increased by the time differences, so that an estimate from them has
+        the right uncertainty; None if the cameras are synchronized, or the data cannot tell.
     """
     if rig.num_cameras < 2:
         return None
@@ -96,20 +96,20 @@ def find_unsynchronized(
         return None
     usual = float(np.median(moved))
     added = found.still**2 + (found.share * torch.where(speed.isfinite(), speed, usual)) ** 2
-    # All points of an image are shifted alike: that of N of them says no more than that of one.
+    # All points of an image are shifted alike, so N of them are worth one.
     return found, _add_variance(labelled, (count * added / 2).numpy())
 
 
 def _verdict(
     speed: NDArray[np.float64], shift: NDArray[np.float64], scatter: NDArray[np.float64]
 ) -> Unsynchronized | None:
-    """Compare images (K,) by speed (px a snapshot), shift (px) and the scatter of their points (px^2)."""
+    """Compare images (K,) by speed (px per snapshot), shift (px) and the scatter of their points (px^2)."""
     grows, order = spearmanr(speed, shift), np.argsort(speed)
     slow, fast = order[: len(order) // 3], order[-(len(order) // 3) :]
     low, high = (float(np.sqrt(np.square(shift[part]).mean())) for part in (slow, fast))
     if not (grows.pvalue < CHANCE and grows.statistic > 0) or high < max(FASTER * low, LEAST_SHIFT):
         return None
-    # Motion blur makes single points worse, and what they have in common less so.
+    # Motion blur adds noise to single points rather than to their common shift.
     if high**2 - low**2 < 2 * float(scatter[fast].mean() - scatter[slow].mean()):
         return None
     before, after = float(np.square(speed[slow]).mean()), float(np.square(speed[fast]).mean())
@@ -119,7 +119,7 @@ def _verdict(
 
 
 def _speed(uv: Tensor, seen: Tensor, before: NDArray[np.int64]) -> Tensor:
-    """How far the points that an image shows move from snapshot to snapshot, RMS: (S, C) pixels, nan = unknown.
+    """RMS motion of the points in an image from snapshot to snapshot: (S, C) pixels, nan = unknown.
 
     `before`: see `Associations.before_rows`.
     """
@@ -132,7 +132,7 @@ def _speed(uv: Tensor, seen: Tensor, before: NDArray[np.int64]) -> Tensor:
 
 
 def _add_variance(labelled: Associations, added: NDArray[np.float64]) -> Detections:
-    """The detections with more variance (px^2 of each axis) by image (S, C) of the used snapshots."""
+    """The detections with added variance (px^2 per axis) by image (S, C) of the used snapshots."""
     detections = labelled.detections
     row = np.full(len(labelled.snapshots), -1)
     row[labelled.used] = np.arange(len(labelled.used))

@@ -1,7 +1,7 @@
-"""Whether a rig and an object are in millimetres, radians and pixels, as all files are to be.
+"""Check that a rig and an object are in millimetres, radians and pixels, as in all files.
 
-Lengths that no camera or marker has say it at once. Where an estimate has failed, images with labels say more: each
-camera by itself knows where it is to the object, and two of them how far they are apart in the object's unit.
+Implausible lengths of cameras or markers show a wrong unit at once. After an estimate has failed, labelled images show
+more: each camera alone determines its pose relative to the object, and two of them their distance in the object's unit.
 """
 
 from __future__ import annotations
@@ -21,34 +21,34 @@ from imgcal.geometry import vector_from_rotation
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
 LEAST_IMAGE, LARGEST_IMAGE = 3.0, 5.0
-"""An object whose image would be smaller (pixels) or larger (times the width of a frame) is of another unit."""
+"""If an object's image is smaller (pixels) or larger (times the image width) than this, its unit is wrong."""
 LEAST_DISTANCE, LEAST_SIZE = 20.0, 2.0
-"""Millimetres: what is nearer and smaller than this is in metres."""
+"""Millimetres: objects nearer and smaller than this are in metres."""
 LARGEST_DISTANCE, LARGEST_SIZE = 200_000.0, 20_000.0
-"""Millimetres: what is farther and larger than this is in micrometres."""
+"""Millimetres: objects farther and larger than this are in micrometres."""
 THOUSAND = 1000.0
 LEAST_FOCAL = 0.05
-"""Of the width of an image; a fisheye that sees all around has 0.16."""
+"""Minimum focal length in image widths; an all-round fisheye lens has 0.16."""
 LENGTHS = {"centimetres": 10.0, "inches": 25.4, "feet": 304.8, "metres": THOUSAND}
 SAME_UNIT = 1.3
-"""Factor by which a ratio of lengths may differ from that of a unit."""
+"""Maximum deviation, as a factor, of a ratio of lengths from that of a unit."""
 LEAST_RATIO, LEAST_LOOKS = 3.0, 6.0
-"""Of lengths, from which on they are of different units: between cameras with labels, and of images without."""
+"""Minimum ratio of lengths for different units: between cameras with labels, and from image sizes without labels."""
 LEAST_TURN = math.radians(20)
-"""By which most pairs of cameras are turned otherwise than a rig says whose rotations are in degrees."""
+"""Minimum rotation error of most pairs of cameras for a rig with rotations in degrees."""
 LEAST_BLOBS = 3
-"""Of a camera whose direction is asked."""
+"""Minimum number of blobs of a camera for a direction."""
 MOST_ASKED = 8
-"""Snapshots that are looked at."""
+"""Maximum number of snapshots to use."""
 
 
 def unit_doubt(rig: CameraRig, obj: CalibrationObject, from_scratch: bool = False) -> str:
-    """Say which of a rig and an object seems to be in another unit; empty where nothing does.
+    """Say which of a rig and an object seems to be in another unit; empty if neither does.
 
-    Nothing is made of it but words: images alone cannot tell.
+    This only makes a message: images alone cannot tell.
 
     Args:
-        rig: its places, or how far it is from the object, say what is plausible.
+        rig: its positions, or distance from the object, define what is plausible.
         obj: the calibration object.
         from_scratch: the rig's lengths are those of the object.
 
@@ -92,13 +92,13 @@ def unit_doubt(rig: CameraRig, obj: CalibrationObject, from_scratch: bool = Fals
 
 
 def image_doubt(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> str:
-    """Say what the images have against the units of a rig and an object; empty where they have nothing.
+    """Say how the images contradict the units of a rig and an object; empty if they do not.
 
-    Meant for an estimate that has failed: an object far from where it is expected looks the same.
+    For use after an estimate has failed: an object far from its expected place looks the same.
 
     Args:
-        detections: blobs. With labels each camera by itself says where it is to the object; without, how large the
-            object looks.
+        detections: blobs. With labels, each camera alone gives its pose relative to the object; without, they show the
+            apparent size of the object.
         rig: the factory calibration.
         obj: the calibration object.
     """
@@ -110,11 +110,11 @@ def image_doubt(detections: Detections, rig: CameraRig, obj: CalibrationObject) 
 def require_units(
     error: RefusedError, detections: Detections, rig: CameraRig, obj: CalibrationObject, from_scratch: bool = False
 ) -> None:
-    """Raise a refusal anew with what lies behind it where values seem to be of another unit.
+    """Replace a refusal by one with the cause if values seem to be in another unit.
 
     Args:
         error: the refusal.
-        detections: the blobs it is about.
+        detections: the blobs that were refused.
         rig: the factory calibration.
         obj: the calibration object.
         from_scratch: the rig's lengths are those of the object.
@@ -129,10 +129,10 @@ def require_units(
 
 @contextmanager
 def require_solvable() -> Iterator[None]:
-    """Refuse where equations cannot be solved within the block: values of a size that belongs to no camera or object.
+    """Refuse if equations in the block cannot be solved: no camera or object has values of such a size.
 
     Raises:
-        RefusedError: instead of a fault of linear algebra.
+        RefusedError: in place of a linear algebra error.
     """
     try:
         yield
@@ -157,7 +157,7 @@ def _focal_doubt(rig: CameraRig) -> str:
 
 
 def _doubt_by_poses(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> str:
-    """Compare where cameras are to each other, by the object in the images of each alone, with what the rig says."""
+    """Compare the cameras' relative poses, by the object in each camera alone, with the rig's."""
     rows = np.flatnonzero((detections.fiducial >= 0) & detections.usable)
     snapshots = np.unique(detections.snapshot[rows])[:MOST_ASKED]
     seen = to_observations(detections.select(rows[np.isin(detections.snapshot[rows], snapshots)]), rig, obj)
@@ -167,10 +167,10 @@ def _doubt_by_poses(detections: Detections, rig: CameraRig, obj: CalibrationObje
         for second in range(first):
             both = known[:, first] & known[:, second]
             if both.any():
-                said = rig.cam_from_rig[second] @ rig.cam_from_rig[first].inverse()
+                in_rig = rig.cam_from_rig[second] @ rig.cam_from_rig[first].inverse()
                 found = placed[both, second] @ placed[both, first].inverse()
-                turns.append(vector_from_rotation(found.rotation @ said.rotation.mT).norm(dim=-1))
-                lengths.append(found.translation.norm(dim=-1) / said.translation.norm().clamp_min(1e-12))
+                turns.append(vector_from_rotation(found.rotation @ in_rig.rotation.mT).norm(dim=-1))
+                lengths.append(found.translation.norm(dim=-1) / in_rig.translation.norm().clamp_min(1e-12))
     if not lengths:
         return ""
     turn, ratio = float(torch.cat(turns).median()), float(torch.cat(lengths).median())
@@ -183,7 +183,7 @@ def _doubt_by_poses(detections: Detections, rig: CameraRig, obj: CalibrationObje
 
 
 def _doubt_by_directions(detections: Detections, rig: CameraRig) -> str:
-    """Ask how far directions in which pairs of cameras see something pass each other: the epipolar constraint."""
+    """Test by how much viewing directions of pairs of cameras miss each other: the epipolar constraint."""
     missed = []
     for snapshot in np.unique(detections.snapshot)[:MOST_ASKED]:
         mine = (detections.snapshot == snapshot) & detections.usable
@@ -209,7 +209,7 @@ def _doubt_by_directions(detections: Detections, rig: CameraRig) -> str:
 
 
 def _doubt_by_size(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> str:
-    """Compare how large the object looks where hardly anything else is seen with how large it should."""
+    """Compare the object's apparent size, in images with hardly anything else, with the expected size."""
     distance = _distance(rig)
     if distance is None:
         return ""
@@ -230,7 +230,7 @@ def _doubt_by_size(detections: Detections, rig: CameraRig, obj: CalibrationObjec
 
 
 def _smaller(ratio: float, least: float) -> str:
-    """Say which of rig (ratio > 1) and object is too small for the other, and as if in which unit."""
+    """Say which of rig (ratio > 1) and object is too small for the other, and which unit would explain it."""
     factor = max(ratio, 1 / max(ratio, 1e-12))
     if factor < least:
         return ""
@@ -244,14 +244,14 @@ def _smaller(ratio: float, least: float) -> str:
 
 
 def _distance(rig: CameraRig) -> float | None:
-    """How far the cameras are from what they look at, in the unit of their positions; None = nobody knows."""
+    """Distance of the cameras from the object, in the unit of their positions; None = unknown."""
     if rig.working_distance is not None:
         return max(float(rig.working_distance), 1e-9)
     if rig.num_cameras < 2:
         return None
     axes, centres = rig.cam_from_rig.rotation[:, 2].double(), rig.positions.double()
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None]
-    # Where the optical axes meet; parallel ones meet far away, held back to some baselines.
+    # Where the optical axes meet; the limit for parallel ones is some baselines away.
     baseline = float(torch.cdist(centres, centres).max())
     weak = 1e-2 * torch.eye(3, dtype=torch.float64)
     middle = centres.mean(0)

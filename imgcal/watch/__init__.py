@@ -1,4 +1,4 @@
-"""Rigs that are watched while they run: exposures come in, snapshots are made of them, what is found goes out."""
+"""Running rigs: exposures come in, are combined into snapshots, and results go out."""
 
 import lazy_loader as lazy
 

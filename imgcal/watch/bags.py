@@ -1,4 +1,4 @@
-"""Recordings of robots: image topics of rosbag2 folders and MCAP files."""
+"""Robot recordings: image topics of rosbag2 folders and MCAP files."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ NANO = 1e-9
 
 @dataclass(frozen=True)
 class Bag:
-    """Grey images of a recording, in the order in which they were recorded; time stamps are those of their headers."""
+    """Grey images of a recording, in the recorded order, with the time stamps of their headers."""
 
     path: Path  # folder with metadata.yaml, or an .mcap file
     rig: CameraRig
-    topics: Mapping[str, str] = field(default_factory=dict)  # camera -> topic; others: the one that names the camera
+    topics: Mapping[str, str] = field(default_factory=dict)  # camera -> topic; default: the topic that names the camera
     live: bool = False
 
     def items(self) -> Iterator[Item]:
-        """Give the images of the cameras' topics."""
+        """Yield the images of the cameras' topics."""
         from rosbags.highlevel import AnyReader  # not in the core
         from rosbags.typesys import Stores, get_typestore
 
@@ -48,11 +48,11 @@ class Bag:
                         yield Unreadable(f"{connection.topic}: {quote(str(error))}", camera)
         except InputError:
             raise
-        except Exception as error:  # a damaged file makes the reader fail in any way
+        except Exception as error:  # the reader may fail in any way on a damaged file
             raise InputError(f"{self.path}: cannot be read: {quote(str(error) or type(error).__name__)}") from error
 
     def _cameras(self, types: Mapping[str, str]) -> dict[str, str]:
-        """Say which camera each topic is of."""
+        """Find the camera of each topic."""
         images = sorted(topic for topic, kind in types.items() if kind == IMAGE)
         there = f"image topics of this recording: {list_names(images) or 'none'}"
         found: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""C3D, the file of markers in 3D that biomechanics exchanges: written frame by frame, readable after a kill.
+"""C3D, the exchange file of biomechanics for 3D markers: written frame by frame, readable after a kill.
 
 Source: The C3D File Format, user guide, https://www.c3d.org: floating-point points, Intel byte order.
 """
@@ -19,30 +19,30 @@ from imgcal.io import write_bytes
 BLOCK = 512  # bytes
 PARAMETERS_AT = 2  # block of the parameters, counted from 1
 INTEL = 84
-MOST_FRAMES = 65_534  # that its header can count: one more means to some readers that it does not say
-MOST_LABELS = 255  # in one parameter; further ones stand in LABELS2, LABELS3, ...
+MOST_FRAMES = 65_534  # limit of its header; to some readers, one more means "unknown"
+MOST_LABELS = 255  # per parameter; more go into LABELS2, LABELS3, ...
 MOST_BYTE, MASKED_CAMERAS = 255, 7
 INVALID = -1.0
 CHARACTER, INTEGER, REAL = -1, 2, 4
 
 
 class C3DFile:
-    """Points in millimetres; the fourth number of each says how surely it is known, and which cameras saw it.
+    """Points in millimetres; the fourth number of each holds its expected error and the cameras that saw it.
 
-    The counts of frames in the file are brought up to date after each call of `append`.
+    `append` updates the frame counts in the file each time.
     """
 
     def __init__(self, path: Path, labels: Sequence[str], rate: float, reach: float) -> None:
-        """Make the file.
+        """Create the file.
 
         Args:
             path: must not exist.
-            labels: of the points.
-            rate: frames a second.
-            reach: mm, that coordinates do not exceed: what a file with integers made from this one can say.
+            labels: names of the points.
+            rate: frames per second.
+            reach: maximum coordinate in mm; it fixes the scale of a file with integers converted from this one.
 
         Raises:
-            OSError: it cannot be made.
+            OSError: the file cannot be created.
         """
         self.frames, self._rate, self._scale = 0, rate, max(reach, 1.0) / 32_000
         self._path, self._points = path, len(labels)
@@ -53,7 +53,7 @@ class C3DFile:
         self._file.flush()
 
     def _begin(self, labels: Sequence[str]) -> bytes:
-        """Make what stands before the frames, and note where its counts stand."""
+        """Make the part before the frames, and note the positions of its counts."""
         parameters, self._counts = _parameters(labels, self._rate, self._scale, self.frames)
         blocks = -(-len(parameters) // BLOCK)
         self._data_at = PARAMETERS_AT + blocks
@@ -66,13 +66,13 @@ class C3DFile:
         return bytes(content)
 
     def widen(self, labels: Sequence[str]) -> None:
-        """Make room for more points, which are missing in all frames until now, in one step.
+        """Add columns for more points, missing in all frames so far, atomically.
 
         Args:
-            labels: of the points that there are, and of further ones.
+            labels: names of the existing points, followed by the new ones.
 
         Raises:
-            InputError: the file cannot be written anew; it is as it was.
+            InputError: the file cannot be rewritten; it is unchanged.
         """
         self._file.seek((self._data_at - 1) * BLOCK)
         given = self._file.read(self.frames * self._points * 16)
@@ -95,11 +95,11 @@ class C3DFile:
 
         Args:
             points: (F, N, 3) mm; NaN = not seen.
-            error: (F, N) mm that a point is expected to be wrong.
-            cameras: (F, N) bits of the first seven cameras that saw it.
+            error: (F, N) mm, expected errors of the points.
+            cameras: (F, N) bits: which of the first seven cameras saw the point.
 
         Raises:
-            OSError: they cannot be written, or there would be more than the format can count.
+            OSError: the frames cannot be written, or exceed the limit of the format.
         """
         if self.frames + len(points) > MOST_FRAMES:
             raise OSError(f"a C3D file holds no more than {MOST_FRAMES:,} frames")
@@ -110,7 +110,7 @@ class C3DFile:
         rows[..., 3] = np.where(valid, 256 * (cameras & (2**MASKED_CAMERAS - 1)) + steps, INVALID)
         self._file.seek((self._data_at - 1) * BLOCK + self.frames * self._points * 16)
         self._file.write(rows.tobytes())
-        self._file.flush()  # the frames are there before they are counted
+        self._file.flush()  # write the frames before their count
         self.frames += len(points)
         self._file.seek(8)
         self._file.write(struct.pack("<H", self.frames))
@@ -128,7 +128,7 @@ class C3DFile:
 
 
 def _parameters(labels: Sequence[str], rate: float, scale: float, frames: int) -> tuple[bytes, dict[str, int]]:
-    """The section of parameters, and where in it the values of each begin."""
+    """The parameter section, and the offsets of the values in it."""
     groups: dict[str, dict[str, tuple[int, tuple[int, ...], bytes]]] = {
         "POINT": {
             "USED": _whole(len(labels)),
@@ -138,7 +138,7 @@ def _parameters(labels: Sequence[str], rate: float, scale: float, frames: int) -
             "FRAMES": _whole(frames),
             "UNITS": _text("mm"),
             **_labels("LABELS", labels),
-            **_labels("DESCRIPTIONS", labels),  # some readers want them
+            **_labels("DESCRIPTIONS", labels),  # some readers need them
         },
         "ANALOG": {"USED": _whole(0), "GEN_SCALE": _real(1.0), "RATE": _real(0.0)},
         "TRIAL": {
@@ -152,19 +152,19 @@ def _parameters(labels: Sequence[str], rate: float, scale: float, frames: int) -
     for number, (group, parameters) in enumerate(groups.items(), start=1):
         section += struct.pack("bb", len(group), -number) + group.encode()
         last = len(section)
-        section += struct.pack("<HB", 3, 0)  # the way to the next entry, no description
+        section += struct.pack("<HB", 3, 0)  # offset of the next entry, no description
         for name, (kind, sizes, values) in parameters.items():
             section += struct.pack("bb", len(name), number) + name.encode()
             last = len(section)
             body = struct.pack("bB", kind, len(sizes)) + bytes(sizes)
             places[f"{group}:{name}"] = last + 2 + len(body)
             section += struct.pack("<H", 2 + len(body) + len(values) + 1) + body + values + b"\0"
-    struct.pack_into("<H", section, last, 0)  # there is no next one
+    struct.pack_into("<H", section, last, 0)  # no next entry
     return bytes(section), places
 
 
 def _whole(*values: int) -> tuple[int, tuple[int, ...], bytes]:
-    """Integers of 16 bits."""
+    """Encode 16-bit integers."""
     sizes = () if len(values) == 1 else (len(values),)
     return INTEGER, sizes, struct.pack(f"<{len(values)}H", *values)
 
@@ -178,13 +178,13 @@ def _text(value: str) -> tuple[int, tuple[int, ...], bytes]:
 
 
 def _texts(values: Sequence[str]) -> tuple[int, tuple[int, ...], bytes]:
-    """Texts of one length, filled up with blanks."""
+    """Encode texts, padded with blanks to one length."""
     width = min(max(map(len, values)), MOST_LABELS)
     cells = [value.encode("ascii", "replace")[:width].ljust(width) for value in values]
     return CHARACTER, (width, len(values)), b"".join(cells)
 
 
 def _labels(name: str, values: Sequence[str]) -> dict[str, tuple[int, tuple[int, ...], bytes]]:
-    """As many parameters as it takes: NAME, NAME2, ..."""
+    """Encode labels in as many parameters as needed: NAME, NAME2, ..."""
     parts = [values[at : at + MOST_LABELS] for at in range(0, len(values), MOST_LABELS)]
     return {f"{name}{number if number > 1 else ''}": _texts(part) for number, part in enumerate(parts, start=1)}

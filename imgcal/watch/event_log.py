@@ -1,4 +1,4 @@
-"""`events.jsonl`: one line an event; what a killed process left of a line is cut off when the file is opened again."""
+"""`events.jsonl`: one line per event; an unfinished line of a killed process is removed on reopening."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from imgcal.errors import InputError
 from imgcal.online import Event
 
 MOST_BYTES = 2**26
-"""Size from which on events go to a new file; the one before is kept, `events.1.jsonl`."""
-LONGEST = 2**16  # bytes of a line, more than any event takes
+"""File size at which a new file is started; the previous one is kept as `events.1.jsonl`."""
+LONGEST = 2**16  # bytes of a line, more than any event needs
 
 
 class EventLog:
     """Appends events to a file.
 
-    A line is written by one call of the system, so all but the last are whole whatever happens to the process. What a
-    kill in the midst of that call, or a power failure, left of the last is cut off when the file is opened again.
+    Each line is written by one system call, so all but the last are whole whatever happens to the process. A last line
+    that is incomplete because of a kill or a power failure is removed when the file is opened again.
     """
 
     def __init__(self, path: Path, most_bytes: int = MOST_BYTES) -> None:
-        """Open or make the file.
+        """Open or create the file.
 
         Raises:
-            InputError: it cannot be written.
+            InputError: the file cannot be written.
         """
         self.path, self._most = path, most_bytes
         self._descriptor: int | None = None  # None = closed
@@ -37,15 +37,15 @@ class EventLog:
 
     @property
     def size(self) -> int | None:
-        """Bytes of the file; None = closed."""
+        """Size of the file in bytes; None = closed."""
         return None if self._descriptor is None else os.fstat(self._descriptor).st_size
 
     def append(self, event: Event) -> None:
         """Write an event.
 
         Raises:
-            OSError: the disk is full, for example; nothing of the line is there then. Or the line is there, and the
-                file, which has become long, could not be put aside.
+            OSError: nothing of the line was written, for example because the disk is full. Or the line was written, but
+                the file, which has become long, could not be renamed.
         """
         if self._descriptor is None:
             raise OSError(f"{self.path}: closed")
@@ -66,7 +66,7 @@ class EventLog:
             raise problem
 
     def _put_aside(self) -> None:
-        """Begin a new file; where that fails, the old one stays open."""
+        """Start a new file; if that fails, the old one stays open."""
         aside = self.path.with_name(f"{self.path.stem}.1{self.path.suffix}")
         os.replace(self.path, aside)
         try:
@@ -86,11 +86,11 @@ class EventLog:
             os.close(descriptor)
 
     def _opened(self) -> int:
-        # Windows would write line ends of its own.
+        # Without it, Windows would convert line ends.
         return os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o644)
 
     def _cut(self) -> None:
-        """Cut off an unfinished line."""
+        """Remove an unfinished line."""
         if not self.path.exists() or not (size := self.path.stat().st_size):
             return
         with open(self.path, "r+b") as file:
@@ -100,12 +100,12 @@ class EventLog:
 
 
 def forget_after(path: Path, size: int) -> None:
-    """Cut off the events that came after the file had a size: those of snapshots that will be worked on once more.
+    """Remove the events after the first `size` bytes: their snapshots will be processed again.
 
-    Nothing happens where the file is shorter: since then, a new one has been begun.
+    Does nothing if the file is shorter: a new one has been started since.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the file cannot be written.
     """
     try:
         if path.is_file() and path.stat().st_size > size >= 0:

@@ -1,4 +1,4 @@
-"""What one camera saw at one moment, as it comes from a source, and whether it can be of this rig at all."""
+"""One camera's data at one moment, as a source gives them, and the check whether they fit the rig."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from imgcal.messages import shorten
 from imgcal.types import CameraRig, limits
 
 MOST_BLOBS = 10_000
-"""Blobs of one camera at one moment."""
+"""Maximum number of blobs of one camera at one moment."""
 LATEST = 1e11
-"""Seconds since the epoch: a time beyond is in other units, nanoseconds for example."""
+"""Seconds since the epoch: later times are in another unit, such as nanoseconds."""
 
 
 @dataclass(frozen=True)
 class CameraBlobs:
-    """Blobs that a camera saw; none of them is an answer, too: the camera is there and sees nothing."""
+    """The blobs that a camera saw. An empty set is data, too: the camera works and sees nothing."""
 
     uv: NDArray[np.float64]  # (K, 2) pixels
     sigma: NDArray[np.float64]  # (K,) pixels, one standard deviation of each axis
@@ -30,7 +30,7 @@ class CameraBlobs:
 
     @classmethod
     def of(cls, uv: Any, sigma: Any = DEFAULT_SIGMA, radius: Any = None) -> CameraBlobs:
-        """Make them of anything that NumPy takes for numbers.
+        """Make them from anything that NumPy accepts as numbers.
 
         Args:
             uv: (K, 2) pixels.
@@ -38,7 +38,7 @@ class CameraBlobs:
             radius: (K,) pixels, or one number for all; None = unknown.
 
         Raises:
-            InputError: other shapes, no numbers, or values that no blob has.
+            InputError: wrong shapes, not numbers, or values that no blob has.
 
         Examples:
             >>> CameraBlobs.of([[100.0, 50.5], [400.0, 300.0]]).sigma
@@ -72,43 +72,43 @@ class Exposure:
     """A frame, or the blobs of one, with its time stamp."""
 
     camera: str
-    time: float  # s since the epoch (or since a recording began), by the camera's clock
+    time: float  # s since the epoch (or the start of a recording), by the camera's clock
     content: Frame | CameraBlobs
-    snapshot: str | None = None  # name of the snapshot that it belongs to, where its source knows; None = by its time
+    snapshot: str | None = None  # name of its snapshot, if the source knows; None = match by time
 
 
 @dataclass(frozen=True)
 class Unreadable:
-    """Something came that is no exposure."""
+    """Input that is not a valid exposure."""
 
     reason: str
-    camera: str | None = None  # None = not known
+    camera: str | None = None  # None = unknown
 
 
 Item = Exposure | Unreadable | None
-"""What a source gives: None = nothing has come for a while."""
+"""What a source yields: None = nothing has come for a while."""
 
 
 class Source(Protocol):
-    """Where exposures come from."""
+    """A source of exposures."""
 
     @property
     def live(self) -> bool:
-        """Whether it goes on by itself: what is not taken in time is dropped. A recording waits."""
+        """Whether it runs by itself, so that data not taken in time are dropped. A recording waits."""
 
     def items(self) -> Iterator[Item]:
-        """Give what comes, and None at least ten times a second while nothing does; ends where the source does."""
+        """Yield the data, and None at least ten times a second while there are none; end with the source."""
 
 
 def check_exposure(exposure: Exposure, rig: CameraRig) -> Exposure:
-    """Compare an exposure with the rig that it is to be of.
+    """Check that an exposure fits the rig.
 
     Raises:
-        InputError: a camera that the rig does not have, no time, a frame of another size, blobs beside the image.
+        InputError: an unknown camera, an invalid time, a frame of another size, or blobs outside the image.
     """
     if exposure.camera not in rig.camera_names:
         raise InputError(f"found camera {shorten(exposure.camera)!r}, expected one of rig {rig.name}")
-    if not 0 <= exposure.time < LATEST:  # nor nan
+    if not 0 <= exposure.time < LATEST:  # also excludes nan
         raise InputError(f"{exposure.camera}: found the time {exposure.time:g}, expected seconds since the epoch")
     width, height = rig.image_size[rig.camera_names.index(exposure.camera)].tolist()
     content = exposure.content

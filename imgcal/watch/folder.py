@@ -1,4 +1,4 @@
-"""A folder that is being filled with frames: `frames/<camera>/<snapshot>.png`, on a disk or a network share."""
+"""A folder that fills with frames: `frames/<camera>/<snapshot>.png`, on a disk or a network share."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ from imgcal.messages import list_names
 from imgcal.types import CameraRig
 from imgcal.watch.exposures import Exposure, Item, Unreadable
 
-TICK = 0.05  # s between two looks
-GIVEN_UP = 2.0  # s during which a file that cannot be read may still be completed
-REMEMBERED = 4096  # names of each camera's files that have been read; earlier ones count as read, too
+TICK = 0.05  # s between two scans
+GIVEN_UP = 2.0  # s for which an unreadable file may still be incomplete
+REMEMBERED = 4096  # names of read files kept per camera; earlier names count as read
 
 
 @dataclass(frozen=True)
 class Folder:
-    """Frames of a capture that grows; the name of a file is that of its snapshot.
+    """Frames of a growing capture; the name of a file is that of its snapshot.
 
-    No file is taken half-written: its size must have been the same at two looks, and the image must be complete. A name
-    that begins with a dot, or ends in no image's suffix (`1.png.part`), is not looked at.
+    No file is read half-written: its size must be equal in two scans, and the image must be complete. Names that begin
+    with a dot or do not end in an image suffix (`1.png.part`) are ignored.
     """
 
     folder: Path  # holds frames/<camera name>/
     rig: CameraRig
-    remove: bool = False  # frames are deleted, once what they have taught is `saved`
-    after: str | None = None  # snapshots up to this one have been seen before
-    until_idle: float | None = None  # s without a new file after which it is complete; None = never
+    remove: bool = False  # delete frames once their result is `saved`
+    after: str | None = None  # snapshots up to this one were processed before
+    until_idle: float | None = None  # s without a new file until it counts as complete; None = never
     _caught_up: threading.Event = field(default_factory=threading.Event, repr=False)
-    _read_files: deque[Path] = field(default_factory=deque, repr=False)  # that are to be deleted
+    _read_files: deque[Path] = field(default_factory=deque, repr=False)  # to be deleted
 
     @property
     def live(self) -> bool:
-        """Whether all has been read that was there at the beginning: that is a recording, which waits."""
+        """Whether all files that existed at the start have been read; those are a recording, which waits."""
         return self._caught_up.is_set()
 
     def known_before(self) -> int:
-        """Count the snapshots that are there and have been seen before."""
+        """Count the existing snapshots that were processed before."""
         if self.after is None:
             return 0
         files = (path for name in self.rig.camera_names for path in (self.folder / "frames" / name).glob("*"))
@@ -51,10 +51,10 @@ class Folder:
         return sum(natural_key(stem) <= natural_key(self.after) for stem in stems)
 
     def delete_read(self, name: str) -> None:
-        """Delete frames that have been read of the snapshots up to one: they will not be needed again.
+        """Delete the frames read so far, up to snapshot `name`; they are not needed again.
 
         Raises:
-            OSError: some of them cannot be deleted; that is tried again the next time, with the latest of them.
+            OSError: some cannot be deleted; the next call tries again.
         """
         failed: list[Path] = []
         problem: OSError | None = None
@@ -73,7 +73,7 @@ class Folder:
             raise problem
 
     def items(self) -> Iterator[Item]:
-        """Give frames snapshot by snapshot, those that are there first, then as they come."""
+        """Yield frames snapshot by snapshot: the existing ones first, then new ones as they come."""
         frames = self.folder / "frames"
         yield from self._check_names(frames)
         cameras = {name: _Camera(frames / name, self.after) for name in self.rig.camera_names}
@@ -87,13 +87,13 @@ class Folder:
                     yield item
                     heard = time.monotonic()
             looks += 1
-            if ready or looks > 1:  # no file is steady at the first look
+            if ready or looks > 1:  # no file is stable in the first scan
                 self._caught_up.set()
             yield None
             time.sleep(TICK)
 
     def _check_names(self, frames: Path) -> Iterator[Item]:
-        """Find what a typing error looks like; the folders of the cameras themselves may come later."""
+        """Report likely typing errors; the cameras' own folders may be created later."""
         if not self.folder.is_dir():
             raise InputError(f"{self.folder}: no such folder, expected one that holds or will hold frames/<camera>/")
         if not frames.is_dir() and any((self.folder / name).exists() for name in self.rig.camera_names):
@@ -108,7 +108,7 @@ class Folder:
                 yield Unreadable(f"{path}: expected {expected}{nearest(path.name, self.rig.camera_names)}")
 
     def _read(self, camera: _Camera, name: str, path: Path, now: float) -> Item:
-        """Read a file whose size is steady; None = its writer may not be done with it."""
+        """Read a file of stable size; None = it may still be incomplete."""
         size = self.rig.image_size[self.rig.camera_names.index(name)].tolist()
         try:
             changed = path.stat().st_mtime
@@ -124,17 +124,17 @@ class Folder:
 
 
 class _Camera:
-    """Which files of a camera are new, and no longer growing."""
+    """The new files of a camera, and whether they still grow."""
 
     def __init__(self, folder: Path, after: str | None) -> None:
         self._folder = folder
         self._floor = None if after is None else natural_key(after)
         self._read: OrderedDict[str, None] = OrderedDict()
-        self._growing: dict[str, tuple[int, int]] = {}  # size and time of change at the last look
-        self._since: dict[str, float] = {}  # when a file was first found steady, yet unreadable
+        self._growing: dict[str, tuple[int, int]] = {}  # size and modification time in the last scan
+        self._since: dict[str, float] = {}  # when a file was first found stable but unreadable
 
     def stable_files(self, now: float) -> list[Path]:
-        """The new files whose size has not changed since the last look."""
+        """New files whose size has not changed since the last scan."""
         steady: list[Path] = []
         growing: dict[str, tuple[int, int]] = {}
         try:
@@ -147,14 +147,14 @@ class _Camera:
                     growing[entry.name] = seen
                     if seen == self._growing.get(entry.name) and state.st_size:
                         steady.append(self._folder / entry.name)
-        except OSError:  # not there yet, or a share that is away for a while
+        except OSError:  # missing, or on a share that is offline for a while
             return []
         self._growing = growing
         self._since = {name: since for name, since in self._since.items() if name in growing}
         return steady
 
     def done(self, path: Path) -> None:
-        """Remember that a file has been dealt with; in bounded memory."""
+        """Mark a file as processed, in bounded memory."""
         self._growing.pop(path.name, None)
         self._since.pop(path.name, None)
         self._read[path.name] = None
@@ -164,7 +164,7 @@ class _Camera:
             self._floor = key if self._floor is None else max(self._floor, key)
 
     def gives_up(self, path: Path, now: float) -> bool:
-        """Tell whether a steady file has been unreadable for so long that it will stay so."""
+        """Tell whether a stable file has been unreadable for too long."""
         if now - self._since.setdefault(path.name, now) < GIVEN_UP:
             return False
         self.done(path)

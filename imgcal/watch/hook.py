@@ -1,4 +1,4 @@
-"""A command of the user that is run for each event, beside the loop and never in its way."""
+"""A user's command that runs for each event, beside the loop and without blocking it."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from imgcal.messages import shorten
 from imgcal.online import Event
 
 MOST_WAITING = 100
-"""Events that wait for the command; more, and the oldest is dropped."""
+"""Maximum number of events that wait for the command; the oldest is dropped beyond that."""
 TIMEOUT = 10.0
-"""Seconds after which the command, and what it has started, is killed."""
+"""Time (s) after which the command and its child processes are killed."""
 
 
 class Hook:
-    """Runs a command for each event, one after the other.
+    """Runs a command for each event, one at a time.
 
-    The event is its standard input, one line of JSON; `IMGCAL_EVENT` (what happened) and `IMGCAL_CAMERA` are in its
-    environment. No shell takes part: nothing in an event can become a command.
+    The event is its standard input, one line of JSON; `IMGCAL_EVENT` (the kind of event) and `IMGCAL_CAMERA` are in its
+    environment. No shell is involved, so nothing in an event can become a command.
     """
 
     def __init__(self, command: str, timeout: float = TIMEOUT) -> None:
@@ -46,18 +46,18 @@ class Hook:
         if not self.command or shutil.which(self.command[0]) is None:
             raise InputError(f"--hook: found {shorten(command)!r}, expected a program that can be run")
         self.dropped = self.failed = 0
-        """Events that were dropped; runs that ended with an error, or not in time."""
+        """Number of dropped events; number of runs that failed or timed out."""
         self.problem: str | None = None
-        """What went wrong the last time; None = nothing did."""
+        """The last problem; None = no problem."""
         self._timeout = timeout
         self._events: deque[Event] = deque()
         self._changed = threading.Condition()
-        self._closing, self._ends = False, float("inf")  # when the last one must have ended, s
+        self._closing, self._ends = False, float("inf")  # s, deadline of the last run
         self._thread = threading.Thread(target=self._work, name="hook", daemon=True)
         self._thread.start()
 
     def notify(self, event: Event) -> None:
-        """Let the command be run; returns at once."""
+        """Queue the command for an event; returns at once."""
         with self._changed:
             self._events.append(event)
             if len(self._events) > MOST_WAITING:
@@ -70,14 +70,14 @@ class Hook:
         self.problem = f"--hook: events were dropped: {why}"
 
     def close(self) -> None:
-        """Let the commands be run that wait, as far as one timeout suffices; the others are dropped."""
+        """Run the waiting commands within one timeout in total; drop the others."""
         with self._changed:
             self._closing, self._ends = True, time.monotonic() + self._timeout
             self._changed.notify()
         self._thread.join(self._timeout + 1)
         with self._changed:
             while self._events:
-                self._drop("the command was not done with them in time")
+                self._drop("the command did not finish in time")
 
     def _work(self) -> None:
         while True:
@@ -88,7 +88,7 @@ class Hook:
                 event = self._events.popleft()
             try:
                 self._run(event)
-            except Exception as error:  # whatever one event holds, the next ones are told
+            except Exception as error:  # a bad event must not stop the next ones
                 self._fail(f"could not be run: {error}")
 
     def _run(self, event: Event) -> None:
@@ -105,13 +105,13 @@ class Hook:
             with contextlib.suppress(ProcessLookupError):
                 if hasattr(os, "killpg"):
                     os.killpg(process.pid, signal.SIGKILL)
-                else:  # Windows: what it has started goes on
+                else:  # Windows: child processes survive
                     process.kill()
             process.communicate()
             self._fail(f"was killed after {timeout:.3g} s")
             return
         finally:
-            if process.stdin is not None:  # still open where there was no time to write
+            if process.stdin is not None:  # still open if there was no time to write
                 with contextlib.suppress(OSError):
                     process.stdin.close()
         if process.returncode:

@@ -1,4 +1,4 @@
-"""Blobs from another process through a pipe: a line of JSON for each camera and moment."""
+"""Blobs from another process through a pipe: one line of JSON per camera and moment."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ AT_ONCE = 2**16  # bytes
 
 @dataclass(frozen=True)
 class JsonLines:
-    """Reads a file descriptor to its end, for example 0, standard input."""
+    """Reads a file descriptor, such as 0 (standard input), to its end."""
 
     descriptor: int
 
     @property
     def live(self) -> bool:
-        """A file waits; what writes into a pipe goes on by itself."""
+        """A file waits; a process that writes into a pipe runs by itself."""
         return not stat.S_ISREG(os.fstat(self.descriptor).st_mode)
 
     def items(self) -> Iterator[Item]:
-        """Read lines; one that is too long is left out, and read over in bounded memory."""
+        """Read lines; a line that is too long is skipped in bounded memory."""
         parts: list[bytes] = []
         length = 0
         chunks = (_chunks_by_thread if sys.platform == "win32" else _chunks)(self.descriptor)
@@ -53,14 +53,14 @@ class JsonLines:
 
 
 def _chunks(descriptor: int) -> Iterator[bytes | None]:
-    """Read what comes, None while nothing does; the last chunk is empty."""
+    """Yield data as they come, and None while there are none; the last chunk is empty."""
     while True:
         ready, _, _ = select.select([descriptor], [], [], TICK)
         yield os.read(descriptor, AT_ONCE) if ready else None
 
 
 def _chunks_by_thread(descriptor: int) -> Iterator[bytes | None]:
-    """Do the same where only sockets can be asked whether they have something: on Windows."""
+    """The same on Windows, where only sockets can be polled."""
     read: queue.Queue[bytes] = queue.Queue(1)
 
     def read_all() -> None:

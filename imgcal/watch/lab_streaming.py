@@ -1,4 +1,4 @@
-"""Blobs through the Lab Streaming Layer (LSL), which takes care of clocks: a line of JSON in a channel of text."""
+"""Blobs through the Lab Streaming Layer (LSL), which synchronizes clocks: lines of JSON in a text channel."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from imgcal.watch.exposures import Item, Unreadable
 from imgcal.watch.wire import LONGEST_LINE, exposure_from_json
 
 TICK = 0.05  # s
-LOOK_EVERY = 1.0  # s, between two looks for new streams
-BUFFERED = 30  # s of samples that LSL keeps
-LONGEST_WAIT = 10.0  # s, for the sender's clock
+LOOK_EVERY = 1.0  # s between two searches for new streams
+BUFFERED = 30  # s of samples buffered by LSL
+LONGEST_WAIT = 10.0  # s to wait for the sender's clock
 NAME = re.compile(r"lsl://([^\s/'\"]{1,200})/?")
 
 
 @dataclass(frozen=True)
 class LabStreaming:
-    """Reads every stream of a name; a sample is the blobs of one camera at one moment, as in `exposure_from_json`.
+    """Reads every stream of a name; a sample holds the blobs of a camera at one moment, as in `exposure_from_json`.
 
-    Where a sample has no `time`, it is that of its LSL stamp, by the clock of this machine: LSL measures how far the
-    sender's is off. Streams need not be there yet, and may go and come back.
+    A sample without `time` gets the time of its LSL stamp, by this machine's clock: LSL measures the offset of the
+    sender's. Streams may start later, and may disappear and return.
     """
 
     address: str  # lsl://NAME
     live: bool = True
 
     def items(self) -> Iterator[Item]:
-        """Receive until the reader stops asking.
+        """Receive until the caller stops.
 
         Raises:
-            InputError: the address is none.
+            InputError: the address is invalid.
         """
         found = NAME.fullmatch(self.address)
         if found is None:
             raise InputError(f"{shorten(self.address)}: expected lsl://NAME, the name of one or more streams")
         try:
             import pylsl  # not in the core
-        except (OSError, RuntimeError) as error:  # its wheels for some machines bring no library along
+        except (OSError, RuntimeError) as error:  # its wheels for some machines lack the library
             raise InputError(f"{self.address}: pylsl finds no liblsl, which has to be installed: {error}") from error
         resolver = pylsl.ContinuousResolver(prop="name", value=found[1])
-        streams: dict[str, _Stream | None] = {}  # by LSL's own number of a stream; None = of no use
+        streams: dict[str, _Stream | None] = {}  # by LSL's stream number; None = unusable
         looked = float("-inf")
         while True:
             if time.monotonic() - looked >= LOOK_EVERY:
@@ -69,14 +69,14 @@ class LabStreaming:
 
 @dataclass
 class _Stream:
-    """An open stream. LSL keeps its samples until the sender's clock is known."""
+    """An open stream. Samples stay in LSL until the sender's clock is known."""
 
     inlet: Any
     opened: float  # s
     ready: bool = False
 
     def is_ready(self, library: Any) -> bool:
-        """Tell whether its samples can be read: the clock is known, or will not be."""
+        """Tell whether to read samples: the clock is known, or the wait for it is over."""
         if not self.ready:
             with contextlib.suppress(*_failures(library)):
                 self.inlet.time_correction(timeout=TICK)
@@ -86,7 +86,7 @@ class _Stream:
 
 
 def _open_new(found: list[Any], streams: dict[str, _Stream | None], library: Any) -> Iterator[Item]:
-    """Open what is new: streams of one text channel."""
+    """Open new streams of one text channel."""
     for one in found:
         if one.uid() in streams:
             continue
@@ -97,17 +97,17 @@ def _open_new(found: list[Any], streams: dict[str, _Stream | None], library: Any
             continue
         inlet = library.StreamInlet(one, max_buflen=BUFFERED, recover=True)
         with contextlib.suppress(*_failures(library)):
-            inlet.open_stream(timeout=TICK)  # goes on by itself
+            inlet.open_stream(timeout=TICK)  # continues in the background
         streams[one.uid()] = _Stream(inlet, time.monotonic())
 
 
 def _failures(library: Any) -> tuple[type[Exception], ...]:
-    """What LSL raises where the other side does not answer."""
+    """The exceptions LSL raises if the other side does not answer."""
     return library.util.TimeoutError, library.util.LostError, RuntimeError
 
 
 def _item(text: str, stamp: float, inlet: Any, library: Any) -> Item:
-    """Blobs, or why they are none."""
+    """Blobs, or why they are unreadable."""
     try:
         if len(text) > LONGEST_LINE:
             raise InputError(f"found {len(text):,} characters, expected a line of JSON")
@@ -119,7 +119,7 @@ def _item(text: str, stamp: float, inlet: Any, library: Any) -> Item:
 
 
 def _add_time(text: str, stamp: float, inlet: Any, library: Any) -> str:
-    """Give a line the time of its stamp, in seconds since 1970."""
+    """Add the time of its stamp to a line, in seconds since 1970."""
     try:
         entry = read_json(text)
         offset = inlet.time_correction(timeout=TICK)

@@ -1,4 +1,4 @@
-"""The loop of a rig that is watched: a snapshot in, what is known out, the state kept for the next start."""
+"""The loop of `imgcal watch`: snapshots in, results out, and the state saved for the next start."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from imgcal.watch.source_reader import SourceReader
 from imgcal.watch.synchronization import TimedSnapshot
 
 EVENTS = "events.jsonl"
-SAVED_EVERY = 1.0  # s between two savings of what is known
-LOOKED_EVERY = 0.1  # s that is waited for a snapshot before other things are seen to
-KEPT_EVERY = 3600.0  # s between two rigs of the history, where nothing happens
+SAVED_EVERY = 1.0  # s between two saves of the state
+LOOKED_EVERY = 0.1  # s to wait for a snapshot before doing other things
+KEPT_EVERY = 3600.0  # s between two rigs of the history without events
 IN_HISTORY = frozenset({"moved", "relearnt", "drift", "factory", "restart"})
-"""Events whose rig is kept."""
+"""Events after which the rig is kept in the history."""
 
 
 class Writable(Protocol):
-    """What is known, as it was at one moment."""
+    """A copy of the state at one moment."""
 
     def write(self, path: Path) -> None:
-        """Write it in one step."""
+        """Write the state atomically."""
 
 
 class Keeper(Protocol):
-    """What keeps the rig calibrated: a `RigKeeper`."""
+    """The part of `RigKeeper` that the loop uses."""
 
     @property
     def factory(self) -> CameraRig:
@@ -47,13 +47,13 @@ class Keeper(Protocol):
     def update(
         self, source: Mapping[str, Frame | None] | Detections, time: float, silent: Collection[str] = ()
     ) -> RigState:
-        """Learn from a snapshot, for which some cameras sent nothing."""
+        """Learn from a snapshot; `silent`: cameras without data."""
 
     def saved(self, progress: dict[str, Any]) -> Writable:
-        """Take down what is known, within milliseconds, and beside it how far its source has been worked on."""
+        """Copy the state, within milliseconds, together with the position in the source."""
 
     def accept_as_factory(self) -> Event:
-        """Make the present rig the factory calibration.
+        """Make the current rig the factory calibration.
 
         Raises:
             RefusedError: no snapshot has come yet.
@@ -61,34 +61,34 @@ class Keeper(Protocol):
 
 
 class Page(Protocol):
-    """Who shows what is known to people."""
+    """A page that shows the state to people."""
 
     def publish(self, state: RigState, frames: Mapping[str, Frame | None] | None) -> None:
-        """Take what is known after a snapshot; must return at once."""
+        """Take the state after a snapshot; must return at once."""
 
     def tell(self, event: Event) -> None:
-        """Take an event that came with no snapshot; must return at once."""
+        """Take an event without a snapshot; must return at once."""
 
     def commands(self) -> Iterable[Any]:
-        """Give what people have asked for since the last call, each with a `name`; must return at once."""
+        """Return the users' commands since the last call, each with a `name`; must return at once."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a source has been worked on."""
+    """Position in a source."""
 
-    time: float  # s, of the last snapshot
-    name: str | None = None  # of it, where its source names snapshots
-    logged: int | None = None  # bytes of events.jsonl until then
-    source: str | None = None  # which one it was; None = not known
-    rate: float | None = None  # snapshots a second, of a source that has no times
+    time: float  # s, time of the last snapshot
+    name: str | None = None  # its name, if the source names snapshots
+    logged: int | None = None  # size of events.jsonl at that time, in bytes
+    source: str | None = None  # identity of the source; None = unknown
+    rate: float | None = None  # snapshots per second of a source without times
 
     @classmethod
     def load(cls, folder: Path) -> Progress | None:
-        """Read it: it stands in the state, so that both are of the same moment; None = there is none.
+        """Read it from the state file, so that both are consistent; None = there is none.
 
         Raises:
-            InputError: the file is none of ours.
+            InputError: the file is not a state file.
         """
         path = folder / STATE
         if not path.is_file():
@@ -105,13 +105,13 @@ class Progress:
                 raise ValueError("the length is no number")
             return cls(time, name, logged, source, None if rate is None else float(rate))
         except (ValueError, TypeError, KeyError, OverflowError) as error:
-            raise InputError(f"{path}: found something else than imgcal watch writes there") from error
+            raise InputError(f"{path}: found something that imgcal watch did not write") from error
 
 
 class Watch:
-    """Works on one snapshot after another. A context manager: leaving it saves what is known.
+    """Processes one snapshot after another. A context manager: leaving it saves the state.
 
-    Whatever cannot be written is counted, said once, and tried again: a full disk does not end the watching.
+    A failure to write is counted, reported once, and retried: a full disk does not stop the loop.
     """
 
     def __init__(
@@ -130,16 +130,16 @@ class Watch:
         """Prepare; nothing is written before it is entered.
 
         Args:
-            keeper: what keeps the rig; not closed here.
+            keeper: keeps the rig calibrated; not closed here.
             folder: for rig.yaml, its history, events.jsonl and the state; must exist.
             hook: command for events.
-            page: shows what is known.
+            page: shows the state.
             told: gets every event.
-            problem: gets what could not be written, once, and what people ask for in vain.
-            saved: gets how far the source has been worked on, once what it taught until then has been written.
-            source: which source it is.
-            rate: snapshots a second, of a source that has no times.
-            poses: get what is known after each snapshot; not closed here.
+            problem: gets each write failure once, and users' commands that failed.
+            saved: gets the position in the source once the results up to there have been written.
+            source: identity of the source.
+            rate: snapshots per second of a source without times.
+            poses: get the state after each snapshot; not closed here.
         """
         self.keeper, self.folder, self.tally = keeper, folder, Tally()
         self.paused = False
@@ -149,7 +149,7 @@ class Watch:
         self._saved = time.monotonic()
         self._progress: Progress | None = None
         self._unsaved = self._hook_told = False
-        self._kept: float | None = None  # s, time of the snapshot whose rig went into the history last
+        self._kept: float | None = None  # s, time of the latest rig in the history
 
     def __enter__(self) -> Watch:
         """Open the outputs.
@@ -163,7 +163,7 @@ class Watch:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Save what is known, and close the outputs."""
+        """Save the state, and close the outputs."""
         self.save()
         self._files.close()
         self._report_problems()
@@ -175,19 +175,19 @@ class Watch:
 
     @property
     def unwritten(self) -> dict[str, str]:
-        """What could not be written the last time that it was tried, by output, and why."""
+        """Outputs whose last write failed, and why."""
         return {output: why for output, why in self._files.problems.items() if output != FRAMES}
 
     def run(self, intake: SourceReader, stopped: threading.Event, looked: Callable[[], None] = lambda: None) -> None:
-        """Work on what comes until it ends, or until told to stop.
+        """Process snapshots until the source ends or `stopped` is set.
 
         Args:
-            intake: gives snapshots.
-            stopped: may be set by anybody.
-            looked: called after each snapshot, and ten times a second while none comes.
+            intake: source of the snapshots.
+            stopped: may be set by any thread.
+            looked: called after each snapshot, and ten times a second while there are none.
 
         Raises:
-            InputError: the source cannot go on.
+            InputError: the source cannot continue.
         """
         while not stopped.is_set():
             snapshot = intake.next(LOOKED_EVERY)
@@ -203,7 +203,7 @@ class Watch:
             looked()
 
     def process(self, snapshot: TimedSnapshot) -> RigState | None:
-        """Work on one snapshot; None = it could not be used, or nothing is to be learnt now."""
+        """Process one snapshot; None = it could not be used, or learning is paused."""
         if self.paused:
             self.tally.paused += 1
             return None
@@ -233,7 +233,7 @@ class Watch:
         return state
 
     def publish_event(self, event: Event) -> None:
-        """Give an event to all who want to know."""
+        """Pass an event to all outputs."""
         self.tally.events[event.kind] += 1
         try:
             self._log.append(event)
@@ -244,11 +244,11 @@ class Watch:
         if self.tally.latest is not None and event.kind in IN_HISTORY:
             self._keep(self.tally.latest)
         if self._page is not None and (self.tally.latest is None or event not in self.tally.latest.events):
-            self._page.tell(event)  # the others come with their state
+            self._page.tell(event)  # other events come with their state
         self._told(event)
 
     def save(self) -> None:
-        """Write what is known: what a start after this moment goes on from."""
+        """Write the state from which the next start resumes."""
         self._saved = time.monotonic()
         state = self.tally.latest
         unsaved = self._unsaved or bool(self._files.problems)
@@ -273,14 +273,14 @@ class Watch:
             self._fail(output, message)
 
     def _report_hook(self) -> None:
-        """Say once that the command fails; how often, the display and the metrics say."""
+        """Report once that the command fails; the display and the metrics show how often."""
         problem = None if self._hook is None or self._hook_told else self._hook.problem
         if problem is not None:
             self._hook_told = True
             self._problem(problem)
 
     def _report_poses(self) -> None:
-        """Say once of each output of poses that it fails."""
+        """Report once for each output of poses that it fails."""
         for output in self._poses:
             if output.problem is not None and not self.tally.problems[output.name]:
                 self._fail(output.name, output.problem)
@@ -291,7 +291,7 @@ class Watch:
             self._problem(message)
 
     def _apply_commands(self) -> None:
-        """Do what people have asked for."""
+        """Execute users' commands."""
         for command in () if self._page is None else self._page.commands():
             if command.name in ("pause", "resume"):
                 self.paused = command.name == "pause"

@@ -1,4 +1,4 @@
-"""Markers in a file for biomechanics: the object's fiducials, or lights, frame by frame, in C3D or TRC."""
+"""Marker files for biomechanics, C3D or TRC: the object's fiducials, or lights, frame by frame."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from imgcal.watch.poses import PoseRecord
 from imgcal.watch.trc_file import TRCFile
 
 TO_FIND_RATE = 32
-"""Snapshots from whose times the rate is found, before anything is written."""
-NEAR_WHOLE = 5e-4  # relative: a rate that is so near a whole number is that
+"""Number of snapshots that determine the rate before anything is written."""
+NEAR_WHOLE = 5e-4  # relative: rates this close to a whole number are rounded
 WRITE_EVERY = 1.0  # s
 LONGEST_GAP = 100_000  # frames
 MOST_LIGHTS = 255
-"""Columns of lights in a file; if there are more lights, the column that was left longest ago is used again."""
+"""Maximum number of columns of lights in a file; beyond that, the column unused for the longest time is reused."""
 
 Frame = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]  # points (N, 3), error (N,), cameras (N,)
 
 
 class MarkerFile:
-    """Writes the fiducials, or the lights, of every snapshot to a new file, evenly spaced in time.
+    """Writes the fiducials, or the lights, of every snapshot to a new file at a constant frame rate.
 
-    Both formats have one rate for the whole file. It is the usual rate of the first snapshots; what is missing
-    in between becomes frames without any marker. A marker that no camera saw is missing in its frame.
+    Both formats have one rate for the whole file: the usual rate of the first snapshots. Missing snapshots become
+    frames without markers. A marker that no camera saw is missing in its frame.
 
-    Lights (`imgcal.load_object("lights")`) are called L1, L2, ... in the order in which they appear. One that is hidden
-    for less than half a second keeps its column; later, it comes back as another one.
+    Lights (`imgcal.load_object("lights")`) are called L1, L2, ... in the order in which they appear. A light hidden for
+    less than half a second keeps its column; after that, it counts as a new one.
     """
 
     def __init__(self, path: Path, rig: CameraRig, obj: CalibrationObject) -> None:
-        """Check that the file can be made.
+        """Check that the file can be created.
 
         Raises:
-            InputError: it exists, or cannot be made.
+            InputError: the file exists, or cannot be created.
         """
         if path.exists():
             raise InputError(f"{path}: exists, expected a new file: a file of markers is one trial")
@@ -53,7 +53,7 @@ class MarkerFile:
         self._reach = 2 * float(centres.abs().max()) + 1000.0
         self._first: list[tuple[float, Frame]] = []  # snapshots before the rate is known, with their times
         self._file: C3DFile | TRCFile | None = None
-        self._width = 0  # columns that the file has
+        self._width = 0  # number of columns in the file
         self._rate, self._latest, self._written = 0.0, 0.0, time.monotonic()
         self._waiting: list[Frame] = []
 
@@ -80,7 +80,7 @@ class MarkerFile:
                 self._file.close()
 
     def _begin(self) -> None:
-        """Make the file, now that the rate is known."""
+        """Create the file, with the known rate."""
         self._rate = usual_rate([moment for moment, _ in self._first])
         if self._path.suffix.lower() == ".c3d":
             self._file = C3DFile(self._path, self._labels, self._rate, self._reach)
@@ -94,11 +94,11 @@ class MarkerFile:
         self._write()
 
     def _add(self, moment: float, frame: Frame) -> None:
-        """Put a frame where it belongs in time: after as many empty ones as were missed."""
+        """Add a frame at its time, after an empty frame for each missed one."""
         steps = max(round((moment - self._latest) * self._rate), 1)
         if steps > LONGEST_GAP:
-            raise OSError(f"a gap of {steps:,} frames: begin a new file")
-        self._waiting += [self._nothing()] * (steps - 1)
+            raise OSError(f"a gap of {steps:,} frames: start a new file")
+        self._waiting += [self._empty_frame()] * (steps - 1)
         self._waiting.append(frame)
         self._latest = moment
 
@@ -109,7 +109,7 @@ class MarkerFile:
             if len(self._labels) > self._width:
                 self._file.widen(self._labels)
                 self._width = len(self._labels)
-            wide = [self._widened(frame) for frame in waiting]
+            wide = [self._widen(frame) for frame in waiting]
             points, error, cameras = (np.stack(part) for part in zip(*wide, strict=True))
             self._file.append(points, error, cameras)
 
@@ -117,7 +117,7 @@ class MarkerFile:
         """The markers that were seen."""
         if record.lights is not None:
             return self._lights(record.time, record.lights)
-        points, error, cameras = self._nothing()
+        points, error, cameras = self._empty_frame()
         if record.pose is None or record.pose.seen is None:
             return points, error, cameras
         found, std = (values.numpy() for values in record.pose.points_rig())
@@ -126,46 +126,46 @@ class MarkerFile:
         return points, error, _camera_bits(record.pose.seen)
 
     def _lights(self, moment: float, lights: LightPoints) -> Frame:
-        """Lights in their columns; one that is the only one that there can be is in the first."""
+        """Put lights into their columns; if only one light is possible, it goes into the first."""
         if self._tracks is None:
             column = np.arange(min(len(lights), 1))
         else:
             column = self._tracks.number_lights(lights.point, moment)
             count = max(len(self._labels), int(column.max(initial=-1)) + 1)
             self._labels = tuple(f"L{number}" for number in range(1, count + 1))
-        points, error, cameras = self._nothing()
+        points, error, cameras = self._empty_frame()
         rows = np.flatnonzero(column >= 0)
         column = column[rows]
         points[column], error[column] = lights.point[rows], lights.error[rows]
         cameras[column] = _camera_bits(lights.seen)[rows]
         return points, error, cameras
 
-    def _nothing(self) -> Frame:
+    def _empty_frame(self) -> Frame:
         count = len(self._labels)
         return np.full((count, 3), np.nan), np.zeros(count), np.zeros(count, dtype=np.int64)
 
-    def _widened(self, frame: Frame) -> Frame:
-        """A frame with all columns that there are by now."""
+    def _widen(self, frame: Frame) -> Frame:
+        """Extend a frame to all present columns."""
         missing = self._width - len(frame[0])
         filled = np.pad(frame[0], ((0, missing), (0, 0)), constant_values=np.nan)
         return filled, np.pad(frame[1], (0, missing)), np.pad(frame[2], (0, missing))
 
 
 def _camera_bits(seen: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Which of the first cameras saw each marker, of (C, N): (N,)."""
+    """Bits of the first cameras that saw each marker, from (C, N): (N,)."""
     bits = 2 ** np.arange(min(len(seen), MASKED_CAMERAS))
     return np.asarray((seen[: len(bits)] * bits[:, None]).sum(0))
 
 
 def marker_labels(obj: CalibrationObject) -> tuple[str, ...]:
-    """Name the markers as the object does, else `M` and the number that tables have; the first of lights `L1`."""
+    """Names of the markers in the object, else `M` and their number in tables; the first light is `L1`."""
     if obj.unknown_markers:
         return ("L1",)
     return obj.fiducial_names or tuple(f"M{label}" for label in obj.labels or range(obj.num_fiducials))
 
 
 def usual_rate(moments: Sequence[float]) -> float:
-    """Frames a second, by the median of the steps between snapshots; whole where it is nearly so.
+    """Frames per second, from the median step between snapshots; rounded if close to a whole number.
 
     Examples:
         >>> usual_rate([0.0, 0.01, 0.02, 0.05, 0.06]), usual_rate([5.0])

@@ -1,4 +1,4 @@
-"""What a running rig is like, in Prometheus' format, read when somebody asks: the loop does nothing for it."""
+"""Metrics of a running rig in Prometheus' format, computed on request: the loop does nothing for them."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ if TYPE_CHECKING:
 Application = Callable[[dict[str, Any], Callable[..., Any]], Iterable[bytes]]
 """Of WSGI."""
 BUCKETS = (0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 5.0)
-"""Seconds of an update."""
+"""Upper bounds (s) of the buckets of update times."""
 
 
 STAMPS = 100
-"""Time stamps of which the mean is formed."""
+"""Number of time stamps in the running mean."""
 
 
 class Tally:
-    """What the loop counts; one thread writes, others may read."""
+    """Counters of the loop; one thread writes them, others may read them."""
 
     def __init__(self) -> None:
         self.snapshots = self.refused = self.unusable = self.paused = 0
-        """Snapshots worked on, those of them that taught nothing or could not be used; those that came while paused."""
+        """Snapshots processed; those that taught nothing; those that were unusable; those that came while paused."""
         self.events: Counter[str] = Counter()
         self.problems: Counter[str] = Counter()
-        """Failures to write, by what was to be written."""
+        """Write failures, by output."""
         self.latest: RigState | None = None
         self.stamps: dict[str, float] = {}
-        """By camera: how far its time stamps are after those of its snapshots, in the mean of the latest; seconds."""
+        """By camera: mean delay of its latest time stamps after those of their snapshots; seconds."""
         self.seconds = 0.0
-        """Spent on updates, all together."""
+        """Total time of updates."""
         self.took = [0] * (len(BUCKETS) + 1)
-        """Updates that took up to each of `BUCKETS`, and longer."""
+        """Numbers of updates that took up to each of `BUCKETS`, and longer."""
 
     @property
     def learnt(self) -> int:
-        """Snapshots that taught something."""
+        """Number of snapshots that taught something."""
         return self.snapshots - self.refused - self.unusable
 
     def count_time_stamp(self, camera: str, offset: float) -> None:
@@ -56,23 +56,23 @@ class Tally:
         self.stamps[camera] = before + (offset - before) / STAMPS
 
     def update_took(self, seconds: float) -> None:
-        """Count the time of an update."""
+        """Count an update's time."""
         self.seconds += seconds
         self.took[bisect.bisect_left(BUCKETS, seconds)] += 1
 
 
 class Metrics:
-    """Serves them by HTTP. A context manager: leaving it ends the server."""
+    """Serves the metrics by HTTP. A context manager: leaving it stops the server."""
 
     def __init__(self, tally: Tally, intake: SourceReader, hook: Hook | None, address: tuple[str, int]) -> None:
-        """Say what to serve, and where: 127.0.0.1 unless others are to read it."""
+        """Prepare to serve; the address should be 127.0.0.1 unless other machines are to read the metrics."""
         self._tally, self._intake, self._hook, self._address = tally, intake, hook, address
 
     def __enter__(self) -> Metrics:
-        """Begin to serve.
+        """Start the server.
 
         Raises:
-            InputError: the address is taken, or none of this machine's.
+            InputError: the address is in use, or not one of this machine's.
         """
         from prometheus_client import CollectorRegistry, make_wsgi_app, start_http_server  # not in the core
 
@@ -84,40 +84,40 @@ class Metrics:
             self._server.set_app(_guard(make_wsgi_app(registry), Gate(Address(host, port), "")))
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
-            raise InputError(f"--metrics: {host}:{port} cannot be listened on: {reason}") from error
+            raise InputError(f"--metrics: {host}:{port} cannot be used: {reason}") from error
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the server."""
+        """Stop the server."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
 
     @property
     def port(self) -> int:
-        """Where it listens; of 0, which was chosen."""
+        """The port; of port 0, the one that was chosen."""
         return int(self._server.server_port)
 
     def collect(self) -> Iterator[Metric]:
-        """Give the metrics as they are now."""
+        """Return the current metrics."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 
         tally, intake = self._tally, self._intake
-        yield _counter("snapshots", "Snapshots worked on", tally.snapshots)
+        yield _counter("snapshots", "Snapshots processed", tally.snapshots)
         yield _counter("snapshots_refused", "Snapshots that taught nothing", tally.refused)
-        yield _counter("snapshots_unusable", "Snapshots that were no input", tally.unusable)
-        yield _counter("snapshots_dropped", "Snapshots that came faster than they were worked on", intake.dropped)
+        yield _counter("snapshots_unusable", "Unusable snapshots", tally.unusable)
+        yield _counter("snapshots_dropped", "Snapshots dropped because processing was too slow", intake.dropped)
         yield _counter("snapshots_paused", "Snapshots that came while paused", tally.paused)
-        yield _gauge("snapshots_waiting", "Snapshots that wait to be worked on", intake.waiting)
-        yield _counter("clock_leaps", "Leaps of all cameras' clocks together", intake.synchronizer.leaps)
+        yield _gauge("snapshots_waiting", "Snapshots waiting to be processed", intake.waiting)
+        yield _counter("clock_leaps", "Joint jumps of all cameras' clocks", intake.synchronizer.leaps)
         for kind, counts in intake.synchronizer.counts.items():
             family = CounterMetricFamily(f"imgcal_exposures_{kind}", f"Exposures {kind}", labels=["camera"])
             for camera, count in list(counts.items()):
                 family.add_metric([camera], count)
             yield family
-        unreadable = CounterMetricFamily("imgcal_exposures_unreadable", "What could not be read", labels=["camera"])
+        unreadable = CounterMetricFamily("imgcal_exposures_unreadable", "Unreadable exposures", labels=["camera"])
         for camera, count in list(intake.unreadable.items()):
             unreadable.add_metric([camera], count)
         yield unreadable
@@ -125,12 +125,12 @@ class Metrics:
         for kind in EVENT_KINDS:
             events.add_metric([kind], tally.events[kind])
         yield events
-        problems = CounterMetricFamily("imgcal_write_failures", "Failures to write", labels=["output"])
+        problems = CounterMetricFamily("imgcal_write_failures", "Write failures", labels=["output"])
         for output, count in list(tally.problems.items()):
             problems.add_metric([output], count)
         yield problems
         if self._hook is not None:
-            yield _counter("hook_dropped", "Events that the hook command never got", self._hook.dropped)
+            yield _counter("hook_dropped", "Events dropped before the hook command got them", self._hook.dropped)
             yield _counter("hook_failed", "Runs of the hook command that failed", self._hook.failed)
         took = HistogramMetricFamily("imgcal_update_seconds", "Time of an update")
         total, buckets = 0, []
@@ -150,7 +150,7 @@ class Metrics:
 
 
 def _camera_values(state: RigState) -> Iterator[Metric]:
-    """What is known of each camera."""
+    """Values of each camera."""
     from prometheus_client.core import GaugeMetricFamily
 
     names = state.factory.camera_names
@@ -161,11 +161,11 @@ def _camera_values(state: RigState) -> Iterator[Metric]:
     yield health
     columns: tuple[tuple[str, str, Any], ...] = (
         ("residual_pixels", "RMS residual of the latest snapshot", state.residual),
-        ("clock_offset_seconds", "How much later each camera exposes than most, by the motion", state.clock_offset),
-        ("clock_offset_sigma_seconds", "One standard deviation of it", state.clock_offset_sigma),
-        ("noise_pixels", "Noise of each camera's blobs beyond what they say of themselves", state.noise),
-        ("shake_pixels", "By how much each camera trembles, one standard deviation", state.shake),
-        ("rotation_radians", "Turn of each camera since the factory calibration", state.moved[:, :3].norm(dim=1)),
+        ("clock_offset_seconds", "Delay of each camera relative to most, from the motion", state.clock_offset),
+        ("clock_offset_sigma_seconds", "One standard deviation of the delay", state.clock_offset_sigma),
+        ("noise_pixels", "Noise of each camera's blobs beyond their own sigmas", state.noise),
+        ("shake_pixels", "Shake of each camera, one standard deviation", state.shake),
+        ("rotation_radians", "Rotation of each camera since the factory calibration", state.moved[:, :3].norm(dim=1)),
         ("position_millimetres", "Shift of each camera", state.moved[:, 3:6].norm(dim=1)),
         ("focal_length_pixels", "Change of the focal length", state.moved[:, 6:8].abs().amax(1)),
     )
@@ -178,7 +178,7 @@ def _camera_values(state: RigState) -> Iterator[Metric]:
 
 
 def _guard(serve: Application, gate: Gate) -> Application:
-    """Serve only who asks for this machine by its own name: another site's may be pointed here (DNS rebinding)."""
+    """Serve only requests that use this machine's own name; other names may be pointed here (DNS rebinding)."""
 
     def answer(environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
         if gate.knows(environ.get("HTTP_HOST", "")):

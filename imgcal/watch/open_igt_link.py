@@ -1,4 +1,4 @@
-"""Poses for 3D Slicer, PLUS and others that speak OpenIGTLink: a server that sends TRANSFORM and STATUS.
+"""Poses for 3D Slicer, PLUS and other OpenIGTLink clients: a server that sends TRANSFORM and STATUS.
 
 Source: the OpenIGTLink protocol, version 1 of its header: http://openigtlink.org/developers/spec
 """
@@ -17,19 +17,19 @@ from imgcal.messages import shorten
 from imgcal.watch.poses import PoseRecord, PoseStatus
 
 PORT = 18944
-"""Where OpenIGTLink usually listens."""
+"""Usual port of OpenIGTLink."""
 VERSION = 1
-HEADER = struct.Struct(">H12s20sQQQ")  # version, type, device, time, bytes of the body, its checksum
+HEADER = struct.Struct(">H12s20sQQQ")  # version, type, device, time, body size in bytes, checksum
 TRANSFORM = struct.Struct(">12f")  # columns of the rotation, translation
-STATUS = struct.Struct(">Hq20s")  # code, subcode, name; a text that ends with a zero follows
+STATUS = struct.Struct(">Hq20s")  # code, subcode, name; followed by a zero-terminated text
 CODES: dict[PoseStatus, int] = {"ok": 1, "degraded": 13, "no_object": 16}
 """STATUS codes: OK, device not ready, device not present."""
 TRANSFORM_NAME, STATUS_NAME = "ObjectToRig", "Rig"
 MOST_CLIENTS = 16
 MOST_PENDING = 2**16
-"""Bytes that wait for a client; until it has read them, it misses poses."""
+"""Maximum number of bytes that wait for a client; it misses poses until it has read them."""
 STALLED = 10.0
-"""Seconds after which a client that reads nothing is disconnected."""
+"""Time (s) after which a client that does not read is disconnected."""
 STATUS_EVERY = 1.0  # s
 POLYNOMIAL, WHOLE = 0x42F0E1EBA9EA3693, 2**64 - 1
 
@@ -58,14 +58,14 @@ def checksum(body: bytes) -> int:
 
 
 def message(kind: str, device: str, seconds: float, body: bytes) -> bytes:
-    """Put a message together; its time is in seconds since 1970."""
+    """Assemble a message; `seconds` since 1970."""
     stamp = int(seconds) << 32 | int(seconds % 1 * 2**32)
     header = HEADER.pack(VERSION, kind.encode(), device.encode("ascii", "replace"), stamp, len(body), checksum(body))
     return header + body
 
 
 def transform_message(record: PoseRecord) -> bytes:
-    """The pose of a record that has one, as object to rig, mm."""
+    """A record's pose as object to rig, mm; the record must have one."""
     assert record.pose is not None
     matrix = record.pose.matrix()
     body = TRANSFORM.pack(*matrix[:3, :3].T.flatten(), *matrix[:3, 3])
@@ -73,17 +73,17 @@ def transform_message(record: PoseRecord) -> bytes:
 
 
 def status_message(record: PoseRecord) -> bytes:
-    """How the rig is: a code, the number of cameras that are not calibrated, and a sentence with the accuracy."""
+    """The state of the rig: a code, the number of uncalibrated cameras, and a sentence with the accuracy."""
     text = f"{record.message}; {record.accuracy()}"
     body = STATUS.pack(CODES[record.status], record.not_ok, record.status.encode())
     return message("STATUS", STATUS_NAME, record.time, body + text.encode("ascii", "replace") + b"\0")
 
 
 def listening_address(text: str) -> tuple[str, int]:
-    """Read `igtl://[HOST][:PORT]` or `igtl://PORT`; the host is this machine alone if it is not given.
+    """Parse `igtl://[HOST][:PORT]` or `igtl://PORT`; the default host is this machine only.
 
     Raises:
-        InputError: something else.
+        InputError: any other format.
 
     Examples:
         >>> listening_address("igtl://"), listening_address("igtl://0.0.0.0:9000"), listening_address("igtl://9000")
@@ -100,20 +100,20 @@ def listening_address(text: str) -> tuple[str, int]:
 class _Client:
     connection: socket.socket
     pending: bytearray = field(default_factory=bytearray)
-    moved: float = field(default_factory=time.monotonic)  # s, when it read something last
+    moved: float = field(default_factory=time.monotonic)  # s, time of its last read
 
 
 class OpenIGTLink:
-    """Serves any number of clients; sockets never block, a client that does not read misses poses, then is let go."""
+    """Serves any number of clients without blocking; a client that does not read misses poses, then is disconnected."""
 
     def __init__(self, host: str = "127.0.0.1", port: int = PORT, stalled: float = STALLED) -> None:
-        """Listen; port 0 takes any that is free.
+        """Listen; port 0 takes any free one.
 
         Raises:
-            InputError: the address is taken, or is none of this machine's.
+            InputError: the address is in use, or not one of this machine's.
         """
         self._stalled, self._clients = stalled, list[_Client]()
-        self._said: tuple[PoseStatus, float] | None = None  # and when, s
+        self._said: tuple[PoseStatus, float] | None = None  # last status, and its time in s
         self._listening = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
         try:
             self._listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -127,7 +127,7 @@ class OpenIGTLink:
         self.port = int(self._listening.getsockname()[1])
 
     def send(self, record: PoseRecord) -> None:
-        """See `PoseSink`: STATUS when it changes and once a second, also to those who have just come."""
+        """See `PoseSink`: send STATUS when it changes, once a second, and to new clients."""
         came = self._accept()
         now = time.monotonic()
         due = self._said is None or self._said[0] != record.status or now - self._said[1] >= STATUS_EVERY
@@ -147,21 +147,21 @@ class OpenIGTLink:
 
     def _accept(self) -> list[_Client]:
         came = []
-        with contextlib.suppress(OSError):  # nobody waits
+        with contextlib.suppress(OSError):  # no pending connection
             while True:
                 connection, _ = self._listening.accept()
                 if len(self._clients) >= MOST_CLIENTS:
                     connection.close()
                     continue
                 connection.setblocking(False)
-                connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MOST_PENDING)  # an old pose is of no use
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MOST_PENDING)  # an old pose is useless
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 came.append(_Client(connection))
                 self._clients.append(came[-1])
         return came
 
     def _give(self, client: _Client, data: bytes, now: float) -> None:
-        """Send to a client what it takes now; the rest waits, unless too much does."""
+        """Send a client what it accepts now; the rest waits unless there is too much."""
         if len(client.pending) + len(data) <= MOST_PENDING:
             client.pending += data
         try:
@@ -179,7 +179,7 @@ class OpenIGTLink:
 
     @staticmethod
     def _has_left(client: _Client) -> bool:
-        """Read over what a client says: nothing that it can ask for is known here."""
+        """Skip what a client sends: no requests are supported."""
         with contextlib.suppress(BlockingIOError):
             while data := client.connection.recv(MOST_PENDING):
                 if len(data) < MOST_PENDING:

@@ -1,4 +1,4 @@
-"""Poses in a file: a table, or a line of JSON each."""
+"""Poses in a file: a table, or lines of JSON."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from imgcal.messages import shorten
 from imgcal.watch.poses import COLUMNS, PoseRecord
 
 SUFFIXES = (".csv", ".jsonl")
-LONGEST = 2**16  # bytes of a line, more than any pose takes
+LONGEST = 2**16  # bytes of a line, more than any pose needs
 
 
 class PoseFile:
     """Appends poses to a table (.csv) or to lines of JSON (.jsonl).
 
-    A line is written by one call of the system. What a killed process left of the last one is cut off when the file is
-    opened again.
+    Each line is written by one system call. An unfinished line of a killed process is removed when the file is opened
+    again.
     """
 
     def __init__(self, path: Path) -> None:
-        """Open or make the file.
+        """Open or create the file.
 
         Raises:
-            InputError: it cannot be written, ends in another suffix, or is a table of something else.
+            InputError: it cannot be written, has another suffix, or is a table of something else.
         """
         if path.suffix.lower() not in SUFFIXES:
             raise InputError(f"{path}: expected a name that ends in .csv, .jsonl, .c3d or .trc")
@@ -34,7 +34,7 @@ class PoseFile:
             if path.exists() and path.stat().st_size:
                 self._check(header)
                 _cut(path)
-            # Windows would write line ends of its own.
+            # Without it, Windows would convert line ends.
             flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0)
             self._descriptor: int | None = os.open(path, flags, 0o644)
             if self._table and not os.fstat(self._descriptor).st_size:
@@ -71,7 +71,7 @@ class PoseFile:
 
 
 def _cut(path: Path) -> None:
-    """Cut off an unfinished line."""
+    """Remove an unfinished line."""
     with open(path, "r+b") as file:
         size = path.stat().st_size
         file.seek(max(size - LONGEST, 0))

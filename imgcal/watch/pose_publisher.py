@@ -1,4 +1,4 @@
-"""Poses for other processes through ZeroMQ: who listens too slowly misses some, and nobody waits."""
+"""Poses for other processes through ZeroMQ: slow listeners miss poses and never block the rig."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from imgcal.messages import shorten
 from imgcal.watch.poses import PoseRecord
 from imgcal.watch.zeromq import ADDRESS
 
-QUEUED = 1000  # messages kept for a subscriber that is slow
+QUEUED = 1000  # messages kept for a slow subscriber
 
 
 class PosePublisher:
-    """Publishes a line of JSON a snapshot, as `PoseRecord.to_json` writes it."""
+    """Publishes a line of JSON per snapshot, as written by `PoseRecord.to_json`."""
 
     def __init__(self, address: str) -> None:
         """Bind to tcp://host:port or ipc://path.
 
         Raises:
-            InputError: the address is taken, or is none.
+            InputError: the address is in use, or invalid.
         """
         import zmq  # not in the core
 
@@ -36,7 +36,7 @@ class PosePublisher:
 
     def send(self, record: PoseRecord) -> None:
         """See `PoseSink`."""
-        self._socket.send(record.to_json().encode(errors="replace"))  # a publisher drops, and never blocks
+        self._socket.send(record.to_json().encode(errors="replace"))  # a publisher drops messages, and never blocks
 
     def close(self) -> None:
         """See `PoseSink`."""

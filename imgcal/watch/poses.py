@@ -1,4 +1,4 @@
-"""Where the object is, snapshot by snapshot, for whoever wants it: `PoseRecord`, and `Poses` that hands them on."""
+"""The object's pose in each snapshot (`PoseRecord`), and its delivery to a sink (`Poses`)."""
 
 from __future__ import annotations
 
@@ -15,22 +15,23 @@ from imgcal.online import LightPoints, ObjectPose, RigState
 
 PoseStatus = Literal["ok", "degraded", "no_object"]
 MOST_WAITING = 128
-"""Snapshots that wait for a sink; more, and the oldest is dropped."""
+"""Maximum number of snapshots that wait for a sink; the oldest is dropped beyond that."""
 LONGEST_END = 5.0
-"""Seconds that a sink has at the end for what waits."""
+"""Time (s) a sink has at the end for waiting poses."""
 COVARIANCE = tuple((i, j) for i in range(6) for j in range(i, 6))
 AXES = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")
 COLUMNS = (
     "time", "snapshot", "status", "markers", "cameras", *AXES, *(f"cov_{i}{j}" for i, j in COVARIANCE),
 )  # fmt: skip
-"""Of a table of poses: rotation vector and translation of rig_from_object, upper triangle of their covariance."""
+"""Columns of a table of poses: rotation vector and translation of rig_from_object, upper triangle of the covariance."""
 
 
 @dataclass(frozen=True)
 class PoseRecord:
-    """What a snapshot says of where the object is.
+    """The object's pose in a snapshot.
 
-    Status: `ok`, all cameras are calibrated; `degraded`, some are not (lost, in doubt, being learnt again), the pose is
+    Status: `ok`, all cameras are calibrated; `degraded`, some are not (lost, in doubt, being relearnt), and the pose
+        comes
     from the others; `no_object`, there is no pose.
     """
 
@@ -39,12 +40,12 @@ class PoseRecord:
     pose: ObjectPose | None
     status: PoseStatus
     message: str  # why there is no pose; otherwise the state of the rig in a sentence
-    not_ok: int = 0  # cameras that are not calibrated
-    lights: LightPoints | None = None  # where no object is known, and lights were found
+    not_ok: int = 0  # number of uncalibrated cameras
+    lights: LightPoints | None = None  # lights, if they are unknown ones
 
     @classmethod
     def of(cls, state: RigState) -> PoseRecord:
-        """Take it out of what is known after a snapshot."""
+        """Make the record from the state after a snapshot."""
         pose, lights = state.object_pose, state.light_points
         not_ok = sum(health != "ok" for health in state.cameras.values())
         if lights is not None and len(lights):
@@ -56,7 +57,7 @@ class PoseRecord:
         return cls(state.time, state.snapshot, pose, "degraded" if not_ok else "ok", state.sentence, not_ok)
 
     def to_json(self) -> str:
-        """Write a line of JSON: the pose as (4, 4), mm; its covariance (6, 6), rad and mm; null where there is none."""
+        """Write a line of JSON: the pose as (4, 4), mm; its covariance (6, 6), rad and mm; null if there is none."""
         values: dict[str, Any] = {
             "time": self.time,
             "snapshot": self.snapshot,
@@ -87,7 +88,7 @@ class PoseRecord:
         return f"{first},{self.pose.markers},{self.pose.cameras}," + ",".join(f"{number:.9g}" for number in numbers)
 
     def accuracy(self) -> str:
-        """Say for people how surely the pose is known.
+        """Describe the accuracy of the pose for people.
 
         Examples:
             >>> PoseRecord(0.0, 0, None, "no_object", "nothing is seen").accuracy()
@@ -106,32 +107,32 @@ class PoseSink(Protocol):
         """Take the pose of a snapshot.
 
         Raises:
-            OSError: it cannot be taken now; the next one may.
+            OSError: this pose cannot be taken now; the next one may.
         """
 
     def close(self) -> None:
-        """Take no more."""
+        """Close the sink."""
 
 
 class Poses:
-    """Hands the pose of every snapshot to a sink. A context manager: leaving it gives the sink a while for what waits.
+    """Passes every snapshot's pose to a sink. A context manager: on leaving, waiting poses get some time.
 
-    Covariances are computed, and the sink is served, by a thread of its own: neither ever holds up who publishes.
+    A separate thread computes covariances and serves the sink, so that neither blocks the caller.
     """
 
     def __init__(self, name: str, sink: PoseSink, most_waiting: int = MOST_WAITING, end: float = LONGEST_END) -> None:
-        """Begin.
+        """Start the thread.
 
         Args:
             name: of the sink, for messages.
-            sink: is closed with it.
-            most_waiting: snapshots.
-            end: seconds that it has at the end.
+            sink: closed together with this object.
+            most_waiting: maximum number of waiting snapshots.
+            end: seconds for waiting poses at the end.
         """
         self.name, self.dropped, self.failed = name, 0, 0
-        """Snapshots that could not be waited for, or written."""
+        """Number of snapshots that were dropped, or could not be written."""
         self.problem: str | None = None
-        """What went wrong first; None = nothing did."""
+        """The first problem; None = no problem."""
         self._sink, self._most, self._end = sink, most_waiting, end
         self._waiting: deque[RigState] = deque()
         self._changed, self._closing = threading.Condition(), False
@@ -140,17 +141,17 @@ class Poses:
 
     @property
     def lost(self) -> int:
-        """Poses that the sink did not get."""
+        """Number of poses that the sink did not get."""
         return self.dropped + self.failed
 
     def publish(self, state: RigState) -> None:
-        """Take what is known after a snapshot; returns at once."""
+        """Take the state after a snapshot; returns at once."""
         with self._changed:
             self._waiting.append(state)
             if len(self._waiting) > self._most:
                 self._waiting.popleft()
                 self.dropped += 1
-                self._fail(f"poses are dropped: more than {self._most} wait")
+                self._fail(f"poses were dropped: more than {self._most} were waiting")
             self._changed.notify()
 
     def __enter__(self) -> Poses:
@@ -160,7 +161,7 @@ class Poses:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Let the sink take what waits, for a while, and close it."""
+        """Let the sink take the waiting poses for a while, and close it."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -169,7 +170,7 @@ class Poses:
             with self._changed:
                 self.dropped += len(self._waiting)
                 self._waiting.clear()
-                self._fail("poses are dropped: they could not be written in time")
+                self._fail("poses were dropped: they could not be written in time")
 
     def _work(self) -> None:
         while True:
@@ -180,7 +181,7 @@ class Poses:
                 state = self._waiting.popleft()
             try:
                 self._sink.send(PoseRecord.of(state))
-            except Exception as error:  # whatever is wrong with one pose, the next ones are sent
+            except Exception as error:  # a bad pose must not stop the next ones
                 self.failed += 1
                 self._fail(f"cannot be written: {error}")
         try:

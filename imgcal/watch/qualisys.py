@@ -1,4 +1,4 @@
-"""Markers of Qualisys cameras from QTM as it measures: the 2D component of its real-time protocol, over TCP.
+"""Markers of Qualisys cameras from a running QTM: the 2D component of its real-time protocol, over TCP.
 
 Source: QTM Real-time Server Protocol Documentation, version 1.20: https://docs.qualisys.com/qtm-rt-protocol/
 """
@@ -26,9 +26,9 @@ from imgcal.types import CameraRig
 from imgcal.watch.exposures import MOST_BLOBS, CameraBlobs, Exposure, Item, Unreadable
 
 PORT = 22223
-"""QTM's base port plus one: numbers come with their low byte first."""
+"""QTM's base port plus one: little-endian numbers."""
 TICK = 0.05  # s
-LARGEST = 2**24  # bytes of a packet
+LARGEST = 2**24  # maximum bytes of a packet
 AT_ONCE = 2**16  # bytes
 VERSION = "1.20"
 COMMANDS = (f"Version {VERSION}", "GetParameters General", "StreamFrames AllFrames 2D")
@@ -36,44 +36,44 @@ ERROR, COMMAND, XML, DATA = 0, 1, 2, 3
 TWO_DIMENSIONAL = 7
 HEADER, DATA_HEADER, COMPONENT, CAMERAS, CAMERA = map(struct.Struct, ("<II", "<qII", "<II", "<Ihh", "<iB"))
 MARKER = np.dtype([("x", "<i4"), ("y", "<i4"), ("width", "<u2"), ("height", "<u2")])
-UNITS = 64  # of a pixel, where the image is a part of the sensor
-LEAST_UNITS = 8.0  # and where it is all of it
+UNITS = 64  # units per pixel if the image is a part of the sensor
+LEAST_UNITS = 8.0  # the same if it is the whole sensor
 BEFORE_NOW = 5.0
-"""Seconds that time stamps may be from what the clock says after a new connection, or leap ahead of it; more, and they
-began anew."""
+"""Seconds that time stamps may be off the clock after a new connection, or jump ahead of it; if they are off by more,
+they have restarted."""
 LEAST_STEP = 0.006
-"""Seconds between the last frame and one whose time stamps begin anew: they are no single snapshot."""
+"""Minimum gap (s) between the last frame and one with restarted time stamps: they are not the same snapshot."""
 
 
 class _Lost(Exception):
-    """The connection is of no use any more."""
+    """The connection is unusable."""
 
 
 @dataclass(frozen=True)
 class _Camera:
-    """How a camera's markers become pixels of the rig."""
+    """Converts a camera's markers to pixels of the rig."""
 
-    name: str  # in the rig
-    unit: float  # of its coordinates, in a pixel
-    corner: tuple[float, float]  # pixels, of the image in the sensor
+    name: str  # name in the rig
+    unit: float  # units of its coordinates per pixel
+    corner: tuple[float, float]  # pixels, position of the image on the sensor
 
 
 @dataclass
 class _Clock:
-    """Seconds since 1970 of time stamps that begin anywhere, and begin anew with each measurement.
+    """Converts time stamps with an arbitrary zero, which restarts with each measurement, to seconds since 1970.
 
-    A time stamp goes on from the last one unless it is earlier, or leaps ahead of the clock. A first one is now, and
-    always later than all before.
+    A time stamp continues from the last one unless it is earlier, or jumps ahead of the clock. The first one after a
+    restart is set to the present time, but always after all earlier ones.
     """
 
     now: Callable[[], float]
-    began: float | None = None  # s, of a time stamp of zero
+    began: float | None = None  # s, time of time stamp zero
     fresh: bool = True  # the connection is new
-    last: float = -math.inf  # s, what was given last
-    heard: float = 0.0  # s, when that was by the clock
+    last: float = -math.inf  # s, last result
+    heard: float = 0.0  # s, clock at that moment
 
     def seconds(self, stamp: int) -> float:
-        """Of a time stamp in microseconds."""
+        """Convert a time stamp in microseconds."""
         passed, now = stamp * 1e-6, self.now()
         time = math.nan if self.began is None else self.began + passed
         goes_on = time >= self.last and (time - self.last) - (now - self.heard) <= BEFORE_NOW
@@ -86,39 +86,39 @@ class _Clock:
 
 @dataclass(frozen=True)
 class Qualisys:
-    """Receives the markers of all cameras, frame by frame, from QTM or from what it plays back.
+    """Receives the markers of all cameras, frame by frame, from QTM live or in playback.
 
-    Cameras are those of the rig by their serial numbers; else, where the rig has as many, in the order of QTM. QTM need
-    not be there yet, and may go and come back. A packet that cannot be read is left out; a stream whose packets do not
-    begin where they should is connected to again.
+    Cameras are matched to the rig by serial number; otherwise, if their number is equal, by QTM's order. QTM may start
+    later, and may disappear and return. An unreadable packet is skipped; if packets do not begin where they should, the
+    connection is renewed.
     """
 
     address: str  # qtm://host[:port]
     rig: CameraRig
-    silence: float = 5.0  # s without anything after which the connection is made anew
+    silence: float = 5.0  # s without data after which the connection is renewed
     pause: float = 1.0  # s between two attempts
     clock: Callable[[], float] = time.time
     live: bool = True
 
     def items(self) -> Iterator[Item]:
-        """Receive until the reader stops asking.
+        """Receive until the caller stops.
 
         Raises:
-            InputError: the address is none.
+            InputError: the address is invalid.
         """
         host, port = _host_and_port(self.address)
-        clock, said = _Clock(self.clock), ""
+        clock, reported = _Clock(self.clock), ""
         while True:
             clock.fresh = True
             try:
                 with (yield from _connect(host, port, self.silence)) as connection:
                     for item in self._session(connection, clock):
-                        said = "" if isinstance(item, Exposure) else said
+                        reported = "" if isinstance(item, Exposure) else reported
                         yield item
             except (_Lost, OSError) as error:
                 reason = one_line(f"{self.address}: {error}")
-                if reason != said:  # once, however often it is tried again
-                    said = reason
+                if reason != reported:  # once, however many retries follow
+                    reported = reason
                     yield Unreadable(reason)
             ends = time.monotonic() + self.pause
             while time.monotonic() < ends:
@@ -126,10 +126,10 @@ class Qualisys:
                 yield None
 
     def _session(self, connection: socket.socket, clock: _Clock) -> Iterator[Item]:
-        """Ask for the stream and read it.
+        """Request the stream and read it.
 
         Raises:
-            _Lost, OSError: the connection is of no use any more.
+            _Lost, OSError: the connection is unusable.
         """
         for command in COMMANDS:
             text = command.encode() + b"\0"
@@ -156,17 +156,17 @@ class Qualisys:
 
 
 def find_cameras(root: Element, rig: CameraRig) -> tuple[_Camera | None, ...]:
-    """Find the cameras of a rig among those of QTM's general settings.
+    """Find the cameras of a rig in QTM's general settings.
 
     Args:
         root: its answer to `GetParameters General`.
-        rig: whose cameras they are to be.
+        rig: to which the cameras should belong.
 
     Returns:
-        QTM's cameras in its order; None = the rig does not have it.
+        QTM's cameras in its order; None = not in the rig.
 
     Raises:
-        InputError: they are not those of the rig, or have images of another size.
+        InputError: the cameras are not those of the rig, or have images of another size.
     """
     general = root.find("General")
     elements = [] if general is None else general.all("Camera")
@@ -201,10 +201,10 @@ def _camera(name: str, element: Element, size: list[int]) -> _Camera:
 
 
 def _exposures(body: bytes, cameras: tuple[_Camera | None, ...], clock: _Clock) -> Iterator[Exposure]:
-    """What all cameras saw in a frame; all of it is read before any is given.
+    """Exposures of all cameras in a frame; the whole frame is read before any is yielded.
 
     Raises:
-        InputError: it is no frame of these cameras.
+        InputError: the data is not a frame of these cameras.
     """
     try:
         stamp, frame, components = DATA_HEADER.unpack_from(body)
@@ -251,10 +251,10 @@ def _markers(inside: bytes, count: int, frame: int) -> list[NDArray[np.void]]:
 
 
 def _packets(connection: socket.socket, silence: float) -> Iterator[tuple[int, bytes] | None]:
-    """Give packets, as kind and content, and None while nothing comes.
+    """Yield packets, as kind and content, and None while there are none.
 
     Raises:
-        _Lost: the stream has ended, is silent, or is none of packets.
+        _Lost: the stream has ended, is silent, or does not consist of packets.
     """
     waiting, heard = bytearray(), time.monotonic()
     while True:
@@ -282,10 +282,10 @@ def _packets(connection: socket.socket, silence: float) -> Iterator[tuple[int, b
 
 
 def _connect(host: str, port: int, timeout: float) -> Generator[None, None, socket.socket]:
-    """Connect, giving None meanwhile.
+    """Connect, yielding None while waiting.
 
     Raises:
-        _Lost, OSError: the host is not known, nobody listens there, or nobody answers.
+        _Lost, OSError: the host is unknown, nothing listens there, or there is no answer.
     """
     family, kind, protocol, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     connection, ends = socket.socket(family, kind, protocol), time.monotonic() + timeout
@@ -297,7 +297,7 @@ def _connect(host: str, port: int, timeout: float) -> Generator[None, None, sock
             if select.select([], [connection], [], TICK)[1]:
                 failed = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
             elif time.monotonic() > ends:
-                raise _Lost("nobody answers")
+                raise _Lost("no answer")
         if failed:
             raise _Lost(f"cannot be connected to: {errno.errorcode.get(failed, failed)}")
         connection.setblocking(True)
@@ -319,7 +319,7 @@ def _text(body: bytes) -> str:
 
 
 def _value(element: Element, *path: str) -> str:
-    """Text of a node by the names that lead there; empty where there is none."""
+    """Text of the node at a path of names; empty if there is none."""
     for tag in path:
         child = element.find(tag)
         if child is None:

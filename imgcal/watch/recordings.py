@@ -1,4 +1,4 @@
-"""Recordings that are read as fast as they can be worked on: a video a camera, or a table of blobs."""
+"""Recordings, read as fast as they are processed: one video per camera, or a table of blobs."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ from imgcal.watch.exposures import CameraBlobs, Exposure, Item
 
 @dataclass(frozen=True)
 class Videos:
-    """Videos `frames/<camera>.<mp4|avi|...>`; time stamps are theirs, from 0 s.
+    """Videos `frames/<camera>.<mp4|avi|...>` with their own time stamps, from 0 s.
 
-    Where they differ, in length or in time, that is an error; or, where that is accepted, frames go together by their
-    time stamps.
+    A difference in length or time stamps is an error; with `differ`, frames are matched by their time stamps instead.
     """
 
     folder: Path  # holds frames/
@@ -29,7 +28,7 @@ class Videos:
     live: bool = False
 
     def items(self) -> Iterator[Item]:
-        """Give frames in the order of time."""
+        """Yield frames in the order of time."""
         capture = open_capture(self.folder, self.rig, self.differ)
         paths = {camera: next(iter(files.values()))[0] for camera, files in capture.files.items() if files}
         with contextlib.ExitStack() as stack:
@@ -39,14 +38,14 @@ class Videos:
 
 @dataclass(frozen=True)
 class BlobTable:
-    """A table of blobs, so many snapshots a second; labels are not used."""
+    """A table of blobs at a given rate; its labels are not used."""
 
     blobs: Detections
-    rate: float  # snapshots a second
+    rate: float  # snapshots per second
     live: bool = False
 
     def items(self) -> Iterator[Item]:
-        """Give blobs snapshot by snapshot, those of cameras that see none, too."""
+        """Yield blobs snapshot by snapshot, including cameras without any."""
         usable = self.blobs.select(self.blobs.usable)
         order = np.lexsort((usable.camera, usable.snapshot))
         rows = usable.select(order)
@@ -69,7 +68,7 @@ def holds_videos(folder: Path) -> bool:
 
 
 def _read_numbered(videos: dict[str, Video]) -> Iterator[Item]:
-    """Frames of one number at a time, after a look at their time stamps."""
+    """Frames with equal numbers together, after a check of their time stamps."""
     for index in range(min(video.count for video in videos.values())):
         frames = {camera: video.read(index) for camera, video in videos.items()}
         check_times(tuple(videos.values()), str(index))

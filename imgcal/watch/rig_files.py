@@ -1,4 +1,4 @@
-"""`rig.yaml` as it is now, and as it was: written beside the loop, the newest first."""
+"""`rig.yaml` and its history: written beside the loop, the newest first."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from imgcal.io import RigCovariance, save_rig
 from imgcal.online import RigState
 
 STATE, CURRENT, HISTORY, FRAMES = "state.json", "rig.yaml", "history", "frames"
-LONGEST_END = 10.0  # s that are waited at the end for what has not been written
+LONGEST_END = 10.0  # s to wait at the end for unfinished writes
 MOST_KEPT = 1000
-"""Files of the history; more, and the oldest are removed."""
+"""Maximum number of files in the history; the oldest are removed beyond that."""
 
-_Step = tuple[str, Callable[[], None] | None]  # name of what is done; None = nothing of it now
+_Step = tuple[str, Callable[[], None] | None]  # name of the step; None = nothing to do
 
 
 class RigFiles:
     """Writes rigs with their standard deviations.
 
-    `rig.yaml` is replaced in one step; a rig that is to be kept goes to `history/<date>/<time>.yaml`, too. Writing is
-    done by a thread of its own; where it cannot follow, the rigs between are left out.
+    `rig.yaml` is replaced atomically; a rig to keep is also written to `history/<date>/<time>.yaml`. A separate thread
+    does the writing; if it cannot keep up, rigs in between are skipped.
     """
 
     def __init__(self, folder: Path, most_kept: int = MOST_KEPT) -> None:
-        """Begin; the folder must exist."""
+        """Start the thread; the folder must exist."""
         self.problems: dict[str, str] = {}
-        """What could not be done the last time, and why."""
+        """The steps that failed last time, and why."""
         self._folder, self._most = folder, most_kept
         self._kept = deque(sorted((folder / HISTORY).glob("*/*.yaml")))
         self._current: RigState | None = None
@@ -52,13 +52,13 @@ class RigFiles:
         also: Callable[[], None] | None = None,
         then: Callable[[], None] | None = None,
     ) -> None:
-        """Let the rig be written; returns at once.
+        """Queue the rig for writing; returns at once.
 
         Args:
-            state: what is known of it.
-            keep: into the history as well.
-            also: writes the state that belongs to this moment, before the rig.
-            then: done once that has been written: deletes frames that are not needed any more.
+            state: the state of the rig.
+            keep: also write it to the history.
+            also: writes the keeper's state of this moment, before the rig.
+            then: called after that: deletes frames that are no longer needed.
         """
         with self._changed:
             self._current = state
@@ -69,12 +69,12 @@ class RigFiles:
             self._changed.notify()
 
     def close(self) -> None:
-        """Write what waits, and end."""
+        """Write what waits, and stop the thread."""
         with self._changed:
             self._closing = True
             self._changed.notify()
         self._thread.join(LONGEST_END)
-        if self._thread.is_alive():  # a disk that does not answer
+        if self._thread.is_alive():  # the disk does not answer
             self.problems |= {CURRENT: f"{self._folder / CURRENT}: was not written within {LONGEST_END:g} s"}
 
     def _work(self) -> None:
@@ -96,7 +96,7 @@ class RigFiles:
         current: RigState | None,
         to_keep: list[RigState],
     ) -> None:
-        """Write what is known, the rig, and the history: one that fails keeps none of the others from it."""
+        """Write the keeper's state, the rig, and the history; if one fails, the others are still written."""
         work: list[_Step] = [(STATE, also)]
         work += [] if current is None else [(CURRENT, partial(_save, current, self._folder / CURRENT))]
         work += [(HISTORY, partial(self._keep, state)) for state in to_keep]
@@ -115,16 +115,16 @@ class RigFiles:
         while len(self._kept) > self._most:
             oldest = self._kept.popleft()
             oldest.unlink(missing_ok=True)
-            with contextlib.suppress(FileNotFoundError):  # somebody has tidied up
+            with contextlib.suppress(FileNotFoundError):  # somebody has deleted it
                 if not any(oldest.parent.iterdir()):
                     oldest.parent.rmdir()
 
 
 def put_aside(folder: Path) -> bool:
-    """Forget what an earlier run knew: its state is deleted, its rig goes into the history.
+    """Reset a folder: delete an earlier run's state, and move its rig into the history.
 
     Returns:
-        Whether there was something.
+        Whether there was anything to reset.
 
     Raises:
         InputError: the folder cannot be written.
@@ -132,18 +132,18 @@ def put_aside(folder: Path) -> bool:
     state, rig = folder / STATE, folder / CURRENT
     found = state.is_file() or rig.is_file()
     try:
-        if state.is_file():  # first: a start after this one must not go on from it
+        if state.is_file():  # first: a later start must not resume from it
             state.unlink()
         if rig.is_file():
             os.replace(rig, _history_path(folder, rig.stat().st_mtime))
     except OSError as error:
         problem = error.strerror or error
-        raise InputError(f"{folder}: what an earlier run left there cannot be put aside: {problem}") from error
+        raise InputError(f"{folder}: the state of an earlier run cannot be moved out of the way: {problem}") from error
     return found
 
 
 def _history_path(folder: Path, time: float) -> Path:
-    """Name of the rig of a moment (s since the epoch) in the history, whose folder is made."""
+    """Path in the history for the rig at a time (s since the epoch); creates its folder."""
     day, moment = datetime.fromtimestamp(time, UTC).strftime("%Y-%m-%d %H%M%S.%f").split()
     path = folder / HISTORY / day / f"{moment[:-3]}.yaml"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -155,7 +155,7 @@ def _save(state: RigState, path: Path) -> None:
 
 
 def _problems(work: list[_Step]) -> dict[str, str]:
-    """Do one after the other; gives the names of those that fail, and why."""
+    """Do all steps, and return the names of those that failed, and why."""
     problems: dict[str, str] = {}
     for name, step in work:
         try:

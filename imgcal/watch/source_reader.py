@@ -1,4 +1,4 @@
-"""A source that is read by a thread of its own, and the few snapshots that wait to be worked on."""
+"""Reads a source in its own thread, with a short queue of snapshots."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ from imgcal.watch.synchronization import Synchronizer, TimedSnapshot
 from imgcal.watch.timing import Timing
 
 MOST_WAITING = 8
-"""Snapshots that wait; more, and the oldest is dropped where the source is live. Otherwise the source waits."""
+"""Maximum length of the queue; beyond it, a live source drops the oldest snapshot, any other source waits."""
 MOST_BYTES = 2**30
-"""Memory of their frames; more, and the oldest go as well."""
-LATELY = 3  # reasons that are kept
+"""Maximum memory (bytes) of the queued frames; beyond it, the oldest are dropped, too."""
+LATELY = 3  # number of reasons to keep
 WOKEN = 0.2  # s
 LONGEST_OPENING = 10.0  # s
 
 
 @dataclass(frozen=True)
 class Known:
-    """How far an earlier run has worked on a recording."""
+    """How much of a recording an earlier run has processed."""
 
-    time: float  # s, of the last snapshot
-    name: str | None = None  # of it, where the recording names snapshots
-    another: bool = False  # that was another recording: all of this one must be later
+    time: float  # s, time of the last snapshot
+    name: str | None = None  # its name, if the recording names snapshots
+    another: bool = False  # that was another recording: this one must be later
 
     def includes(self, snapshot: TimedSnapshot) -> bool:
-        """Tell whether a snapshot has been worked on: all up to the one of that name, or else of that time.
+        """Tell whether a snapshot was processed: all up to the one of that name, or otherwise of that time.
 
         Raises:
-            InputError: it is of another recording, and not later.
+            InputError: the snapshot is of another recording, and not later.
         """
         if self.another:
             if snapshot.time > self.time:
                 return False
             raise InputError(
-                f"found a recording that is not the one before, and begins at {snapshot.time:.9g} s, expected one "
+                f"found a different recording that begins at {snapshot.time:.9g} s, expected one "
                 f"after {self.time:.9g} s; --fresh begins anew"
             )
         return self._is_named(snapshot) or snapshot.time <= self.time
 
     def ends_with(self, snapshot: TimedSnapshot) -> bool:
-        """Tell whether this is the last one that has been worked on."""
+        """Tell whether this is the last processed snapshot."""
         return self._is_named(snapshot) and snapshot.name == self.name
 
     def _is_named(self, snapshot: TimedSnapshot) -> bool:
@@ -57,9 +57,9 @@ class Known:
 
 
 class SourceReader:
-    """Snapshots of a source as they become complete. A context manager: leaving it ends the thread.
+    """Snapshots of a source, in order of completion. A context manager: leaving it stops the thread.
 
-    What cannot be read is counted and left out; what ends the source is raised by `next`.
+    Unreadable data are counted and skipped; an error that ends the source is raised by `next`.
     """
 
     def __init__(
@@ -74,34 +74,34 @@ class SourceReader:
         """Prepare to read.
 
         Args:
-            source: where exposures come from.
-            rig: what they are compared with.
-            timing: when they belong together.
-            keep_all: drop nothing, even if the source is live: it is taken for a recording.
-            waiting: most snapshots that wait.
-            known: how far an earlier run has worked on this recording; None = not at all.
+            source: source of exposures.
+            rig: to check exposures against.
+            timing: when exposures belong together.
+            keep_all: drop nothing, even if the source is live: treat it as a recording.
+            waiting: maximum length of the queue.
+            known: how much of this recording an earlier run has processed; None = nothing.
         """
         self.synchronizer = Synchronizer(rig.camera_names, timing)
         self.dropped = 0
-        """Snapshots that were complete and not worked on in time."""
+        """Number of complete snapshots that were dropped."""
         self.unreadable: Counter[str] = Counter()
-        """By camera; "" = not known."""
+        """Number of unreadable items by camera; "" = unknown."""
         self.reasons: deque[str] = deque(maxlen=LATELY)
         """Why the latest ones could not be read."""
         self.known_before = 0
-        """Snapshots of a recording that an earlier run has worked on."""
+        """Number of a recording's snapshots that an earlier run has processed."""
         self._source, self._rig, self._most, self._keep_all = source, rig, waiting, keep_all
         self._known = known
         self._snapshots: deque[TimedSnapshot] = deque()
         self._bytes = 0
-        self._blobs: bool | None = None  # whether blobs come, or frames; None = nothing has come
+        self._blobs: bool | None = None  # True = blobs, False = frames, None = nothing yet
         self._changed = threading.Condition()
         self._closing = self._ended = self._begun = False
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._read, name="intake", daemon=True)  # a read may hang in a driver
 
     def __enter__(self) -> SourceReader:
-        """Begin to read."""
+        """Start reading."""
         self._thread.start()
         return self
 
@@ -116,12 +116,12 @@ class SourceReader:
 
     @property
     def live(self) -> bool:
-        """Whether what is not worked on in time is dropped."""
+        """Whether snapshots are dropped if they are not processed in time."""
         return self._source.live and not self._keep_all
 
     @property
     def waiting(self) -> int:
-        """Number of snapshots that wait to be worked on."""
+        """Number of snapshots in the queue."""
         return len(self._snapshots)
 
     @property
@@ -131,10 +131,10 @@ class SourceReader:
             return self._ended and not self._snapshots
 
     def wait_until_open(self, timeout: float = LONGEST_OPENING) -> SourceReader:
-        """Wait until the source has been opened, so long at most; returns itself.
+        """Wait until the source has been opened, at most `timeout` seconds; return `self`.
 
         Raises:
-            InputError: it cannot be.
+            InputError: the source cannot be opened.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._begun or self._ended, timeout)
@@ -143,10 +143,10 @@ class SourceReader:
         return self
 
     def next(self, timeout: float) -> TimedSnapshot | None:
-        """Take the oldest snapshot that waits; None = none came within so many seconds.
+        """Take the oldest snapshot from the queue; None = none came within `timeout` seconds.
 
         Raises:
-            InputError: the source cannot go on. All that came before has been taken.
+            InputError: the source cannot continue; all earlier snapshots have been taken.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._snapshots or self._ended, timeout)
@@ -197,10 +197,10 @@ class SourceReader:
             self._put(snapshot)
 
     def _check_kind(self, exposure: Exposure) -> Exposure:
-        """Compare an exposure with the first one.
+        """Compare an exposure's kind with that of the first one.
 
         Raises:
-            InputError: a frame among blobs, or blobs among frames: nobody works on both.
+            InputError: a frame among blobs, or blobs among frames: a mixture is not supported.
         """
         blobs = isinstance(exposure.content, CameraBlobs)
         self._blobs = blobs if self._blobs is None else self._blobs
@@ -218,7 +218,7 @@ class SourceReader:
             included = self._known.includes(snapshot)
             self.known_before += included
             if not included or self._known.ends_with(snapshot):
-                self._known = None  # what comes from now on is new
+                self._known = None  # everything from now on is new
             if included:
                 return
         with self._changed:

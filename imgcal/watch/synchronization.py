@@ -1,4 +1,4 @@
-"""Snapshots from exposures that come one by one, each with the time stamp of its camera: late, twice, or never."""
+"""Combine single exposures into snapshots by the cameras' time stamps; exposures may be late, repeated or missing."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from imgcal.watch.exposures import CameraBlobs, Exposure
 from imgcal.watch.timing import LEAP, Timing
 
 MOST_PENDING = 32
-"""Snapshots that are waited for at a time; beyond, the oldest goes on as it is."""
+"""Maximum number of unfinished snapshots; beyond it, the oldest is released as it is."""
 OUT_AFTER = 10
-"""Snapshots in a row without a camera, after which nobody waits for it."""
+"""Successive snapshots without a camera after which it is no longer waited for."""
 INTERVALS, LEAST_INTERVALS = 8, 3
-"""Latest times between two exposures of a camera whose median says when its next one is due; until there are so many,
-it always is."""
+"""Number of intervals between exposures of a camera whose median predicts its next one; until there are so many, it is
+always due."""
 BEGINNING = 3.0
-"""Seconds for which a camera that has sent but little is waited for: it may send once a second."""
+"""Time (s) to wait for a camera with few exposures: it may send once a second."""
 EARLY = 0.05
-"""Share of that time by which it may come earlier."""
+"""Share of the median interval by which it may come early."""
 ALONE = 30
-"""Snapshots in a row in which a camera is alone while others come together, from which its time stamps are told."""
+"""Successive snapshots of one camera alone, while the others are together, that show that its time stamps are off."""
 NEIGHBOUR = 1.1
-"""Of its usual rest, within which others must have exposed: one that sends more often than they is alone by right."""
+"""Part of a camera's usual interval in which others must have exposed: a faster camera is often alone rightly."""
 LONGEST_ASTRAY = 100
-"""Exposures in a row by clocks that have leapt, after which these are believed."""
+"""Successive exposures after a jump of the clocks until the new times are accepted."""
 REMEMBERED = 4096
-"""Names of snapshots that are known to have gone on."""
+"""Number of remembered names of released snapshots."""
 
 COUNTS = ("received", "missing", "late", "duplicate", "out_of_order", "astray", "beside")
-"""What is counted for each camera.
+"""Counters of each camera.
 
-`missing`: snapshots without it in which it was due. `late`: it came after its snapshot had gone on. `duplicate`: its
-second of a snapshot. `astray`: its clock is more than `LEAP` off. `beside`: its time stamps have been beside those of
-the others for long. These four are left out. `out_of_order`: earlier
-than one before; used where its snapshot has not gone on.
+`missing`: snapshots without it although it was due. `late`: it came after its snapshot was released. `duplicate`: a
+second exposure for the same snapshot. `astray`: its clock is off by more than `LEAP`. `beside`: its time stamps have
+differed from the others' for long. These four are left out. `out_of_order`: earlier than a previous one; used if its
+snapshot has not been released.
 """
 
 
@@ -49,17 +49,17 @@ than one before; used where its snapshot has not gone on.
 class TimedSnapshot:
     """What the cameras saw at one moment."""
 
-    time: float  # s, the middle one of the time stamps
-    exposures: Mapping[str, Exposure]  # by camera, those that came
-    name: str | None = None  # where the source names snapshots
+    time: float  # s, median time stamp
+    exposures: Mapping[str, Exposure]  # by camera, as far as present
+    name: str | None = None  # if the source names snapshots
 
     def frames(self, camera_names: tuple[str, ...]) -> dict[str, Frame | None]:
-        """Frame of each camera; None = none came, or blobs."""
+        """Frame of each camera; None = no frame, or blobs."""
         contents = {name: self.exposures[name].content for name in camera_names if name in self.exposures}
         return {name: None if isinstance(found := contents.get(name), CameraBlobs) else found for name in camera_names}
 
     def source(self, camera_names: tuple[str, ...]) -> dict[str, Frame | None] | Detections:
-        """What a recalibration takes: frames by camera, or, where blobs came, these."""
+        """Input for a keeper: frames by camera, or blobs if the source sends those."""
         given = [
             (camera, content)
             for camera, name in enumerate(camera_names)
@@ -83,16 +83,16 @@ class TimedSnapshot:
 
     @property
     def num_bytes(self) -> int:
-        """Memory that its frames take."""
+        """Memory of its frames."""
         return sum(e.content.nbytes for e in self.exposures.values() if not isinstance(e.content, CameraBlobs))
 
 
 @dataclass
 class _Pending:
-    """A snapshot that is being gathered."""
+    """An unfinished snapshot."""
 
     name: str | None
-    arrived: float  # s, when its first exposure came
+    arrived: float  # s, arrival of its first exposure
     exposures: dict[str, Exposure] = field(default_factory=dict)
     earliest: float = math.inf
     latest: float = -math.inf
@@ -105,7 +105,7 @@ class _Pending:
         return abs(time - (self.earliest + self.latest) / 2)
 
     def spread(self, time: float) -> float:
-        """Between the earliest and the latest time stamp, would this one be added."""
+        """Time between the earliest and the latest time stamp if this one is added."""
         return max(self.latest, time) - min(self.earliest, time)
 
     def finished(self) -> TimedSnapshot:
@@ -114,11 +114,11 @@ class _Pending:
 
 
 class Synchronizer:
-    """Gathers exposures to snapshots, in bounded memory.
+    """Combines exposures into snapshots, in bounded memory.
 
-    A snapshot goes on when all cameras that are there have given theirs, or when `patience` has passed. Snapshots go on
-    in the order of their times; named ones in the order in which they came. No single clock decides what time it is:
-    the cameras' time stamps do, the middle one of them.
+    A snapshot is released when all active cameras have delivered, or when `patience` has passed. Snapshots are released
+    in the order of their times; named ones in the order of arrival. No single clock defines the time of a snapshot: it
+    is the median of the cameras' time stamps.
 
     Examples:
         >>> pair = Synchronizer(("left", "right"), Timing())
@@ -132,24 +132,24 @@ class Synchronizer:
         self.camera_names, self.timing = camera_names, timing
         self.counts: dict[str, Counter[str]] = {kind: Counter(dict.fromkeys(camera_names, 0)) for kind in COUNTS}
         self.leaps = 0
-        """How often all clocks leapt together."""
-        self._pending: list[_Pending] = []  # in the order in which they will go on
-        self._absent = Counter(dict.fromkeys(camera_names, 0))  # snapshots in a row without a camera
+        """Number of joint jumps of all clocks."""
+        self._pending: list[_Pending] = []  # in the order of release
+        self._absent = Counter(dict.fromkeys(camera_names, 0))  # successive snapshots without a camera
         self._newest: dict[str, float] = {}  # latest time stamp of each camera
-        self._stamps = {name: deque[float](maxlen=INTERVALS + 1) for name in camera_names}  # the latest of each camera
-        self._alone: Counter[str] = Counter()  # snapshots in a row of one camera alone, with others beside it
+        self._stamps = {name: deque[float](maxlen=INTERVALS + 1) for name in camera_names}  # latest of each camera
+        self._alone: Counter[str] = Counter()  # successive snapshots of one camera alone, close to others
         self.alone: tuple[str, ...] = ()
-        """Cameras whose time stamps are always beside those of the others: their clocks are."""
-        self._offset: dict[str, float] = {}  # its last time stamp, against this machine's clock when it came
-        self._gone = (-math.inf, -math.inf)  # earliest and latest time stamp of the snapshot that went on last
+        """Cameras whose time stamps always differ from the others': their clocks do."""
+        self._offset: dict[str, float] = {}  # last time stamp minus this machine's clock at arrival
+        self._gone = (-math.inf, -math.inf)  # earliest and latest time stamp of the last released snapshot
         self._names: deque[str] = deque(maxlen=REMEMBERED)
-        self._known: set[str] = set()  # the same
-        self._astray: dict[str, Exposure] = {}  # the last one of each camera whose clock has leapt
+        self._known: set[str] = set()  # the same as a set
+        self._astray: dict[str, Exposure] = {}  # last exposure of each camera whose clock has jumped
         self._astray_in_a_row = 0
 
     @property
     def waiting(self) -> int:
-        """Number of snapshots that are being gathered."""
+        """Number of unfinished snapshots."""
         return len(self._pending)
 
     def add(self, exposure: Exposure, now: float = 0.0) -> tuple[TimedSnapshot, ...]:
@@ -157,10 +157,10 @@ class Synchronizer:
 
         Args:
             exposure: checked.
-            now: s, this machine's clock; 0 for recordings, which come as fast as they are read.
+            now: s, this machine's clock; 0 for recordings, which are read as fast as possible.
 
         Returns:
-            The snapshots that need not wait any more, the earliest first.
+            The snapshots released by it, the earliest first.
         """
         self.counts["received"][exposure.camera] += 1
         if exposure.snapshot is not None or not self._has_leapt(exposure, now):
@@ -169,30 +169,30 @@ class Synchronizer:
         self.counts["astray"][exposure.camera] += 1
         self._astray[exposure.camera] = exposure
         self._astray_in_a_row += 1
-        believed = [held for held in self._astray.values() if abs(held.time - exposure.time) <= LEAP]
-        if 2 * len(believed) <= len(self._there()) and self._astray_in_a_row < LONGEST_ASTRAY:
+        believed = [waiting for waiting in self._astray.values() if abs(waiting.time - exposure.time) <= LEAP]
+        if 2 * len(believed) <= len(self._active_cameras()) and self._astray_in_a_row < LONGEST_ASTRAY:
             return self.release_due(now)
         done = self.flush()
         self._reset()
-        for held in sorted(believed, key=lambda held: held.time):
-            self.counts["astray"][held.camera] -= 1
-            self._add(held, now)
+        for waiting in sorted(believed, key=lambda waiting: waiting.time):
+            self.counts["astray"][waiting.camera] -= 1
+            self._add(waiting, now)
         return done + self.release_due(now)
 
     def release_due(self, now: float) -> tuple[TimedSnapshot, ...]:
-        """Give the snapshots that need not wait any more; to be called now and then while nothing comes."""
+        """Release snapshots that are due; call this now and then while nothing comes."""
         done: list[TimedSnapshot] = []
         while self._pending and self._may_go(self._pending[0], now):
             done.append(self._has_continued(self._pending.pop(0)))
         return self._drop_unsynchronized(done)
 
     def flush(self) -> tuple[TimedSnapshot, ...]:
-        """Give all that is being gathered, as it is."""
+        """Release all unfinished snapshots."""
         pending, self._pending = self._pending, []
         return self._drop_unsynchronized([self._has_continued(snapshot) for snapshot in pending])
 
     def _drop_unsynchronized(self, done: list[TimedSnapshot]) -> tuple[TimedSnapshot, ...]:
-        """Leave out what a camera sees at moments of its own: nobody knows where the object was then."""
+        """Remove the exposures of unsynchronized cameras: the object's pose at those times is unknown."""
         kept = []
         for snapshot in done:
             if len(snapshot.exposures) == 1 and (name := next(iter(snapshot.exposures))) in self.alone:
@@ -219,7 +219,7 @@ class Synchronizer:
             pending.add(exposure)
 
     def _place(self, exposure: Exposure, now: float) -> _Pending | None:
-        """Find the snapshot of an exposure, or begin a new one; None = it has gone on already."""
+        """Find the snapshot of an exposure, or start a new one; None = it was released already."""
         name, time = exposure.snapshot, exposure.time
         near = [pending for pending in self._pending if pending.name == name]
         if name is None:
@@ -236,7 +236,7 @@ class Synchronizer:
 
     def _may_go(self, pending: _Pending, now: float) -> bool:
         if len(self._pending) > MOST_PENDING or all(
-            name in pending.exposures or not self._is_due(name, pending) for name in self._there()
+            name in pending.exposures or not self._is_due(name, pending) for name in self._active_cameras()
         ):
             return True
         if pending.name is not None:
@@ -261,30 +261,30 @@ class Synchronizer:
         return pending.finished()
 
     def _rest(self, name: str) -> float:
-        """How long a camera usually rests between two exposures; nan = it has sent too few to say that."""
+        """Usual interval between a camera's exposures; nan = too few exposures."""
         stamps = sorted(self._stamps[name])
         rests = sorted(later - earlier for earlier, later in itertools.pairwise(stamps))
         return rests[len(rests) // 2] if len(rests) >= LEAST_INTERVALS else math.nan
 
     def _nearest(self, name: str, pending: _Pending) -> float:
-        """How far the nearest of a camera's latest exposures is from a snapshot."""
+        """Time between a snapshot and the nearest of a camera's latest exposures."""
         return min((abs(stamp - pending.latest) for stamp in self._stamps[name]), default=math.inf)
 
     def _is_due(self, name: str, pending: _Pending) -> bool:
-        """Tell whether a camera that sends less often than others should have sent for a snapshot."""
+        """Tell whether a camera that sends less often than others was due for a snapshot."""
         between = (1 - EARLY) * self._rest(name) - self.timing.tolerance
         return pending.name is not None or not self._nearest(name, pending) < between
 
     def _is_beside(self, name: str, pending: _Pending) -> bool:
-        """Tell whether a snapshot is of one camera alone, while others expose shortly before or after it."""
+        """Tell whether a snapshot has one camera only, while others expose shortly before or after it."""
         if len(pending.exposures) > 1 or pending.name is not None:
             return False
         return any(
             self._nearest(other, pending) < NEIGHBOUR * self._rest(name) for other in self.camera_names if other != name
         )
 
-    def _there(self) -> list[str]:
-        """The cameras that are waited for; also one that has just begun: nobody knows yet how often it sends."""
+    def _active_cameras(self) -> list[str]:
+        """The cameras to wait for, including one that has just started: its rate is still unknown."""
         latest = max(self._newest.values(), default=0.0)
         return [name for name in self.camera_names if self._absent[name] < OUT_AFTER or self._begins(name, latest)]
 
@@ -293,8 +293,8 @@ class Synchronizer:
         return few and latest - self._newest.get(name, -math.inf) < BEGINNING
 
     def _clock(self, now: float) -> float:
-        """What the cameras' clocks say now: the middle one, of two the one that is behind."""
-        offsets = sorted(self._offset[name] for name in self._there() if name in self._offset)
+        """Current time by the cameras' clocks: the median, of two the earlier one."""
+        offsets = sorted(self._offset[name] for name in self._active_cameras() if name in self._offset)
         return now + offsets[(len(offsets) - 1) // 2] if offsets else math.nan
 
     def _has_leapt(self, exposure: Exposure, now: float) -> bool:

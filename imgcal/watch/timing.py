@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from imgcal.errors import InputError
 
 LEAP = 10.0
-"""Seconds by which a clock may not leap: the exposure is left out, unless the other cameras' clocks did the same."""
+"""Maximum jump (s) of a clock: an exposure beyond it is left out, unless the other cameras' clocks jump equally."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """When exposures belong together, and how long the missing ones are waited for."""
+    """When exposures belong together, and how long to wait for missing ones."""
 
-    tolerance: float = 0.005  # s between the earliest and the latest time stamp of a snapshot, at most
-    patience: float = 0.1  # s that missing exposures are waited for
+    tolerance: float = 0.005  # maximum s between the earliest and the latest time stamp of a snapshot
+    patience: float = 0.1  # s to wait for missing exposures
 
     def __post_init__(self) -> None:
         for name in ("tolerance", "patience"):

@@ -1,4 +1,4 @@
-"""TRC, the table of markers that OpenSim and others read: written row by row, readable after a kill.
+"""TRC, the marker table of OpenSim and others: written row by row, readable after a kill.
 
 Source: OpenSim documentation, Marker (.trc) Files, https://opensimconfluence.atlassian.net/wiki/spaces/OpenSim
 """
@@ -16,22 +16,22 @@ from imgcal.errors import InputError
 from imgcal.io import write_text
 
 HEADER_LINES = 6
-WIDTH = 10  # characters of the number of frames, which is written again and again
+WIDTH = 10  # characters of the number of frames, which is overwritten
 
 
 class TRCFile:
-    """Points in millimetres; what was not seen is an empty cell."""
+    """Points in millimetres; a missing point is an empty cell."""
 
     def __init__(self, path: Path, labels: Sequence[str], rate: float) -> None:
-        """Make the file.
+        """Create the file.
 
         Args:
             path: must not exist.
-            labels: of the points.
-            rate: frames a second.
+            labels: names of the points.
+            rate: frames per second.
 
         Raises:
-            OSError: it cannot be made.
+            OSError: the file cannot be created.
         """
         self.frames, self._rate, self._path, self._points = 0, rate, path, len(labels)
         text = self._begin(labels)
@@ -41,7 +41,7 @@ class TRCFile:
         self._file.flush()
 
     def _begin(self, labels: Sequence[str]) -> str:
-        """Make the lines before the frames, and note where their counts stand."""
+        """Make the lines before the frames, and note the positions of the counts."""
         names = [label.replace("\t", " ") for label in labels]
         head = (
             f"PathFileType\t4\t(X/Y/Z)\t{self._path.name}\n"
@@ -55,13 +55,13 @@ class TRCFile:
         return text + "\t\t\t".join(names) + f"\t\t\n\t\t{axes}\n\n"
 
     def widen(self, labels: Sequence[str]) -> None:
-        """Make room for more points, which are missing in all frames until now, in one step.
+        """Add columns for more points, missing in all frames so far, atomically.
 
         Args:
-            labels: of the points that there are, and of further ones.
+            labels: names of the existing points, followed by the new ones.
 
         Raises:
-            InputError: the file cannot be written anew; it is as it was.
+            InputError: the file cannot be rewritten; it is unchanged.
         """
         self._file.seek(0)
         rows = self._file.read().decode().split("\n")[HEADER_LINES:-1]
@@ -89,7 +89,7 @@ class TRCFile:
             cameras: (F, N) bits.
 
         Raises:
-            OSError: they cannot be written.
+            OSError: the frames cannot be written.
         """
         rows = []
         for number, frame in enumerate(points, start=self.frames):
@@ -97,7 +97,7 @@ class TRCFile:
             rows.append("\t".join((str(number + 1), f"{number / self._rate:.6f}", *cells)) + "\n")
         self._file.seek(0, os.SEEK_END)
         self._file.write("".join(rows).encode())
-        self._file.flush()  # the rows are there before they are counted
+        self._file.flush()  # write the rows before their count
         self.frames += len(points)
         for place in self._counts:
             self._file.seek(place)
@@ -105,5 +105,5 @@ class TRCFile:
         self._file.flush()
 
     def close(self) -> None:
-        """Write no more."""
+        """Close the file."""
         self._file.close()

@@ -1,4 +1,4 @@
-"""What other processes send: blobs as one line of JSON, frames as a line of JSON and the pixels behind it."""
+"""Messages from other processes: blobs as one line of JSON, frames as a line of JSON followed by the pixels."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def exposure_from_json(text: str | bytes) -> Exposure:
             blobs (one number) or of each (a list): seconds and pixels. No blobs: `"uv": []`.
 
     Raises:
-        InputError: anything else.
+        InputError: any other format.
 
     Examples:
         >>> exposure_from_json('{"camera": "cam01", "time": 12.5, "uv": [[100, 50.5]], "sigma": 0.08}').content.sigma
@@ -42,11 +42,11 @@ def exposure_from_pixels(header: str | bytes, pixels: bytes | memoryview) -> Exp
 
     Args:
         header: `{"camera": "cam01", "time": 12.5, "width": 1280, "height": 1024, "type": "uint8"}`; the type may also
-            be uint16, low byte first.
+            be uint16, little-endian.
         pixels: row by row from the top, without gaps.
 
     Raises:
-        InputError: anything else.
+        InputError: any other format.
 
     Examples:
         >>> header = '{"camera": "cam01", "time": 12.5, "width": 3, "height": 2, "type": "uint8"}'
@@ -57,7 +57,7 @@ def exposure_from_pixels(header: str | bytes, pixels: bytes | memoryview) -> Exp
     width, height, kind = (entry[key] for key in ("width", "height", "type"))
     if not all(isinstance(side, int) and 0 < side <= limits.LONGEST_SIDE for side in (width, height)):
         raise InputError(f"found {width!r} x {height!r} pixels, expected whole numbers up to {limits.LONGEST_SIDE:,}")
-    if kind not in tuple(PIXEL_TYPES):  # compares, which a list may be, too
+    if kind not in tuple(PIXEL_TYPES):  # compares without hashing, so lists are allowed
         raise InputError(f"type: found {shorten(repr(kind))}, expected {' or '.join(PIXEL_TYPES)}")
     expected = width * height * PIXEL_TYPES[kind].itemsize
     if len(pixels) != expected:
@@ -71,7 +71,7 @@ def _mapping(text: str | bytes, allowed: set[str], needed: set[str]) -> dict[str
         raise InputError(f"found {len(text):,} bytes, expected a line of JSON of at most {LONGEST_LINE:,}")
     try:
         entry = read_json(text.decode() if isinstance(text, bytes) else text)
-    except ValueError as error:  # also where it is no UTF-8
+    except ValueError as error:  # also if it is not UTF-8
         raise InputError(f"found {shorten(repr(text))}, expected a line of JSON: {error}") from error
     if not isinstance(entry, dict) or not needed <= set(entry) <= allowed:
         found = list_names(map(str, entry)) or "no keys" if isinstance(entry, dict) else shorten(repr(entry))

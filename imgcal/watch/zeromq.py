@@ -1,4 +1,4 @@
-"""Blobs or frames from another process through ZeroMQ: whoever sends never waits for us."""
+"""Blobs or frames from another process through ZeroMQ, which never blocks the sender."""
 
 from __future__ import annotations
 
@@ -18,37 +18,37 @@ if TYPE_CHECKING:
     import zmq
 
 TICK = 50  # ms
-QUEUED = 1000  # messages that ZeroMQ keeps while ours are worked on; frames of all cameras: some moments
+QUEUED = 1000  # messages that ZeroMQ buffers: a few moments of frames of all cameras
 ADDRESS = re.compile(r"tcp://[^\s/]+:(\d{1,5})|ipc://\S+")
 
 
 @dataclass(frozen=True)
 class ZeroMQ:
-    """Subscribes to a publisher, or to several: one message a camera and moment.
+    """Subscribes to one or several publishers: one message per camera and moment.
 
-    A message has one part, blobs (`exposure_from_json`), or two: a header and pixels (`exposure_from_pixels`). It need
-    not be there yet, and may go and come back.
+    A message has one part, blobs (`exposure_from_json`), or two: a header and pixels (`exposure_from_pixels`). A
+    publisher may start later, and may disappear and return.
     """
 
     addresses: tuple[str, ...]  # tcp://host:port or ipc://path
     largest: int = 2 * MOST_PIXELS + LONGEST_LINE  # bytes of a message
     queued: int = QUEUED  # messages
-    silence: float = 5.0  # s after which the connection is made anew
+    silence: float = 5.0  # s without data after which the connection is renewed
     live: bool = True
 
     def items(self) -> Iterator[Item]:
-        """Receive until the reader stops asking."""
+        """Receive until the caller stops."""
         import zmq  # not in the core
 
         with zmq.Context() as context:
             while True:
-                # ZeroMQ itself does not connect again after a message that was too large.
+                # ZeroMQ does not reconnect by itself after an oversized message.
                 with context.socket(zmq.SUB) as socket:
                     self._connect(socket)
-                    yield from self._received(socket)
+                    yield from self._receive(socket)
 
-    def _received(self, socket: zmq.Socket[bytes]) -> Iterator[Item]:
-        """Receive until nothing has come, and nothing waits, for a while: the reader may be held up for longer."""
+    def _receive(self, socket: zmq.Socket[bytes]) -> Iterator[Item]:
+        """Receive until nothing has come for a while; time in which the caller is busy does not count."""
         heard = time.monotonic()
         while True:
             if not socket.poll(TICK):
@@ -72,7 +72,7 @@ class ZeroMQ:
         socket.setsockopt(zmq.SUBSCRIBE, b"")
         for address in self.addresses:
             found = ADDRESS.fullmatch(address)
-            if found is None or int(found[1] or 0) >= 2**16:  # ZeroMQ takes the rest of a division
+            if found is None or int(found[1] or 0) >= 2**16:  # ZeroMQ takes the port modulo 65536
                 raise InputError(f"{shorten(address)}: expected an address tcp://host:port or ipc://path")
             try:
                 socket.connect(address)

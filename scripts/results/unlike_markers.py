@@ -2,10 +2,10 @@
 
     python -m scripts.results.unlike_markers --runs out/unlike
 
-Rig O10 and object asymmetric8 with squares, rings, bars, dark discs or bloomed lamps as markers, among
-round discs that are no markers. The rig is known, as after a calibration; `imgcal harvest` labels 3 to 100 frames (ten
-are a snapshot), `imgcal train --from` adapts network and measurer, and other snapshots are measured, in which the believed pose is 1 degree
-and 8 mm off. Right and wrong are those of `scripts.results.infrared`.
+Rig O10 and object asymmetric8 with squares, rings, bars, dark discs or bloomed lamps as markers, among round discs that
+are no markers. The rig is known, as after a calibration; `imgcal harvest` labels 3 to 100 frames (ten are a snapshot),
+`imgcal train --from` adapts network and measurer, and other snapshots are measured, in which the believed pose is
+1 degree and 8 mm off. Right and wrong are those of `scripts.results.infrared`.
 """
 
 from __future__ import annotations

@@ -131,24 +131,45 @@ def test_what_comes_late_in_a_long_capture_is_still_found(seen, o10, asymmetric8
     assert associate(without_labels(long), o10, asymmetric8).used == list(range(16, 24))
 
 
-def test_a_snapshot_that_is_tried_again_teaches_the_rig_once(seen, o10, asymmetric8, monkeypatch):
+@pytest.fixture
+def trackers(monkeypatch) -> list:
+    """Trackers that were made; each keeps the names of the snapshots that it decided, and the poses it started from."""
     made = []
 
     class Kept(tracker.Tracker):
         def __init__(self, *arguments):
             super().__init__(*arguments)
-            self.tried = []
+            self.tried, self.starts = [], []
             made.append(self)
 
         def decide(self, blobs, name):
             self.tried.append(name)
+            self.starts.append(self.pose)
             return super().decide(blobs, name)
 
     monkeypatch.setattr(series, "Tracker", Kept)
+    return made
+
+
+def test_a_snapshot_that_is_tried_again_teaches_the_rig_once(seen, o10, asymmetric8, trackers):
     clutter = (seen.snapshot == 1) & (seen.camera == 3)  # a camera in which nothing is the object's
     uv = np.where(clutter[:, None], np.random.default_rng(0).uniform(0, 1000, seen.uv.shape), seen.uv)
     labelled = associate(without_labels(replace(seen, uv=uv)), o10, asymmetric8)
-    (kept,) = made
+    (kept,) = trackers
     first, again = kept.tried[:4], kept.tried[4:]
     assert first == list(seen.snapshot_names) and again == [seen.snapshot_names[1]] and labelled.used == [0, 1, 2, 3]
     assert len(kept.learnt.accepted) == 4
+    pose = labelled.snapshots[1].rig_from_object
+    torch.testing.assert_close(kept.starts[4].translation, pose.translation, atol=0.5, rtol=0)
+
+
+def test_stray_lights_are_looked_at_again_only_with_a_better_rig(o10, asymmetric8, trackers):
+    """The rig is fitted to 1, 2 and 4 snapshots: after the fifth there is nothing new to try."""
+    seen = true_detections(simulate_truth(o10, asymmetric8, 5, torch.Generator().manual_seed(0), PhysicalDrift()))
+    stray = np.isin(seen.snapshot, (1, 4)) & (seen.camera == 3)
+    kept = seen.select(~stray | (seen.fiducial == 0))  # of camera 3 a single blob is left in the second and the fifth
+    kept = replace(kept, uv=np.where((kept.fiducial == 0)[:, None] & (kept.camera == 3)[:, None], 5.0, kept.uv))
+    kept = kept.select((kept.camera != 3) | np.isin(kept.snapshot, (1, 4)))
+    labelled = associate(without_labels(kept), o10, asymmetric8)
+    assert labelled.used == [0, 1, 2, 3, 4]
+    assert trackers[0].tried[5:] == [seen.snapshot_names[1]]

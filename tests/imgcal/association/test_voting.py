@@ -36,14 +36,15 @@ def test_predictions_are_projections_without_distortion(o10, asymmetric8) -> Non
     assert (found[1][inside < 1] == -1e7).all() and (inside < 1).any()
 
 
-def counted(predicted, ideal, width, gate):
-    """The most votes in two by two cells of a histogram of all differences."""
+def fullest(predicted, ideal, width, gate):
+    """Votes and shift of the first fullest window of two by two cells of a histogram of all differences."""
     difference = (ideal[None] - predicted[:, None]).reshape(-1, 2).astype(np.float64) + gate
     inside = difference[((difference >= 0) & (difference < 2 * gate)).all(1)]
     cells = np.floor(inside / width).astype(int) + 1
     table = np.zeros((np.ceil(2 * gate / width).astype(int) + 2,) * 2, dtype=int)
     np.add.at(table, tuple(cells.T), 1)
-    return (table[1:, 1:] + table[:-1, 1:] + table[1:, :-1] + table[:-1, :-1]).max()
+    windows = table[1:, 1:] + table[:-1, 1:] + table[1:, :-1] + table[:-1, :-1]
+    return windows.max(), np.array(np.unravel_index(windows.argmax(), windows.shape)) * width - gate
 
 
 @pytest.mark.parametrize("gate", [30.0, 75.0])
@@ -55,8 +56,9 @@ def test_votes_are_those_of_a_histogram(gate) -> None:
     votes = vote(blobs, predicted, 5.0, gate)
     for k in range(4):
         for c, number in enumerate(blobs.count):
-            expected = counted(predicted[k, c], ideal[c, :number], 5.0, gate) if number else 0
+            expected, shift = fullest(predicted[k, c], ideal[c, :number], 5.0, gate) if number else (0, -gate)
             assert votes.count[k, c] == min(expected, 6)
+            np.testing.assert_allclose(votes.shift[k, c], shift)
 
 
 def test_a_shift_of_each_camera_is_found_among_false_blobs() -> None:

@@ -248,7 +248,7 @@ def test_a_recording_is_gone_on_with_by_its_names_and_rate_and_another_one_is_no
     assert "2 snapshots, 1 events" in (said := capsys.readouterr().out) and "| 4 had been read before" in said
     save_detections(blobs.of_snapshots(0, 6), tmp_path / "second.csv")
     assert watch(tmp_path / "second.csv", out) == 2
-    assert "not the one before, and begins at 0 s, expected one after" in capsys.readouterr().err
+    assert "found a different recording that begins at 0 s, expected one after" in capsys.readouterr().err
 
 
 def test_a_rig_that_was_accepted_as_factory_is_gone_on_with_by_the_file_it_began_with(known, tmp_path, capsys):

@@ -82,7 +82,7 @@ def test_what_cannot_be_decided_waits_and_is_then_what_is_more_probable(case: Ca
     table: tuple[Explanation, ...] = (Known("a", (1.0,)), Known("b", (0.0,)))
     diagnosis = Diagnosis()
     for _ in range(PATIENCE):
-        with pytest.raises(RefusedError, match="a cannot be told from the rest yet: no explanation leads by 5"):
+        with pytest.raises(RefusedError, match="a is not certain yet: no explanation leads by 5"):
             diagnosis.decide(case, True, table)
     assert diagnosis.decide(case, True, table).best.name == "a"
     assert Diagnosis().decide(case, False, table).best.name == "a"
@@ -128,7 +128,7 @@ def test_a_move_is_not_believed_of_too_little() -> None:
     verdict = weigh(case)
     assert verdict.best.name == "moved" and Diagnosis().decide(case, patient=False).best.name == "moved"
     assert "a move" in verdict.reasons["unsynchronized"]  # one snapshot is explained by either
-    with pytest.raises(RefusedError, match="moved cannot be told from the rest yet"):
+    with pytest.raises(RefusedError, match="moved is not certain yet"):
         Diagnosis().decide(replace(case, quarantined=True), patient=False)
     early = replace(case, pauses=[0.0] * (BEFORE + 1), count=BEFORE, beginning=case.before)
     assert early.too_early and Moved().premature(early, verdict.best) is not None

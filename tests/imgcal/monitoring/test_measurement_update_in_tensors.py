@@ -23,5 +23,5 @@ def test_a_belief_that_nothing_is_known_of_is_refused() -> None:
     factory, obj, _, _ = made
     belief = RigBelief.of_prior(factory, obj)
     unknown = RigBelief(belief.rig, obj, belief.object_offset, torch.zeros_like(belief.factor), belief.unit)
-    with pytest.raises(RefusedError, match="nothing is known of"):
+    with pytest.raises(RefusedError, match="do not determine the rig"):
         update_in_tensors(unknown, *snapshots(made, 0, 1), SQUARED)

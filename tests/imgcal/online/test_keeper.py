@@ -420,7 +420,7 @@ def test_lights_of_which_nothing_is_known_keep_a_rig_calibrated(tmp_path: Path) 
             states.append(keeper.update(blobs, number / 10))
     assert not [event for state in states for event in state.events]
     assert all(state.refused is None and state.rig_from_object is None for state in states)
-    assert states[-1].sentence.startswith("all 10 cameras are calibrated; their scale is known to +- 0.0")
+    assert states[-1].sentence.startswith("all 10 cameras are calibrated; the scale is known to +- 0.0")
     first, last = states[0], states[-1]
     assert float((last.std[:, :3] / first.std[:, :3]).max()) < 0.9
     assert normalized(last, rig) < 1.6

@@ -91,5 +91,5 @@ def test_what_changed_of_the_object_is_said() -> None:
         ("object_exchanged", None), ("object_exchanged", "mm"), ("object_bent", "mm"),
     ]  # fmt: skip
     assert "1.2 % larger" in told[0].message
-    assert told[1].message.endswith("its fiducials are 0.012 mm (RMS) from there; made less exactly, or another one")
+    assert told[1].message.endswith("0.012 mm (RMS); it was made less accurately, or is a different object")
     assert told[2].message.startswith("fiducial 4 of the object is 0.012 ")

@@ -37,4 +37,4 @@ def test_of_two_cameras_it_is_said_that_it_may_be_the_other() -> None:
     rig, obj = imgcal.load_rig("T4").to(torch.float64).select([0, 2]), imgcal.load_object("asymmetric8")
     change = Change(1, 0, "unknown", math.nan, math.nan)
     told = Relearning(rig.camera_names).report_change(change, 1.0, 1.1, 4, RigBelief.of_prior(rig, obj))
-    assert told.message == "cam03 moved, or cam01: of two cameras nobody can tell which"
+    assert told.message == "cam03 moved, or cam01: with two cameras it is impossible to tell which"

@@ -47,7 +47,7 @@ def test_a_kind_of_values_too_far_from_the_factory_is_named(o10):
 
 def test_residuals_and_outliers_are_told_with_what_to_do():
     require_fit(0.9, 0.2, 0.3, OPTIONS)
-    with pytest.raises(RefusedError, match=r"misses the blobs by 1\.60 px .* 1\.50 px do not fit"):
+    with pytest.raises(RefusedError, match=r"misses the blobs by 1\.60 px .* 1\.50 px are not noise"):
         require_fit(1.5, 0.0, 1.6, OPTIONS)
     with pytest.raises(RefusedError, match="30 % of the labelled blobs") as found:
         require_fit(0.0, 0.3, 0.1, OPTIONS)

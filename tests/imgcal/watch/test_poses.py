@@ -75,7 +75,7 @@ def test_a_sink_that_hangs_holds_up_nobody():
     with Poses("slow", sink, most_waiting=3, end=0.1) as poses:
         for number in range(50):
             poses.publish(replace(state, snapshot=number))
-    assert poses.lost >= 49 and poses.problem == "slow: poses are dropped: more than 3 wait"
+    assert poses.lost >= 49 and poses.problem == "slow: poses were dropped: more than 3 were waiting"
     go_on.set()
 
 
