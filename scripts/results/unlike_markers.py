@@ -159,7 +159,10 @@ def measured(shape: str, runs: Path) -> dict[str, Any]:
 
 def tables(found: dict[str, Any]) -> str:
     """Right and wrong of each method, by marker; of several seeds the mean."""
-    columns = ["matched filter", "ir-cnn", *(f"{count} frames" for count in FRAMES)]
+    measured_names = {name.partition(", seed")[0] for methods in found.values() for name in methods}
+    columns = [
+        name for name in ("matched filter", "ir-cnn", *(f"{n} frames" for n in FRAMES)) if name in measured_names
+    ]
     lines = []
     for shape, methods in found.items():
         line = [shape]
