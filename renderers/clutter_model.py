@@ -34,7 +34,7 @@ NO_BLOBS = BlobRange(0, (1.0, 1.0), (1.0, 1.0), (1.0, 1.0))
 
 @dataclass(frozen=True)
 class ClutterModel:
-    """What a frame shows beside its markers."""
+    """What a frame shows besides its markers."""
 
     reflections: BlobRange = BlobRange(2, (6.0, 30.0), (2.0, 6.0), (0.5, 2.0))
     blobs: BlobRange = BlobRange(4, (1.0, 6.0), (1.0, 1.5), (0.2, 1.0))

@@ -49,7 +49,7 @@ def njit(**options: Any) -> Callable[[Function], Function]:
         try:
             compiled = numba.njit(**options)(function)
             return cast(Function, _keep_cached(compiled) if options["cache"] else compiled)
-        except RuntimeError:  # nowhere to write: compiled anew in every process
+        except RuntimeError:  # nowhere to write: compiled in every process
             return cast(Function, numba.njit(**(options | {"cache": False}))(function))
         finally:
             numba.config.CACHE_DIR = before  # type: ignore[attr-defined]

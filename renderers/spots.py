@@ -33,7 +33,7 @@ class Smear:
 
 @dataclass(frozen=True)
 class Spots:
-    """Ellipses in pixels, of uniform brightness and still where nothing else is said."""
+    """Ellipses in pixels; of uniform brightness and at rest by default."""
 
     uv: Tensor  # (*B, N, 2) px, centres
     shape: Tensor  # (*B, N, 2, 2) px^2, A of the boundary (x - uv)^T A^-1 (x - uv) = 1

@@ -40,7 +40,7 @@ class Simulate:
     object: tuple[str, ...]
     """object: file, or the name of a shipped one (asymmetric8, cube8, cube27, sphere64, wand4; printed boards: charuco,
     aprilgrid, checkerboard, circles); several, each of which moves by itself: --object A B; lights = a body with
-    markers of which nothing is known (--lights)"""
+    unknown markers (--lights)"""
     out: Path  #: folder to write; must not hold a capture yet
     lights: int = 15  #: number of markers on the body, with --object lights
     snapshots: int = 10  #: number of poses of the object
@@ -88,7 +88,7 @@ class LookAt:
 
 @dataclass(frozen=True)
 class Cameras:
-    """Make a file of cameras of which nothing is known but their images and roughly how much they see.
+    """Make a file of cameras whose image size and rough field of view are all that is known.
 
     It is what imgcal calibrate --cameras begins with where there is no factory calibration.
     Example: imgcal rig cameras my_capture --field-of-view-deg 65 --out cameras.yaml
@@ -146,15 +146,13 @@ class Calibrate:
     input: Annotated[Path, tyro.conf.Positional]  #: capture folder, detections file, or a shipped sample (sample:O10)
     object: tuple[str, ...]
     """object: file, or the name of a shipped one; several, any of which may be in view: INPUT --object A B; lights =
-    every blob may be a marker of its own, and nothing is known of them: the scale then rests on the factory positions
-    of the cameras"""
+    unknown markers, every blob may be one: the scale then rests on the factory positions of the cameras"""
     out: Path  #: folder to write
     rig: str | None = None  #: factory rig: file, or the name of a shipped one
     cameras: Path | None = None
-    """instead of --rig, where there is no factory calibration: cameras of which only the size of the images and a rough
-    focal length or field of view is known (imgcal rig cameras writes such a file), or a calibration whose places do not
-    count; carry the whole object through what neighbouring cameras see together; the rig's frame is that of its first
-    camera"""
+    """instead of --rig, without a factory calibration: a file with each camera's image size and rough focal length or
+    field of view (imgcal rig cameras writes one), or a calibration whose camera places do not count; carry
+    the whole object through what neighbouring cameras see together; the rig's frame is that of its first camera"""
     distance: tuple[str, str, float] | None = None
     """with --cameras and --object lights: CAMERA CAMERA MM, the distance of two cameras, which gives the scale; without
     it the rig is known up to scale. The first is in the origin of the rig's frame, the second on its x axis"""
@@ -203,7 +201,7 @@ class Watch:
     a rosbag2 folder or .mcap file; a table of blobs (.csv, .csv.gz).
 
     OUT gets rig.yaml (the rig as it is now, replaced in one step), history/ (as it was), events.jsonl (what happened:
-    a line of JSON each) and state.json, from which the same command goes on after any end, even a power failure.
+    a line of JSON each) and state.json, from which the same command resumes after any end, even a power failure.
     Ends with the input, or at Ctrl-C. Example: imgcal watch tcp://127.0.0.1:5555 --rig factory.yaml --object
     object.csv --out out/watch
     """
@@ -358,7 +356,7 @@ class Harvest:
     object: str  #: object file, or the name of a shipped object
     out: Path  #: folder to write
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
-    detector: str = "auto"  #: who finds the object where blobs decide nothing: auto, both, or classical for nobody
+    detector: str = "auto"  #: what finds the object where blobs decide nothing: auto, both, or classical for none
     size: int = 96  #: crop pixels, each way: as the network takes them
     seed: int = 0  #: of the crops' places
     videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
@@ -370,7 +368,8 @@ class Train:
     """Train a network as an experiment file says.
 
     Writes OUT/model.safetensors, resolved.yaml, metrics.jsonl and TensorBoard's files.
-    Ctrl-C saves the state first; so do steps on the way, and --resume goes on from there, with the same result.
+    Ctrl-C saves the state first, as the training does from time to time; --resume continues from there, with the same
+    result.
     Several processes: torchrun --nproc-per-node 2 -m imgcal train ...; on GPUs also accelerate launch -m imgcal ...
     Example: imgcal train table1-row01 --out out/row01
     """

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -16,6 +16,7 @@ from imgcal.cli import arguments
 from imgcal.cli.common import (
     check_folder,
     drop_cameras,
+    keep_memory,
     open_rig,
     parse_range,
     progress,
@@ -23,11 +24,8 @@ from imgcal.cli.common import (
     select_cameras,
     start_pose,
 )
-from imgcal.cli.counts import doubtful_cameras
 from imgcal.cli.describe import describe, describe_refusal
-from imgcal.cli.findings import findings
-from imgcal.cli.memory import keep_memory
-from imgcal.cli.outcome import print_outcome, refused_summary, summary
+from imgcal.cli.outcome import doubtful_cameras, findings, print_outcome, refused_summary, summary
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import Gauge
 from imgcal.extras import advice, missing
@@ -94,10 +92,7 @@ class Calibrate(arguments.Calibrate):
         detections, frames = read_detections(source, self.snapshots, self.detection, measurer, obj.board)
         detections = select_cameras(detections, rig)
         seconds = {"loading": loaded - started, "reading and detection": time.perf_counter() - loaded}
-
-        def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
-            return progress(snapshots, total, "identifying")
-
+        bar = partial(progress, label="identifying")
         outcome: Calibration | RefusedError
         try:
             if self.cameras is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 import re
@@ -29,6 +30,8 @@ from imgcal.pipeline import LearnedMeasurer, detect_capture
 from imgcal.types import Board, CameraRig, Detections
 
 Item = TypeVar("Item")
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # as glibc's malloc.h numbers them
+KEPT, LARGEST = 256 << 20, 32 << 20  # bytes: that are free and kept, and of an array that is
 
 
 def open_rig(given: str) -> CameraRig:
@@ -97,14 +100,11 @@ def read_detections(
 
 
 def progress(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
-    """Show a progress bar on standard error, if that is a terminal, while going through `items`."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    console = Console(file=sys.stderr)
-    if not console.is_terminal:  # some versions of rich write a line even where it is disabled
-        yield from items
-        return
-    with Progress(*columns, console=console, transient=True) as bar:
-        yield from bar.track(items, total=total, description=label)
+    """Show a progress bar while going through `items`; see `progress_bar`."""
+    with progress_bar(label, total) as advance:
+        for item in items:
+            yield item
+            advance(1)
 
 
 def start_pose(values: StartPose | None) -> RigidTransform | None:
@@ -152,12 +152,25 @@ def check_folder(path: Path) -> None:
 
 @contextmanager
 def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar on standard error, if that is a terminal; yields what is to be told of each advance."""
+    """Show a progress bar on standard error, if that is a terminal; yields a function to call with each advance."""
     console = Console(file=sys.stderr)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     if not console.is_terminal:  # some versions of rich write a line even where it is disabled
         yield lambda done: None
         return
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda done: bar.advance(task, done)
+
+
+def keep_memory() -> bool:
+    """Let the allocator keep what was freed, and tell whether it does: glibc's can.
+
+    Networks and maps make arrays of some megabytes for every snapshot. Given back each time, their pages are new each
+    time, and the kernel takes longer to clear them than the arithmetic takes.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):  # another C library, or Windows
+        return False
+    return bool(mallopt(TRIM_THRESHOLD, KEPT) and mallopt(MMAP_THRESHOLD, LARGEST))

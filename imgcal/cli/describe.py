@@ -13,7 +13,7 @@ from torch import Tensor
 
 import imgcal
 from imgcal.association import match_to_rig
-from imgcal.cli.findings import Findings
+from imgcal.cli.outcome import Findings
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
 from imgcal.io import Frame

@@ -22,7 +22,7 @@ from imgcal.fleet import recalibrate_fleet as recalibrate
 from imgcal.io import load_object, write_text, yaml_text
 from imgcal.types import RigPrior
 
-EVERY = 60.0  # s between lines where nobody looks at a terminal
+EVERY = 60.0  # s between lines without a terminal
 NEEDED = ("ray", "pyarrow", "fsspec", "filelock")
 
 
@@ -39,13 +39,13 @@ class Fleet(arguments.Fleet):
                 raise InputError(f"{name}: found {value:g}, expected more than 0")
         before = RigPrior() if self.rig is None else open_rig(self.rig).prior or RigPrior()
         if self.object is not None:
-            load_object(self.object)  # what is wrong for all is said at once
+            load_object(self.object)  # an error that concerns all captures is reported now
         manifest, dataset = Manifest(self.manifest, self.rig, self.object), Dataset(self.out)
         if self.cores is not None and self.cores < 1:
             raise InputError(f"--cores: found {self.cores}, expected at least 1")
         manifest.check()
         with dataset.written():
-            pass  # it can be, and nobody else is at it
+            pass  # it can be written, and no other run is using it
         settings = Settings(self.blind_cameras, self.detector, self.seconds, self.memory_mb, self.keep_rigs)
         started = time.perf_counter()
         with Engine(self.address, self.cores) as engine, _show_progress() as tell:

@@ -30,69 +30,13 @@ DONE, UNUSABLE, REFUSED, INTERRUPTED = 0, 2, 3, 130
 
 DEBUG, VERSION = "--debug", "--version"
 
-COMMANDS = {
-    "simulate": (
-        "imgcal.cli.simulate",
-        "Make a capture: one rig that has drifted from its factory calibration, seen through realistic infrared "
-        "frames.",
-    ),
-    "rig": (
-        "imgcal.cli.rig",
-        "Make rig files: cameras that look at a point, for simulations, or cameras yet to be calibrated.",
-    ),
-    "detect": ("imgcal.cli.detect", "Find blobs in captured frames and measure their centres."),
-    "calibrate": (
-        "imgcal.cli.calibrate",
-        "Recalibrate a rig from captured frames (or a table of blobs) of a known object.",
-    ),
-    "watch": (
-        "imgcal.cli.watch",
-        "Keep a running rig calibrated: learn from every snapshot, and report cameras that move.",
-    ),
-    "score": (
-        "imgcal.cli.score",
-        "Measure the reprojection error of a rig that is held fixed; only the object's pose is fitted in each "
-        "snapshot.",
-    ),
-    "render": (
-        "imgcal.cli.render",
-        "Redraw captured frames as colour-coded images: every fiducial a soft dot in its own colour, nothing else.",
-    ),
-    "convert": (
-        "imgcal.cli.convert",
-        "Convert the calibration of a rig: another tool's to ours, ours to another tool's, or one tool's to another's.",
-    ),
-    "export": (
-        "imgcal.cli.export",
-        "Write a trained network for another runtime: ONNX, or a program of torch.export.",
-    ),
-    "describe": ("imgcal.cli.experiment_keys", "List every key of an experiment file: type, default and meaning."),
-    "harvest": (
-        "imgcal.cli.harvest",
-        "Make training data of a calibrated capture: crops of its frames in which every marker's place is known.",
-    ),
-    "train": ("imgcal.cli.train", "Train a network as an experiment file says."),
-    "evaluate": (
-        "imgcal.cli.evaluate",
-        "Measure networks and classical methods on random rigs, alone and refined.",
-    ),
-    "compare": (
-        "imgcal.cli.evaluate",
-        "Compare networks side by side on the same random rigs: accuracy alone and refined, time, parameters, size.",
-    ),
-    "fleet": (
-        "imgcal.cli.fleet",
-        "Recalibrate every capture of a table, on all cores of this machine or on a cluster, and learn from all of "
-        "them.",
-    ),
-    "demo": (
-        "imgcal.cli.demo",
-        "See it at work: a simulated rig that is kept calibrated, on a page with buttons that bump and cover its "
-        "cameras.",
-    ),
-    "warmup": ("imgcal.cli.warmup", "Compile ahead of time what the first calibration would wait for"),
-}
-"""Module and summary of each command; the class has the command's name, here and among the arguments."""
+COMMANDS = (
+    "simulate", "rig", "detect", "calibrate", "watch", "score", "render", "convert", "export", "describe", "harvest",
+    "train", "evaluate", "compare", "fleet", "demo", "warmup",
+)  # fmt: skip
+"""Each has a class of its name, among the arguments and in the module of its name."""
+ELSEWHERE = {"describe": "experiment_keys", "compare": "evaluate"}
+"""Modules of commands that have none of their name."""
 
 DESCRIPTION = """Recalibrate infrared multi-camera rigs from images of a known calibration object.
 
@@ -160,7 +104,7 @@ def _parse(arguments: list[str]) -> Runnable:
         given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=options)
         _check_values(given, options)
         with end_at_once():  # imports take a while
-            command = getattr(import_module(COMMANDS[first][0]), first.capitalize())
+            command = getattr(import_module(f"imgcal.cli.{ELSEWHERE.get(first, first)}"), first.capitalize())
         return command(**vars(given))
     # The shell's completion knows the options of every command; all else ends here, and names and summaries will do.
     load = _arguments if first.startswith("--tyro-") else _summary
@@ -211,7 +155,9 @@ def _arguments(name: str) -> Any:
 
 
 def _summary(name: str) -> Any:
-    return make_dataclass(name.capitalize(), (), namespace={"__doc__": COMMANDS[name][1]})
+    """A command without options, and the first paragraph of its help."""
+    words = (_arguments(name).__doc__ or "").partition("\n\n")[0]
+    return make_dataclass(name.capitalize(), (), namespace={"__doc__": words})
 
 
 def _strip_boxes(box: str, first: str = "") -> str:
@@ -267,7 +213,7 @@ def _shorten(problem: str, command: str = "") -> str:
 
 
 def _verdict(error: BaseException, given: list[str]) -> tuple[int, str]:
-    """Say what a failure means to the user: exit code and message."""
+    """Translate a failure into an exit code and a message."""
     match error:
         case InputError():
             return UNUSABLE, str(error)

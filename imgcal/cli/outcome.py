@@ -1,24 +1,145 @@
-"""What comes of a calibration: in the form of result.json, and in the words of the terminal."""
+"""What comes of a calibration: in the form of result.json, and in the words of the terminal.
+
+Blobs, labels and labels that do not fit are counted; the findings say which cameras have moved, what is not known, and
+where to take the object next.
+"""
 
 from __future__ import annotations
 
 import math
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import imgcal
-from imgcal.cli.counts import blobs_by_camera, counts_by_camera, counts_by_snapshot
-from imgcal.cli.findings import UNKNOWN, Findings
 from imgcal.errors import RefusedError
-from imgcal.pipeline import Calibration, rms_length
-from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError
+from imgcal.estimation import Gauge
+from imgcal.io import RigCovariance
+from imgcal.messages import list_names
+from imgcal.pipeline import (
+    DOUBTFUL,
+    Calibration,
+    Coverage,
+    LabelCounts,
+    Motion,
+    measure_coverage,
+    motion_since_factory,
+    rms_length,
+)
+from imgcal.types import CalibrationObject, CameraRig, Detections, MovedCamera, MovedError
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What printed lines, result.json and the report share."""
+
+    motion: Motion
+    knowledge: Coverage
+    from_scratch: bool = False  # there was no factory calibration since which a camera could have moved
+    moved: tuple[MovedCamera, ...] = ()  # during the capture
+    untimed: tuple[str, ...] = ()  # cameras without evidence that their frames show the same moments
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Plain values for result.json."""
+        motion, known = self.motion, self.knowledge
+        reference = motion.gauge.reference
+        since_factory = () if self.from_scratch else motion.moves
+        return {
+            "moved": [move.as_values() for move in (*since_factory, *self.moved)],
+            "motion": None
+            if self.from_scratch
+            else {
+                "relative_to": "most cameras" if reference is None else motion.camera_names[reference],
+                "cameras_moved": [motion.camera_names[c] for c in motion.moved],
+                "per_camera": {
+                    name: {"rotation_deg": float(motion.rotation_deg[c]), "position_mm": float(motion.position_mm[c])}
+                    for c, name in enumerate(motion.camera_names)
+                },
+            },
+            "timing_untested": list(self.untimed),
+            "knowledge": {
+                "coverage": dict(zip(known.camera_names, known.coverage, strict=True)),
+                "undetermined": {name: list(cameras) for name, cameras in known.undetermined.items()},
+                "move_object_to_mm": [list(place.rig_from_centre) for place in known.places],
+            },
+        }
+
+    @property
+    def lines(self) -> list[str]:
+        """What is printed."""
+        lines = [self.motion.sentence] if self.motion.sentence and not self.from_scratch else []
+        if self.knowledge.sentences:
+            lines.append("not known: " + " ".join(self.knowledge.sentences))
+        if self.untimed:
+            which = "all cameras" if len(self.untimed) == len(self.knowledge.camera_names) else list_names(self.untimed)
+            lines.append(
+                f"timing of {which} not tested: the object moved too little, or too evenly, between snapshots to show "
+                "a camera that is late"
+            )
+        if self.knowledge.advice:
+            lines.append(self.knowledge.advice)
+        return lines
+
+
+UNKNOWN: dict[str, Any] = {"motion": None, "timing_untested": None, "knowledge": None}
+"""`Findings.values` of a refused run."""
+
+
+def findings(calibration: Calibration, gauge: Gauge, covariance: RigCovariance) -> Findings:
+    """Derive motion and coverage from a calibration."""
+    motion, knowledge = motion_since_factory(calibration, gauge), measure_coverage(calibration, covariance.std)
+    return Findings(motion, knowledge, calibration.from_scratch, calibration.moved, calibration.untimed)
+
+
+def counts_by_camera(calibration: Calibration, camera: int) -> dict[str, int]:
+    """Count over all snapshots."""
+    blobs = int((calibration.labelled_detections.camera == camera).sum())
+    return {"blobs": blobs, **_counts(calibration.tally, np.s_[:, camera])}
+
+
+def counts_by_snapshot(calibration: Calibration) -> dict[str, dict[str, int]]:
+    """Count over all cameras: snapshot name -> numbers."""
+    detections = calibration.labelled_detections
+    blobs = np.bincount(detections.snapshot, minlength=len(detections.snapshot_names)).tolist()
+    found = {
+        name: {"blobs": count, "labelled": 0, "outliers": 0}
+        for name, count in zip(detections.snapshot_names, blobs, strict=True)
+    }
+    for row, snapshot in enumerate(calibration.labelled.snapshots):  # several rows may be of one snapshot
+        for key, count in _counts(calibration.tally, np.s_[row]).items():
+            found[snapshot.name][key] += count
+    return found
+
+
+def blobs_by_camera(detections: Detections, rig: CameraRig) -> dict[str, dict[str, Any]]:
+    """Count the blobs of each camera of a refused capture."""
+    found = detections.count_by_camera().tolist()
+    blobs = dict(zip(detections.camera_names, found, strict=True))
+    return {name: {"blobs": blobs.get(name, 0), "labelled": None, "outliers": None} for name in rig.camera_names}
+
+
+def doubtful_cameras(calibration: Calibration) -> list[str]:
+    """Name the cameras that see a part of the object in the wrong place."""
+    kept, unexplained = calibration.tally.kept.sum(0), calibration.tally.unexplained.sum(0)
+    doubtful = np.flatnonzero(unexplained > DOUBTFUL * np.maximum(kept + unexplained, 1))
+    stopped = [str(camera) for camera in calibration.doubtful]
+    return [f"{late}; these took no part" for late in calibration.late] or stopped + [
+        f"camera {calibration.rig.camera_names[c]}: {unexplained[c]} blobs may be fiducials and are not where these "
+        f"should be, {kept[c]} are"
+        for c in doubtful
+    ]
+
+
+def _counts(counts: LabelCounts, part: Any) -> dict[str, int]:
+    return {name: int(getattr(counts, name)[part].sum()) for name in ("labelled", "outliers")}
 
 
 def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, Any]:
-    """Put a calibration into the form that scripts read."""
+    """Summarize a calibration as plain values for result.json."""
     labelled, snapshots = calibration.labelled, calibration.labelled.snapshots
     used, total = labelled.moment_counts
     seen = calibration.observations.seen
@@ -120,7 +241,7 @@ def _object_summary(calibration: Calibration) -> list[dict[str, Any]]:
 
 
 def _named(obj: CalibrationObject, fiducial: int) -> int | str:
-    """What people call a fiducial: its row; with several objects, also that of its object."""
+    """Name a fiducial by its row; with several objects, by the object and its row there."""
     if not obj.parts:
         return fiducial
     part = int(obj.part_of[fiducial])
@@ -139,7 +260,7 @@ def _guess_summary(calibration: Calibration) -> dict[str, Any] | None:
 def refused_summary(
     refusal: RefusedError, detections: Detections, rig: CameraRig, seconds: dict[str, float]
 ) -> dict[str, Any]:
-    """Say why there is no result, with the same keys."""
+    """Summarize a refusal under the same keys."""
     moved = refusal.moved if isinstance(refusal, MovedError) else ()
     return {
         "version": imgcal.__version__,
@@ -182,7 +303,7 @@ def refused_summary(
 
 
 def predicted_line(predicted: dict[str, Any]) -> str:
-    """Say in one line how good the rig is where it is used."""
+    """Describe in one line the predicted error where the rig is used."""
     lengths = [
         f"{value:.2g} {unit} (95 %: {p95:.2g})"
         for unit in ("mm", "px")
@@ -204,7 +325,7 @@ def _offsets(result: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bool) -> None:
-    """Say on the terminal what was found, and where it is written; notes go to standard error."""
+    """Print what was found and where it was written; notes go to standard error."""
     guess = result["first_guess"]
     alone = None if guess is None else guess["rms_px"]
     network = "" if alone is None else f"network alone {alone:.3f} px, "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from functools import partial
 
 import numpy as np
 import torch
@@ -28,10 +28,7 @@ class Render(arguments.Render):
             raise InputError(f"{self.out}: found images of these cameras there already, expected a new folder")
         source = open_input(self.input, rig, obj.rows, self.videos_differ)
         detections, _ = read_detections(source, self.snapshots, self.detection, board=obj.board)
-
-        def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
-            return progress(snapshots, total, "identifying")
-
+        bar = partial(progress, label="identifying")
         labelled = associate(match_to_rig(detections, rig), rig, obj, progress=bar)
         kept = labelled.detections.select(np.isin(labelled.detections.snapshot, labelled.used))
         observations = to_observations(kept, rig, obj)

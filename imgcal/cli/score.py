@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable
+from functools import partial
 
 import torch
 
@@ -23,17 +23,14 @@ class Score(arguments.Score):
         rig, obj = open_rig(self.rig), load_objects(self.object)
         source = open_input(self.input, rig, obj.rows, self.videos_differ)
         detections, _ = read_detections(source, self.snapshots, self.detection, board=obj.board)
-
-        def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
-            return progress(snapshots, total, "scoring")
-
+        bar = partial(progress, label="scoring")
         print(json.dumps(summary(score(detections, rig, obj, progress=bar), rig), indent=2))
         if doubt := unit_doubt(rig, obj):
             print(f"note: {doubt}", file=sys.stderr)
 
 
 def summary(scored: RigScore, rig: CameraRig) -> dict[str, object]:
-    """Put a score into the form that scripts read: robust figures first."""
+    """Summarize a score as plain values, robust figures first."""
     per_camera = {}
     for camera, name in enumerate(rig.camera_names):
         seen, outlier = scored.seen[:, camera], scored.outliers[:, camera]

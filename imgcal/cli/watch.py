@@ -1,4 +1,4 @@
-"""`imgcal watch`: a running rig is kept calibrated, and whoever wants to know is told."""
+"""`imgcal watch`: keep a running rig calibrated, and report what happens to it."""
 
 from __future__ import annotations
 
@@ -277,7 +277,7 @@ def _going_on() -> Iterator[None]:
 
 
 class _Stopped(threading.Event):
-    """Set by Ctrl-C or by whoever ends services."""
+    """Set by Ctrl-C, or by SIGTERM."""
 
     interrupted = False
 

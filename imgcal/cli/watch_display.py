@@ -16,10 +16,10 @@ from imgcal.messages import list_names, one_line
 from imgcal.online import Event
 from imgcal.watch import EVENTS, Hook, SourceReader, Tally
 
-SAID_EVERY = 10.0  # s between two lines where nobody looks at a terminal
+SAID_EVERY = 10.0  # s between two lines without a terminal
 DRAWN_EVERY = 0.25  # s
 SHOWN = ("late", "duplicate", "astray", "beside")
-"""What is told of exposures where it happens; missing ones show as lost cameras."""
+"""Problems of exposures that are counted in the line; missing ones show as lost cameras."""
 CLOCK_SIGMAS = 5.0
 LEAST_OFFSET = 5e-4  # s: smaller ones are the exposure's length
 

@@ -1,4 +1,4 @@
-"""Blobs in captured frames: OpenCV finds them, a fitted ellipse measures them."""
+"""Blobs in captured frames: OpenCV detects them, and a fitted ellipse measures them."""
 
 import lazy_loader as lazy
 

@@ -1,7 +1,8 @@
-"""Corners and circles of printed boards in one frame: OpenCV finds them, and says which is which.
+"""Corners and circles of printed boards in one frame: OpenCV finds and identifies them.
 
-What is found is kept where it lies as the board's layout says. How exact it is, the image says: corners are compared
-with homographies of their neighbourhoods, which a lens or a bent print hardly changes over so short a way.
+Detections are kept only where they agree with the board's layout. Their accuracy is estimated from the image: corners
+are compared with homographies of their neighbourhoods, which lens distortion or a bent print hardly affects over such a
+short distance.
 """
 
 from __future__ import annotations
@@ -25,32 +26,32 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 NEIGHBOURS = 9
-"""Points of a neighbourhood, itself included, that a homography is compared with."""
+"""Points of a neighbourhood, including the point itself, to which a homography is fitted."""
 LEAST_POINTS = 4
-UNKNOWN_SIGMA = 0.2  # px, of corners too few to be compared with each other
+UNKNOWN_SIGMA = 0.2  # px, where there are too few corners for a comparison
 LEAST_SIGMA, MOST_SIGMA = 0.02, 2.0  # px
 OFF_LAYOUT = 0.3
-"""Of the distance between neighbouring points: what is farther from where the layout has it is another corner."""
+"""Tolerance in units of the distance between neighbouring points: a corner farther off is another one."""
 LEAST_ON_LAYOUT = 0.7
-"""Share of the markers that must lie as the layout says."""
+"""Smallest share of the markers that must agree with the layout."""
 CONTRAST = 0.25
-"""Of the contrast inside the board, from which corners beyond its edge say that it goes on."""
+"""Contrast relative to that inside the board, from which the pattern continues beyond the grid's edge."""
 MOST_LOOKED = 8
-"""Frames that are looked at to say why a board was not found."""
+"""Most frames that are examined to explain why a board was not found."""
 OTHER_SIZES = 2
-"""Columns and rows more or fewer that are tried for that."""
+"""Columns and rows more or fewer that are tried for this explanation."""
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """What was found of a board in one frame."""
+    """The points of a board found in one frame."""
 
     uv: Floats  # (K, 2) pixels
     fiducial: Ints  # (K,)
 
 
 def find_board(frame: Frame, board: Board) -> Blobs:
-    """Find a board in one frame (H, W) of any depth; each point with its fiducial. Their camera is 0."""
+    """Find a board in one frame (H, W) of any depth. Returns labelled points; their camera is 0."""
     grey = _eight_bits(frame, board)
     seen = _FINDERS[board.kind](grey, board)
     if seen is None or len(seen.uv) < LEAST_POINTS:
@@ -63,10 +64,10 @@ def find_board(frame: Frame, board: Board) -> Blobs:
 
 
 def require_board(blobs: Sequence[Blobs], frames: Iterable[Frame], board: Board) -> None:
-    """Say why, where a board was found in none of some frames.
+    """Explain why no frame shows the board, if none does.
 
     Raises:
-        InputError: it was in none.
+        InputError: no frame shows it.
     """
     if not any(len(shot.uv) for shot in blobs):
         why = explain_missing(frames, board)
@@ -74,10 +75,10 @@ def require_board(blobs: Sequence[Blobs], frames: Iterable[Frame], board: Board)
 
 
 def corner_sigma(xy: Floats, uv: Floats) -> float:
-    """Standard deviation (px, each axis) of corners, by what homographies of their neighbourhoods leave.
+    """Standard deviation (px, each axis) of corners, from the residuals of homographies of their neighbourhoods.
 
     Args:
-        xy: (K, 2) where they are on the board.
+        xy: (K, 2) positions on the board.
         uv: (K, 2) pixels.
     """
     count = min(NEIGHBOURS, len(xy))
@@ -94,7 +95,7 @@ def corner_sigma(xy: Floats, uv: Floats) -> float:
 
 
 def _homography_residuals(xy: Floats, uv: Floats) -> Floats:
-    """What homographies (least squares, direct linear) leave of points: (K, M, 2) and (K, M, 2) -> (K, M, 2) pixels."""
+    """Residuals of homographies (least squares, direct linear): (K, M, 2) and (K, M, 2) -> (K, M, 2) pixels."""
     source = xy - xy.mean(1, keepdims=True)
     source = source / np.sqrt(np.square(source).mean((1, 2), keepdims=True))
     middle = uv.mean(1, keepdims=True)
@@ -110,7 +111,7 @@ def _homography_residuals(xy: Floats, uv: Floats) -> Floats:
 
 
 def _eight_bits(frame: Frame, board: Board) -> NDArray[np.uint8]:
-    """Stretch the grey values of a frame to eight bits; a board in negative is turned over."""
+    """Stretch the grey values of a frame to eight bits, and invert the frame for an inverted board."""
     grey = np.ascontiguousarray(frame)
     if grey.dtype != np.uint8:
         values = grey.astype(np.float64)
@@ -132,7 +133,7 @@ def _dictionary(name: str) -> Any:
 
 
 def dictionaries() -> list[str]:
-    """Names of the dictionaries that OpenCV has."""
+    """Names of OpenCV's dictionaries."""
     by_number = {getattr(cv2.aruco, name): name for name in sorted(dir(cv2.aruco)) if name.startswith("DICT_")}
     return sorted(by_number.values())
 
@@ -147,7 +148,7 @@ def _parameters(board: Board) -> Any:
 
 @lru_cache(maxsize=8)
 def _make_charuco(board: Board) -> Any:
-    """OpenCV's own description of a ChArUco board."""
+    """Describe a ChArUco board to OpenCV."""
     count = board.columns * board.rows // 2 if not board.legacy else (board.columns * board.rows + 1) // 2
     count = max(count, board.columns * board.rows // 2)
     dictionary = _dictionary(board.dictionary)
@@ -175,7 +176,7 @@ def _charuco(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
 
 
 def _matches_layout(corners: Any, ids: Any, layout: dict[int, Any], size: float) -> bool:
-    """Tell whether markers lie on a plane as a layout has them: id -> (4, 2) mm."""
+    """Check that markers lie on a plane as in a layout: id -> (4, 2) mm."""
     known = [k for k, marker in enumerate(np.ravel(ids)) if int(marker) in layout]
     if len(known) < LEAST_ON_LAYOUT * len(np.ravel(ids)):
         return False
@@ -202,7 +203,7 @@ def _april_grid(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
     corners, number = corners[inside], number[inside]
     points = board.points[:, :2].reshape(-1, 4, 2)[number]
     layout = {int(n): p for n, p in zip(number, points, strict=True)}
-    # Printed tags may all be turned in their places: OpenCV and AprilTag's own images differ by half a turn.
+    # Printed tags may all be rotated in place: OpenCV's images and AprilTag's own differ by half a turn.
     for turn in range(4):
         turned = np.roll(corners, turn, axis=1)
         if len(number) > 1 and _matches_layout(turned, number, layout, board.marker):
@@ -212,7 +213,7 @@ def _april_grid(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
 
 
 def _markers(grey: NDArray[np.uint8], board: Board) -> tuple[Floats, Ints]:
-    """All markers of the board's dictionary: corners (K, 4, 2), ids (K,)."""
+    """Detect all markers of the board's dictionary: corners (K, 4, 2), ids (K,)."""
     corners, ids, _ = cv2.aruco.ArucoDetector(_dictionary(board.dictionary), _parameters(board)).detectMarkers(grey)
     if ids is None or not len(corners):
         return np.zeros((0, 4, 2)), np.zeros(0, dtype=np.int64)
@@ -233,9 +234,9 @@ def _checkerboard(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
         return None
     grid = np.asarray(corners, dtype=np.float64).reshape(down, across, 2)
     grid = _flip_mirrored(grid)
-    if _goes_on(grey, grid):
+    if _continues(grey, grid):
         return None
-    # The first square, at the top left, is black; so is the first between four inner corners.
+    # The first square, at the top left, is black; so is the first square enclosed by four inner corners.
     if _colour(grey, grid, 0, 0) > _colour(grey, grid, 0, 1):
         turned = grid[::-1, ::-1]
         if _colour(grey, turned, 0, 0) > _colour(grey, turned, 0, 1) and across == down:
@@ -256,7 +257,7 @@ def _circles(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
 
 @lru_cache(maxsize=1)
 def _blob_detector() -> Any:
-    library: Any = cv2  # whose types do not know of it
+    library: Any = cv2  # its type stubs lack this class
     parameters = library.SimpleBlobDetector_Params()
     parameters.minArea, parameters.maxArea = 12, 50_000
     parameters.minDistBetweenBlobs = 4
@@ -264,18 +265,18 @@ def _blob_detector() -> Any:
 
 
 def _flip_mirrored(grid: Floats) -> Floats:
-    """Reverse the rows of a grid (R, C, 2) that is numbered as a mirror would show it."""
+    """Reverse the rows of a grid (R, C, 2) that is numbered as in a mirror image."""
     right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     return grid if right[0] * down[1] - right[1] * down[0] > 0 else grid[:, ::-1]
 
 
 def _colour(grey: NDArray[np.uint8], grid: Floats, row: int, column: int) -> float:
-    """Grey value in the middle of four inner corners."""
+    """Grey value at the centre of four inner corners."""
     return _grey_at(grey, grid[row : row + 2, column : column + 2].mean((0, 1))[None])[0]
 
 
 def _grey_at(grey: NDArray[np.uint8], uv: Floats) -> Floats:
-    """Grey values at pixels (K, 2), averaged over nine; nan outside."""
+    """Grey values at pixels (K, 2), averaged over 3 x 3; nan outside."""
     smooth = cv2.blur(grey, (3, 3))
     column, row = np.rint(uv).astype(np.int64).T
     inside = (column >= 0) & (row >= 0) & (column < grey.shape[1]) & (row < grey.shape[0])
@@ -283,10 +284,10 @@ def _grey_at(grey: NDArray[np.uint8], uv: Floats) -> Floats:
     return np.where(inside, value, np.nan)
 
 
-def _goes_on(grey: NDArray[np.uint8], grid: Floats) -> bool:
-    """Tell whether the squares go on beyond some side of the grid: the board is larger than what was looked for."""
+def _continues(grey: NDArray[np.uint8], grid: Floats) -> bool:
+    """Check whether the squares continue beyond a side of the grid: then the board is larger than expected."""
     for side in (grid, grid[::-1], grid.transpose(1, 0, 2), grid[:, ::-1].transpose(1, 0, 2)):
-        # Middles of the squares beyond the side, and of those one farther: white paper, or squares of two colours.
+        # Centres of the squares beyond the side and one row farther in: white paper, or squares of two colours.
         first, second = (side[0, 1:] + side[0, :-1]) / 2, (side[1, 1:] + side[1, :-1]) / 2
         inner = _grey_at(grey, (first + second) / 2)
         outer = _grey_at(grey, first + 1.5 * (first - second))
@@ -307,15 +308,15 @@ _FINDERS: dict[str, Callable[[NDArray[np.uint8], Board], _Seen | None]] = {
 }
 
 
-# Why there is none
+# Explanations for a missing board
 
 
 def explain_missing(frames: Iterable[Frame], board: Board) -> str:
-    """Say why a board is in none of some frames, as far as these show it: one line, to follow `found no ...`."""
+    """Explain as well as possible why no frame shows a board: one line, to follow `found no ...`."""
     looked = [_eight_bits(frame, board) for _, frame in zip(range(MOST_LOOKED), frames, strict=False)]
     negative = [255 - grey for grey in looked]
     if not board.is_coded:
-        return _other_grid(looked, board) or _turned_over(negative, board)
+        return _explain_other_grid(looked, board) or _explain_inverted(negative, board)
     found = [_markers(grey, board) for grey in looked]
     ids = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(number for _, number in found)]))
     if len(ids) >= 2:
@@ -323,19 +324,19 @@ def explain_missing(frames: Iterable[Frame], board: Board) -> str:
         last = board.first_id + count - 1
         if ids.max() > last or ids.min() < board.first_id:
             return (
-                f"markers {ids.min()} to {ids.max()} of {board.dictionary} are seen, expected {board.first_id} to "
-                f"{last}: the board has other numbers of columns and rows, or another first_id"
+                f"markers {ids.min()} to {ids.max()} of {board.dictionary} are visible, expected {board.first_id} to "
+                f"{last}: the board has another number of columns or rows, or another first_id"
             )
-        seen = f"{len(ids)} markers of {board.dictionary} are seen, but they do not lie as on this board"
+        seen = f"{len(ids)} markers of {board.dictionary} are visible, but not in the layout of this board"
         if board.kind == "charuco":
-            return f"{seen}: are columns and rows exchanged, or is it a legacy pattern?"
-        return f"{seen}: look at columns, rows, tag, gap and numbered_from"
+            return f"{seen}: check whether columns and rows are swapped, or the pattern is a legacy one"
+        return f"{seen}: check columns, rows, tag, gap and numbered_from"
     if sum(len(_markers(grey, board)[1]) for grey in negative) >= 2:
-        return f"it is printed the other way round: expected inverted: {'false' if board.inverted else 'true'}"
-    return _other_dictionary(looked, board)
+        return f"black and white are swapped: expected inverted: {'false' if board.inverted else 'true'}"
+    return _explain_other_dictionary(looked, board)
 
 
-def _other_dictionary(looked: list[NDArray[np.uint8]], board: Board) -> str:
+def _explain_other_dictionary(looked: list[NDArray[np.uint8]], board: Board) -> str:
     counts = {}
     for name in dictionaries():
         detector = cv2.aruco.ArucoDetector(_dictionary(name), _parameters(board))
@@ -343,13 +344,13 @@ def _other_dictionary(looked: list[NDArray[np.uint8]], board: Board) -> str:
         counts[name] = sum(0 if found is None else len(found) for found in ids)
     best = max(counts.values())
     if best < 3:
-        return "no marker of any dictionary is seen"
-    # The small dictionaries of a family are the beginnings of the large ones.
+        return "no marker of any dictionary is visible"
+    # The small dictionaries of a family are prefixes of the large ones.
     names = [name for name in counts if counts[name] == best]
-    return f"its markers are of {' or '.join(names[:4])}, expected {board.dictionary} as its file says"
+    return f"its markers are from {' or '.join(names[:4])}, expected {board.dictionary} as in its file"
 
 
-def _other_grid(looked: list[NDArray[np.uint8]], board: Board) -> str:
+def _explain_other_grid(looked: list[NDArray[np.uint8]], board: Board) -> str:
     part = "squares" if board.kind == "checkerboard" else "circles"
     least = 3 if board.kind == "checkerboard" else 2
     steps = range(-OTHER_SIZES, OTHER_SIZES + 1)
@@ -360,11 +361,11 @@ def _other_grid(looked: list[NDArray[np.uint8]], board: Board) -> str:
         for columns, rows in sizes:
             other = Board(board.kind, columns, rows, board.pitch, asymmetric=board.asymmetric)
             if _FINDERS[board.kind](grey, other) is not None:
-                return f"a board of {columns}x{rows} {part} is seen, expected {board.columns}x{board.rows}"
+                return f"a board of {columns}x{rows} {part} is visible, expected {board.columns}x{board.rows}"
     return ""
 
 
-def _turned_over(negative: list[NDArray[np.uint8]], board: Board) -> str:
+def _explain_inverted(negative: list[NDArray[np.uint8]], board: Board) -> str:
     if any(_FINDERS[board.kind](grey, board) is not None for grey in negative):
-        return f"it is printed the other way round: expected inverted: {'false' if board.inverted else 'true'}"
+        return f"black and white are swapped: expected inverted: {'false' if board.inverted else 'true'}"
     return "the whole board must be in the image, with a white margin" if not board.inverted else ""

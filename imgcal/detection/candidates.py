@@ -1,4 +1,4 @@
-"""Where the blobs are: candidate components, found on block means so that each frame is read once."""
+"""Candidate components for blobs, found on block means so that each frame is read only once."""
 
 # Compiled functions take their types from their arguments.
 # ruff: noqa: ANN001, ANN202
@@ -18,39 +18,39 @@ from imgcal.detection.options import DetectionOptions
 from renderers.compiling import njit
 
 BLOCK = 4  # px, side of a block; a 4 x 4 mean is close to the matched filter of a small blob
-NOISE_FACTOR = 5.0  # candidates stand out of the block means by this many standard deviations
-LEAST_CONTRAST = 0.006  # of full scale: below this, block means tell quantization steps rather than blobs
-LEVELS = 5  # components that are too large are tried again at higher levels
-LEVEL_STEP = 1.6  # from one level to the next
-EDGE = 0.3  # of the level: what the blocks at the edge of a blob hold
-SPLIT_AT = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9)  # of a clipped peak: levels at which several are looked for
-LEAST_CLIPPED = 4  # pixels of a peak in the midst of clipped ones
+NOISE_FACTOR = 5.0  # standard deviations of the block means by which candidates exceed the background
+LEAST_CONTRAST = 0.006  # of full scale: below this, block means show quantization steps rather than blobs
+LEVELS = 5  # attempts with increasing levels for components that are too large
+LEVEL_STEP = 1.6  # factor from one level to the next
+EDGE = 0.3  # of the level: smallest contrast of the blocks at the edge of a blob
+SPLIT_AT = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9)  # of a clipped peak: levels at which it may split into several
+LEAST_CLIPPED = 4  # clipped pixels of a clipped peak
 PEAK_FRACTION = 0.3  # of the local peak: keeps the skirts of neighbours apart
 
 
 @dataclass(frozen=True)
 class Screening:
-    """Blocks of one frame that stand out of its background."""
+    """Blocks of one frame that are brighter than its background."""
 
     blocks: NDArray[np.int64]  # (K,) flat indices of blocks, ascending
     base: NDArray[np.floating]  # (K,) grey levels of the background
-    excess: NDArray[np.floating]  # (K,) grey levels above the base that a pixel of a blob exceeds
+    excess: NDArray[np.floating]  # (K,) grey levels above the base, threshold for the pixels of a blob
     means: Frame  # (R, Q) grey levels of all blocks, inverted for dark blobs
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Blocks in a column and in a row of the frame."""
+        """Number of blocks along a column and along a row of the frame."""
         return self.means.shape[0], self.means.shape[1]
 
     def holds(self, height: float, least: float, most: float, step: int = 1) -> bool:
-        """Tell whether anything `height` grey levels bright is wider than `least` (px) and narrower than `most`.
+        """Check for anything `height` grey levels bright that is wider than `least` (px) and narrower than `most`.
 
-        Only one block in `step` is looked at, along each axis.
+        Only every `step`-th block along each axis is used.
         """
         cells = self.means[::step, ::step].copy()
         wide, wider = (math.ceil(width / (step * BLOCK)) for width in (least, most))
         worn = cv2.erode(cells, np.ones((wide, wide), np.uint8))
-        if int(worn.max()) - int(cells.min()) < height:  # nothing at all is: so it is nearly always
+        if int(worn.max()) - int(cells.min()) < height:  # the usual case: nothing is that wide
             return False
         large, larger = (cv2.morphologyEx(cells, cv2.MORPH_OPEN, np.ones((n, n), np.uint8)) for n in (wide, wider))
         return float(cv2.subtract(large, larger).max()) >= height
@@ -58,13 +58,13 @@ class Screening:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Connected bright components of one frame. Their pixels are kept as tiles, one a block that holds any."""
+    """Connected bright components of one frame. Their pixels are stored as tiles, one per non-empty block."""
 
     tile: NDArray[np.int32]  # (R + 2, Q + 2) tile of each block, 0 = empty; one empty block around the frame
     labels: NDArray[np.int32]  # (K + 1, 4, 4) component of each pixel of a tile, 0 = none
     boxes: NDArray[np.int64]  # (M, 4) left, top, right, bottom pixel (included)
     label: NDArray[np.int32]  # (M,) number of the component in `labels`
-    whole: NDArray[np.int64]  # (M, 4) box of what the component is a part of: its own where it is whole
+    whole: NDArray[np.int64]  # (M, 4) box of the component before it was split; its own box if it was not
 
 
 def screen(means: Frame, options: DetectionOptions, scale: int) -> Screening:
@@ -75,7 +75,7 @@ def screen(means: Frame, options: DetectionOptions, scale: int) -> Screening:
         options: threshold and radii.
         scale: largest grey value.
     """
-    # An opening follows steps of the background (paper on a table), which a median would smear; blobs are smaller.
+    # An opening follows steps of the background (paper on a table), which a median would smear; it removes blobs.
     side = math.ceil((2 * options.radius_limit + 6) / BLOCK) + 1
     background = cv2.morphologyEx(means, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
     contrast = cv2.subtract(means, background)
@@ -86,7 +86,7 @@ def screen(means: Frame, options: DetectionOptions, scale: int) -> Screening:
 
 
 def outline(frame: Frame, screening: Screening, options: DetectionOptions, scale: int) -> Candidates:
-    """Connect the bright pixels of the screened blocks; components too large are tried again at higher levels.
+    """Connect the bright pixels of the screened blocks; components that are too large are retried at higher levels.
 
     Args:
         frame: (H, W) grey values, contiguous.
@@ -98,14 +98,14 @@ def outline(frame: Frame, screening: Screening, options: DetectionOptions, scale
     tile = np.zeros((screening.shape[0] + 2, screening.shape[1] + 2), np.int32)
     smooth = _smooth_tiles(frame, screening.blocks, tile, scale if options.polarity == "dark" else -1)
     labels = np.empty((count + 1, BLOCK, BLOCK), np.int32)
-    largest = 4 * options.radius_limit + 8  # merged blobs pass: they are to be reported
+    largest = 4 * options.radius_limit + 8  # includes merged blobs, which are reported
     level = screening.base + screening.excess
     raised, excess = np.arange(count), screening.excess
     for _ in range(LEVELS):
         boxes, small = _connect(screening.blocks, tile, smooth, level, labels, largest)
         if small.all():
             break
-        oversize = np.append(~small, False)[labels[raised + 1] - 1].any((1, 2))  # label 0, of no component: the last
+        oversize = np.append(~small, False)[labels[raised + 1] - 1].any((1, 2))  # label 0, no component, is the last
         raised, excess = raised[oversize], LEVEL_STEP * excess[oversize]
         level[raised] = screening.base[raised] + excess
     saturation = 0.995 * scale if options.saturation is None else options.saturation
@@ -121,12 +121,12 @@ def outline(frame: Frame, screening: Screening, options: DetectionOptions, scale
 
 
 def block_means(frame: Frame, options: DetectionOptions, scale: int) -> Frame:
-    """Average blocks of 4 x 4: (ceil(H / 4), ceil(W / 4)). Beyond the border the last row or column repeats.
+    """Average blocks of 4 x 4: (ceil(H / 4), ceil(W / 4)). Beyond the border the last row or column is repeated.
 
     Args:
         frame: (H, W) grey values.
         options: polarity.
-        scale: largest grey value, from which those of frames with dark blobs are subtracted.
+        scale: largest grey value, from which frames with dark blobs are subtracted.
     """
     height, width = (-(-n // BLOCK) for n in frame.shape)
     means = np.empty((height, width), frame.dtype)
@@ -136,7 +136,7 @@ def block_means(frame: Frame, options: DetectionOptions, scale: int) -> Frame:
 
 @njit(cache=True, nogil=True)
 def _average(frame, sums, means):
-    """Fill the block means in one pass over the frame, which is far larger than the cache; (4 Q,) sums are scratch."""
+    """Compute block means in one pass over the frame, which exceeds the cache; `sums` (4 Q,) is scratch."""
     height, width = frame.shape
     for row in range(len(means)):
         first, second = frame[BLOCK * row], frame[min(BLOCK * row + 1, height - 1)]
@@ -151,20 +151,20 @@ def _average(frame, sums, means):
 
 
 def _levels(contrast: NDArray[np.generic], options: DetectionOptions, scale: int) -> tuple[float, float]:
-    """Estimate what the opening leaves of an empty background, and how far above it a candidate must stand."""
-    sample = np.sort(contrast[::8, ::8], axis=None, kind="stable")  # by radix: these are integers
+    """Estimate the background's level after the opening, and the contrast that a candidate needs above it."""
+    sample = np.sort(contrast[::8, ::8], axis=None, kind="stable")  # radix sort, because these are integers
     lower = sample[: max(1, int(0.6 * sample.size))]  # without the blobs and most of the texture
     spread = float(cv2.meanStdDev(lower)[1][0, 0])
-    noise = 1.54 * spread  # the standard deviation of a normal variable below its 60th percentile
+    noise = 1.54 * spread  # converts the spread below the 60th percentile to a normal standard deviation
     level = max(NOISE_FACTOR * noise, LEAST_CONTRAST * scale)
     if options.threshold is not None:
-        level = max(level, 0.2 * options.threshold)  # a block mean holds at least this part of a small blob's peak
+        level = max(level, 0.2 * options.threshold)  # a block mean has at least this share of a small blob's peak
     return float(sample[sample.size // 2]), level
 
 
 @njit(cache=True, nogil=True)
 def _select(contrast, local_peak, background, floor, level):
-    """Blocks that stand out, and those next to them that hold something: their places (K,), base and excess."""
+    """Select bright blocks and their non-empty neighbours: indices (K,), base and excess."""
     columns, count = contrast.shape[1], 0
     blocks = np.empty(contrast.size, np.int64)
     for row in range(len(contrast)):
@@ -177,7 +177,7 @@ def _select(contrast, local_peak, background, floor, level):
     for k in range(count):
         row, column = blocks[k] // columns, blocks[k] % columns
         base[k] = background[row, column] + floor
-        # The mean of the 3 x 3 pixels around a pixel has 4/3 of the noise of a block mean.
+        # The mean of 3 x 3 pixels has 4/3 of the noise of a block mean.
         excess[k] = max(level * 4 / 3, PEAK_FRACTION * (local_peak[row, column] - floor))
     return blocks[:count], base, excess
 
@@ -186,7 +186,7 @@ def _select(contrast, local_peak, background, floor, level):
 def _smooth_tiles(frame, blocks, tile, invert):
     """Number the tiles, and average the 3 x 3 pixels around each of their pixels: (K, 4, 4), -1 outside the frame.
 
-    `invert` is the grey value from which dark frames are subtracted, -1 = bright.
+    `invert` is the grey value from which dark frames are subtracted; -1 = bright.
     """
     height, width = frame.shape
     columns = np.uint32(tile.shape[1] - 2)
@@ -210,14 +210,14 @@ def _smooth_tiles(frame, blocks, tile, invert):
 
 @njit(cache=True, nogil=True)
 def _split(blocks, base, tile, smooth, labels, count, saturation, level):
-    """Raise levels (K,) where that parts one of `count` components into several clipped peaks, joined by their light.
+    """Raise levels (K,) to split any of `count` components that consist of clipped peaks joined by their light.
 
-    Only what is connected to clipped pixels is followed, a small part of all that is bright.
+    Only pixels connected to clipped ones are visited, a small part of the bright pixels.
 
     Returns:
-        Whether there is any.
+        Whether any component was split.
     """
-    tops = np.zeros(count + 1)  # height above the base of each component that is clipped, 0 of all others
+    tops = np.zeros(count + 1)  # height of each clipped component above its base, 0 for the others
     bright, many = np.empty(len(smooth), np.int64), 0  # tiles with clipped pixels
     for k in range(len(smooth)):
         found = False
@@ -231,7 +231,7 @@ def _split(blocks, base, tile, smooth, labels, count, saturation, level):
     if many == 0:
         return False
     parts, stack = np.zeros(labels.shape, np.int32), np.empty((4 * smooth.size, 2), np.int32)
-    # What the highest level parts, and the lowest level that parts it as much.
+    # The largest number of peaks, and the lowest level that gives it.
     most, chosen = np.ones(count + 1, np.int64), np.zeros(count + 1)
     for trial in range(1, len(SPLIT_AT) + 1):
         part, parted = SPLIT_AT[len(SPLIT_AT) - trial], False
@@ -260,7 +260,7 @@ def _split(blocks, base, tile, smooth, labels, count, saturation, level):
 
 @njit(cache=True, nogil=True)
 def _highest(labels, k, values):
-    """Largest value of the components that have pixels in a tile, at least 0."""
+    """Largest value of the components with pixels in a tile, at least 0."""
     highest = 0.0
     for i in range(BLOCK):
         for j in range(BLOCK):
@@ -270,7 +270,7 @@ def _highest(labels, k, values):
 
 @njit(cache=True, nogil=True)
 def _count_peaks(blocks, bright, tile, smooth, labels, parts, count, saturation, stack):
-    """Number of clipped peaks (count + 1,) in each component of `labels`; `parts` marks the pixels above a level."""
+    """Count the clipped peaks (count + 1,) in each component of `labels`; `parts` marks the pixels above a level."""
     flat, box, pieces = parts.reshape(-1), np.zeros(4, np.int64), 0
     clipped = np.zeros(BLOCK * BLOCK * len(bright) + 1, np.int64)
     peaks = np.zeros(count + 1, np.int64)
@@ -290,7 +290,7 @@ def _count_peaks(blocks, bright, tile, smooth, labels, parts, count, saturation,
 
 @njit(cache=True, nogil=True)
 def _parents(merged, labels, count):
-    """Component (counted from 0) of `merged` that each of the `count` components of `labels` is a part of."""
+    """Component of `merged` (from 0) that contains each of the `count` components of `labels`."""
     parents = np.zeros(count, np.int64)
     for k in range(1, len(labels)):
         for i in range(BLOCK):
@@ -302,16 +302,16 @@ def _parents(merged, labels, count):
 
 @njit(cache=True, nogil=True)
 def _place(tile, v, u):
-    """Place of a pixel, counted from the empty blocks around the frame, among all pixels of all tiles."""
+    """Flat index of a pixel in the tiles; coordinates start at the empty blocks around the frame."""
     return np.uint32(tile[np.uint32(v) >> 2, np.uint32(u) >> 2] * BLOCK * BLOCK + (v & 3) * BLOCK + (u & 3))
 
 
 @njit(cache=True, nogil=True)
 def _connect(blocks, tile, smooth, level, labels, largest):
-    """Number the components (eight neighbours) of the pixels above the level (K,) of their tile from 1, all others 0.
+    """Label connected components (8-neighbourhood) of pixels above their tile's level (K,) from 1; 0 elsewhere.
 
     Returns:
-        Their boxes (M, 4), and which are smaller than `largest` (M,).
+        Their boxes (M, 4), and whether each is smaller than `largest` (M,).
     """
     labels[0] = 0
     for k in range(len(smooth)):
@@ -339,14 +339,14 @@ def _connect(blocks, tile, smooth, level, labels, largest):
 
 @njit(cache=True, nogil=True)
 def _corner(block, tile):
-    """First pixel (v, u) of a block, counted from the empty blocks around the frame."""
+    """First pixel (v, u) of a block; coordinates start at the empty blocks around the frame."""
     columns = tile.shape[1] - 2
     return BLOCK * (block // columns + 1), BLOCK * (block % columns + 1)
 
 
 @njit(cache=True, nogil=True)
 def _fill(flat, tile, v, u, number, stack, box):
-    """Number the component of a marked pixel, and fill in its box; pixels are counted as in `_place`."""
+    """Label the component of a marked pixel, and compute its box; coordinates as in `_place`."""
     box[0], box[1], box[2], box[3] = u, v, u, v
     stack[0, 0], stack[0, 1], size = v, u, 1
     while size:

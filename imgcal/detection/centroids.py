@@ -1,6 +1,6 @@
-"""How exactly a blob lies where: a blurred ellipse fitted above the local background, else the weighted centroid.
+"""Accurate blob centres: the fit of a blurred ellipse above the local background, or the weighted centroid.
 
-Each blob is measured in a window of its own that is walked a few times while it is in the cache.
+Each blob is measured in its own window, which is visited a few times while it is in the cache.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class Blobs:
     sigma: NDArray[np.float64]  # (K,) pixels
     radius: NDArray[np.float64]  # (K,) pixels
     flags: NDArray[np.uint8]  # (K,) BlobFlag bits
-    camera: NDArray[np.int64]  # (K,) which of the frames
+    camera: NDArray[np.int64]  # (K,) index of the frame
     contrast: NDArray[np.float64]  # (K,) brightest pixel above the background, share of full scale
-    fiducial: NDArray[np.int64]  # (K,) which one it is, -1 = the image does not say
+    fiducial: NDArray[np.int64]  # (K,) label, -1 = unknown from the image
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Blobs:
         """Keep the given rows."""
@@ -40,7 +40,7 @@ def to_detections(shots: Sequence[Blobs], camera_names: tuple[str, ...], snapsho
 
     Args:
         shots: blobs of each snapshot, at least one.
-        camera_names: which `Blobs.camera` counts.
+        camera_names: names of the cameras that `Blobs.camera` indexes.
         snapshot_names: one for each snapshot.
     """
     names = ("uv", "sigma", "radius", "flags", "camera", "fiducial")
@@ -90,7 +90,7 @@ def measure(frame: Frame, candidates: Candidates, options: DetectionOptions, sca
 
 
 def _first(blobs: Blobs, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Rows of the kept blobs without those that lie on an earlier one: components of one blob found in pieces."""
+    """Rows of the kept blobs without duplicates at the same pixel: components of one blob that was found in pieces."""
     rows = np.flatnonzero(kept)
     places = [(round(u), round(v)) for u, v in blobs.uv[rows].tolist()]
     if len(set(places)) == len(places):

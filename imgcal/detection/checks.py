@@ -1,4 +1,4 @@
-"""Checks of the frames and masks that the detector is given."""
+"""Checks of the detector's input frames and masks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Frame = NDArray[np.uint8] | NDArray[np.uint16]  # (H, W) grey values
 
 
 def check_frame(frame: object, camera: str) -> Frame:
-    """Return `frame` as a grey (H, W) image of 8 or 16 bit if it is one, also in equal channels; explain otherwise."""
+    """Return `frame` as a grey (H, W) image of 8 or 16 bit, also from equal channels; explain why if it is none."""
     if not isinstance(frame, np.ndarray):
         raise InputError(f"camera {camera}: found a {type(frame).__name__}, expected a NumPy array (H, W)")
     if frame.dtype not in (np.uint8, np.uint16):

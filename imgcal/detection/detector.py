@@ -1,4 +1,4 @@
-"""Frames in, `Detections` out."""
+"""Detection of blobs: from frames to `Detections`."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from imgcal.detection.populations import DIMMER, drop_dim, usable, usual_size
 from imgcal.errors import InputError
 from imgcal.types import BlobFlag, Board, Detections
 
-LARGER = 32.0  # px, radius up to which blobs show when they are looked for with the usual limit
-LARGEST = 48.0  # px, radius that the windows hold
-FEW = 4  # usable blobs of a frame below which much larger ones are looked for
+LARGER = 32.0  # px, largest radius that a search with the usual limit still finds
+LARGEST = 48.0  # px, largest radius that fits the windows
+FEW = 4  # usable blobs of a frame below which the search for much larger ones is finer
 
 Mask = NDArray[np.bool_] | NDArray[np.uint8]  # (H, W) non-zero inside known reflections
 
@@ -36,13 +36,13 @@ def detect(
     """Detect the blobs of all cameras in one or several snapshots.
 
     Args:
-        frames: camera name -> frame (H, W) uint8 or uint16, or one frame a snapshot; None = the camera has no frame.
+        frames: camera name -> frame (H, W) uint8 or uint16, or one frame per snapshot; None = no frame.
         options: what counts as a blob.
         masks: camera name -> (H, W), non-zero inside known reflections; blobs there are flagged.
-        board: the printed board whose points are found instead of blobs, each with its label.
+        board: a printed board to detect instead of blobs; its points are labelled.
 
     Raises:
-        InputError: the board is in no frame; a frame is no grey image, or cameras have different numbers of snapshots.
+        InputError: no frame shows the board; a frame is no grey image, or cameras differ in their number of snapshots.
 
     Examples:
         >>> import imgcal
@@ -82,14 +82,14 @@ def detect_snapshot(
     whole_capture: bool = False,
     board: Board | None = None,
 ) -> Blobs:
-    """Detect the blobs of one snapshot; `Blobs.camera` counts the cameras in the order of `frames`.
+    """Detect the blobs of one snapshot; `Blobs.camera` indexes the cameras in the order of `frames`.
 
     Args:
         frames: camera name -> frame (H, W), None = missing.
         options: what counts as a blob.
         masks: camera name -> (H, W).
-        pool: threads that live on between snapshots; None = a pool for this call.
-        whole_capture: the blobs of all snapshots will go through `drop_dim` together; nothing is left out here.
+        pool: threads that persist between snapshots; None = a pool for this call.
+        whole_capture: skip `drop_dim`, because the caller applies it to all snapshots together.
         board: as in `detect`; a snapshot without it is no error.
     """
     if pool is None:
@@ -104,7 +104,7 @@ def detect_snapshot(
         for image, (_, name) in zip(images, present, strict=True)
     ]
     names = [name for _, name in present]
-    # OpenCV and the compiled functions release the interpreter: frames are worked on in parallel.
+    # OpenCV and the compiled functions release the GIL, so frames are processed in parallel.
     found = list(pool.map(_detect_one, images, names, covered, [options] * len(images), [board] * len(images)))
     camera = np.repeat([camera for camera, _ in present], [len(blobs.uv) for blobs in found]).astype(np.int64)
     blobs = Blobs(
@@ -145,8 +145,8 @@ def _detect_one(
 def _find_all_sizes(frame: Frame, options: DetectionOptions, scale: int) -> Blobs:
     """Find blobs of the usual sizes, and larger ones where there are several of one size.
 
-    What is found first shows most of the larger ones, too. A frame without any blob, or with something large and as
-    bright as blobs are, is searched again; that is looked for more closely where there is hardly any blob.
+    The first search also finds most of the larger ones. A frame is searched again if it has no blob, or something large
+    that is as bright as its blobs; with hardly any blob, the check for the latter is finer.
     """
     limit, means = options.radius_limit, block_means(frame, options, scale)
     screening = screen(means, options, scale)
@@ -163,7 +163,7 @@ def _find_all_sizes(frame: Frame, options: DetectionOptions, scale: int) -> Blob
 
 
 def _median(values: NDArray[np.float64]) -> float:
-    """Do what `np.median` does for some values (K,), in a tenth of the time."""
+    """Median of values (K,), ten times faster than `np.median` for a few."""
     ordered, middle = np.sort(values), len(values) // 2
     return float(ordered[middle] + ordered[-1 - middle]) / 2
 
@@ -173,7 +173,7 @@ def _find(frame: Frame, means: Frame, options: DetectionOptions, scale: int) -> 
 
 
 def _inside(mask: NDArray[np.bool_], uv: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which centres (K, 2) lie inside a mask (H, W)."""
+    """Check which centres (K, 2) lie inside a mask (H, W)."""
     pixel = np.clip(np.rint(uv).astype(np.int64), 0, np.array(mask.shape[::-1]) - 1)
     return mask[pixel[:, 1], pixel[:, 0]]
 
@@ -183,7 +183,7 @@ def _workers(cameras: int) -> int:
 
 
 def _snapshots(frames: Mapping[str, Frame | Sequence[Frame | None] | None]) -> list[dict[str, Frame | None]]:
-    """Turn camera -> frames into one mapping camera -> frame a snapshot."""
+    """Convert camera -> frames to one mapping camera -> frame per snapshot."""
     series: dict[str, list[Frame | None]] = {}
     for name, entry in frames.items():
         if entry is None or isinstance(entry, np.ndarray):

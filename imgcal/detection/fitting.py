@@ -1,9 +1,10 @@
-"""The image of a disc fitted to a blob, compiled: its centre is as exact as the noise allows.
+"""Compiled fit of a disc's image to a blob, for a centre as accurate as the noise allows.
 
-A centroid counts all pixels of a blob alike, but only its edge tells where it is. The model is an ellipse with a soft
-edge, A Phi(c - sqrt(1 + d' Q d)) at the offset d from the centre: smooth in the middle, as a small blurred disc is,
-and a blurred step far out, as the edge of a large one. It fits blurred discs of any radius to a thousandth of their
-contrast. Symmetric about its centre, it does not move the centre of other symmetric blobs, which it fits less well.
+A centroid uses all pixels of a blob, but only its edge carries information about its position. The model is an ellipse
+with a soft edge, A Phi(c - sqrt(1 + d' Q d)) at the offset d from the centre. It is smooth in the middle, like a small
+blurred disc, and a blurred step far out, like the edge of a large one. It fits blurred discs of any radius to a
+thousandth of their contrast. It is symmetric about its centre, so it is unbiased for other symmetric blobs, too,
+although it fits them less well.
 """
 
 # Compiled functions take their types from their arguments.
@@ -16,15 +17,15 @@ import numpy as np
 
 from renderers.compiling import njit
 
-# A, c, Qxx, Qxy, Qyy, and last the centre x, y: the last corner of the Cholesky factor is what is known of it alone.
+# A, c, Qxx, Qxy, Qyy, and last the centre x, y: the last corner of the Cholesky factor is its marginal information.
 PARAMETERS = 7
 ROWS = PARAMETERS + 4  # of scratch: the derivatives, the residual; x, y and grey value of the pixels
-MOST = 3000  # pixels that are fitted; blobs that have more at their edge keep their centroid
-BLUR = 0.8  # px, softness of the edge that a clipped blob starts with
-BAND = 5.0  # of the blur: how far inside of the edge pixels are fitted
-STEPS = 5  # of Gauss and Newton; two do nearly always
-CLIPPED_STEPS = 15  # the start is farther off where the top of the blob is clipped
-SETTLED = 0.01  # of the variance: a step of the centre after which there is no other one
+MOST = 3000  # most pixels in a fit; blobs with more at their edge keep their centroid
+BLUR = 0.8  # px, initial softness of the edge of a clipped blob
+BAND = 5.0  # in units of the blur: width of the band inside the edge in which pixels are used
+STEPS = 5  # Gauss-Newton steps; two are nearly always enough
+CLIPPED_STEPS = 15  # more, because the start is farther off where the top of the blob is clipped
+SETTLED = 0.01  # of the variance: a smaller step of the centre ends the iteration
 FARTHEST = 0.5  # px from the centroid: a fit farther away has found something else
 # Phi(t) - 1/2 = t * polynomial(t^2) for |t| < END, with value 1/2 and slope 0 there: at most 2.4e-4 off.
 END = 3.5
@@ -37,15 +38,15 @@ def fit_centre(rows, pixels, start, clipped, noise):
     """Fit the centre of a blob.
 
     Args:
-        rows: (ROWS, MOST) scratch, of which the last three are offsets x, y and grey values above the background.
-        pixels: P, how many of them.
-        start: (PARAMETERS,) where to begin.
-        clipped: whether pixels are missing because they are saturated.
-        noise: one standard deviation of a pixel.
+        rows: (ROWS, MOST) scratch; its last three rows are offsets x, y and grey values above the background.
+        pixels: P, number of pixels.
+        start: (PARAMETERS,) initial parameters.
+        clipped: whether saturated pixels are left out.
+        noise: standard deviation of a pixel.
 
     Returns:
-        Centre x, y; information about it, 1 / px^2 at a noise of 1 (mean of the axes, 0 where the fit has failed); and
-        the mean of the squared residuals.
+        Centre x, y; its information, 1 / px^2 for unit noise (mean of the axes, 0 where the fit has failed); and the
+        mean squared residual.
     """
     now, cost = start, _draw(rows, pixels, start)
     normal = _products(rows, pixels)
@@ -54,7 +55,7 @@ def fit_centre(rows, pixels, start, clipped, noise):
         factor = _factor(normal, damping)
         step = _solve(factor, normal[PARAMETERS, :PARAMETERS])
         trial = now + step
-        # What is left moves the centre by much less than the noise does: no need to draw it again.
+        # The remaining change of the centre is far below the noise, so the model need not be evaluated again.
         settled = moved and normal[5, 5] * step[5] ** 2 + normal[6, 6] * step[6] ** 2 < SETTLED * noise**2
         if settled:
             now = trial
@@ -67,7 +68,7 @@ def fit_centre(rows, pixels, start, clipped, noise):
             normal, moved = _products(rows, pixels), True
         else:
             damping = max(30 * damping, 1e-2)
-    if damping > 1e-4:  # less makes no difference
+    if damping > 1e-4:  # smaller values make no difference
         factor = _factor(normal, 1e-9)
     a, b, d = factor[5, 5], factor[6, 5], factor[6, 6]
     known = a * a * d * d / ((a * a + b * b + d * d) / 2)  # one over the mean of the inverse's diagonal
@@ -76,12 +77,12 @@ def fit_centre(rows, pixels, start, clipped, noise):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def start_ellipse(peak, radius, clipped, moments, centre):
-    """Begin with the ellipse of equal area and moments, (xx, xy, yy) of the blob cut at half of its peak.
+    """Initial ellipse with the area and moments (xx, xy, yy) of the blob, clipped at half of its peak.
 
-    The half axes of the cut blob are longer than those of the disc by its blur.
+    The half axes of the clipped blob are longer than those of the disc because of its blur.
     """
     start = np.empty(PARAMETERS)
-    xx, xy, yy = 4 * moments[0], 4 * moments[1], 4 * moments[2]  # of a filled ellipse: its half axes squared
+    xx, xy, yy = 4 * moments[0], 4 * moments[1], 4 * moments[2]  # squared half axes of a filled ellipse
     longer = np.sqrt(np.sqrt(max(xx * yy - xy * xy, 0.0)))
     blur = BLUR if clipped else min(max((longer - radius) / 0.93, 0.5), 1.5)
     less = min(longer**2 - radius**2, 0.5 * min(xx, yy))
@@ -99,13 +100,13 @@ def start_ellipse(peak, radius, clipped, moments, centre):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _is_blob(p):
-    """Tell whether parameters are those of a bright ellipse."""
+    """Check that parameters describe a bright ellipse."""
     return p[0] > 0 and p[1] > 0 and p[2] > 0 and p[2] * p[4] - p[3] * p[3] > 1e-3 and abs(p[5] + p[6]) < 1e3
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _draw(rows, pixels, parameters):
-    """Fill derivatives and residuals of all pixels (columns), and return the sum of the squared residuals."""
+    """Evaluate derivatives and residuals of all pixels (columns); return the sum of the squared residuals."""
     height, edge, xx, xy, yy, x0, y0 = parameters.astype(np.float32)
     zero, one, half, end, mean = (
         np.float32(0),
@@ -116,13 +117,13 @@ def _draw(rows, pixels, parameters):
     )
     p0, p1, p2, p3, p4, p5 = PHI
     s0, s1, s2, s3, s4, s5 = _SLOPE
-    flat, cost = rows.reshape(-1), zero  # only rows at constant distances are vectorized
+    flat, cost = rows.reshape(-1), zero  # only rows at constant offsets are vectorized
     for p in range(pixels):
         dx, dy = flat[8 * MOST + p] - x0, flat[9 * MOST + p] - y0
         gx, gy = xx * dx + xy * dy, xy * dx + yy * dy
         along = dx * gx + dy * gy
         away = np.sqrt(one + along)
-        # Softer along the longer axis as the ellipse is, the edge is made as soft as along the other one.
+        # The model's edge is softer along the longer axis; this makes it equally soft all around.
         steep = np.sqrt((one + mean * along) / (one + gx * gx + gy * gy))
         t = min(max(steep * (edge - away), -end), end)
         q = t * t
@@ -139,7 +140,7 @@ def _draw(rows, pixels, parameters):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _products(rows, pixels):
-    """Sum up the products of derivatives and residuals: lower triangle (8, 8)."""
+    """Sum the products of derivatives and residuals: lower triangle (8, 8)."""
     products = np.empty((PARAMETERS + 1, PARAMETERS + 1))
     for i in range(PARAMETERS + 1):
         for j in range(i + 1):
@@ -152,8 +153,8 @@ def _products(rows, pixels):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _factor(normal, damping):
-    """Cholesky factor of the normal matrix, its diagonal grown by the damping."""
-    factor = np.empty((PARAMETERS, PARAMETERS))  # above its diagonal it is never read
+    """Cholesky factor of the normal matrix with its diagonal scaled by 1 + damping."""
+    factor = np.empty((PARAMETERS, PARAMETERS))  # the upper triangle is never read
     for i in range(PARAMETERS):
         for j in range(i + 1):
             value = normal[i, j] * (1 + damping) if i == j else normal[i, j]
@@ -168,7 +169,7 @@ def _factor(normal, damping):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _solve(factor, right):
-    """Solve by a Cholesky factor."""
+    """Solve with a Cholesky factor."""
     step = np.empty(PARAMETERS)
     for i in range(PARAMETERS):
         value = right[i]

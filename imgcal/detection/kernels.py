@@ -1,8 +1,8 @@
-"""Blobs in their windows, compiled: background, territory, weights, moments.
+"""Compiled measurement of blobs in their windows: background, territory, weights, moments.
 
 Scratch arrays hold the part of the window that the blob may reach, its *area*, from row and column `MARGIN` on, and the
-pixels around it. Loops run from constant bounds, without which they are not vectorized. The tests hold the same in
-plain NumPy.
+pixels around it. Loops start at constant bounds, because otherwise they are not vectorized. The tests implement the
+same in plain NumPy.
 """
 
 # Compiled functions take their types from their arguments.
@@ -21,35 +21,35 @@ from imgcal.types import BlobFlag
 from renderers.compiling import njit
 
 HALF_SIZES = (7, 10, 14, 20, 29, 42, 60)  # px; windows of 2 h + 1
-REACH = 4  # px from a component to the end of its window: the skirt and a ring that is clear of it
-RING = 2  # px, width of the frame of a window from which the background is taken
+REACH = 4  # px from a component to the border of its window: the skirt and a ring beyond it
+RING = 2  # px, width of the border of a window from which the background is estimated
 CLIP = (4.0, 9.0)  # standard deviations of a 3 x 3 mean below which a pixel is background: weak blob, bright blob
-CLIP_PEAK = 0.1  # of the peak: where the clip lies between the two
+CLIP_PEAK = 0.1  # of the peak: the threshold between these two limits
 SIGNIFICANT = 6.0  # standard deviations of a 3 x 3 mean that the brightest one of a blob must reach
-MISFIT = 0.05  # of the peak, beyond the noise: RMS residual from which a blob is no ellipse and keeps its centroid
-CROWDED = 0.6  # of the peak: a border this bright with a neighbour is no border
-CROWDED_CLIPPED = 0.9  # the same between clipped peaks that were parted: the light around them adds up there
-# Of the radius, times that part to the power 1.5: how far a neighbour's light moves the centre of a clipped blob. By
-# simulation of bright lamps with halos.
+MISFIT = 0.05  # of the peak, beyond the noise: largest RMS residual of an ellipse; above, the centroid is used
+CROWDED = 0.6  # of the peak: two blobs count as merged if the border between them is this bright
+CROWDED_CLIPPED = 0.9  # the same between clipped peaks that were split, because their light adds up there
+# A neighbour's light shifts the centre of a clipped blob by this times the radius, times the border's brightness over
+# the peak to the power 1.5. From simulations of bright lamps with halos.
 SHARED = 0.1
-SMALLEST_SIGMA = 0.0005  # px, what sampling by pixels leaves without any noise
-# px * sqrt(px): position lost where clipping turns a soft edge into a step, over sqrt(radius); the worst case of the
+SMALLEST_SIGMA = 0.0005  # px, remaining error of pixel sampling without noise
+# px * sqrt(px): position error, times sqrt(radius), where clipping turns a soft edge into a step; the worst case of the
 # exposures (2 to 15 times full scale) in the tests.
 CLIPPED_SIGMA = 0.045
-CLIPPED_FIT = 0.01  # the same where clipped pixels are left out of a fit
+CLIPPED_FIT = 0.01  # the same where a fit leaves out clipped pixels
 _MERGED, _SATURATED, _BORDER = int(BlobFlag.MERGED), int(BlobFlag.SATURATED), int(BlobFlag.BORDER)
 
 
 @njit(cache=True, nogil=True)
 def measure_all(frame, candidates, levels, limits, blobs):
-    """Fill the columns of all candidates of a frame.
+    """Measure all candidates of a frame.
 
     Args:
         frame: (H, W) grey values.
         candidates: tile, labels, boxes, label and whole of `Candidates`.
-        levels: largest grey value, the same or -1 where dark is bright, and from where a pixel is saturated.
-        limits: least threshold, radius from and to, greatest elongation.
-        blobs: the columns of `Blobs` but for the camera, and which candidates are kept.
+        levels: largest grey value, the same for dark blobs or -1 for bright ones, and the level of saturation.
+        limits: smallest peak, smallest and largest radius, largest elongation.
+        blobs: outputs: the columns of `Blobs` except the camera, and whether each candidate is kept.
     """
     tile, labels, boxes, label, whole = candidates
     full_scale, invert, saturation = levels
@@ -83,14 +83,14 @@ def measure_all(frame, candidates, levels, limits, blobs):
         if not (stands_out and smallest <= radius[k] <= largest):
             continue
         x, y = offsets[0, :pixels], offsets[1, :pixels]
-        # What was found of a flat patch is all of it.
+        # The component of a flat patch covers all of it.
         patch = (boxes[k, 2] - boxes[k, 0] + 1) * (boxes[k, 3] - boxes[k, 1] + 1) > brightness / peak
         elongation, two_peaked, middle, moments = find_shape(grey, weight, x, y, peak_mean / 2, patch)
         kept[k] = elongation <= longest
         if not kept[k]:
             continue
         clipped = brightest >= saturation and _is_saturated(frame, first, invert, saturation, weight)
-        shared = min(saddle / peak_mean, 1.0)  # light, where others are as near
+        shared = min(saddle / peak_mean, 1.0)  # light at the border with neighbours
         merged = two_peaked or shared > (CROWDED_CLIPPED if clipped and _differ(boxes[k], whole[k]) else CROWDED)
         flags[k] = clipped * _SATURATED + merged * _MERGED + _is_at_border(boxes[k], frame) * _BORDER
         known = x0 = y0 = residual = 0.0
@@ -115,9 +115,9 @@ def measure_all(frame, candidates, levels, limits, blobs):
 
 @njit(cache=True, nogil=True)
 def half_size(box, whole):
-    """Half size of the window around a box: the smallest that holds what it is a part of.
+    """Half size of the smallest window around a box that holds the whole component before it was split.
 
-    Only around that is the background.
+    The background is only outside of that.
     """
     u, v = (box[0] + box[2]) // 2, (box[1] + box[3]) // 2
     reach = max(whole[2] - u, u - whole[0], whole[3] - v, v - whole[1]) + REACH
@@ -129,13 +129,13 @@ def half_size(box, whole):
 
 @njit(cache=True, nogil=True)
 def _differ(box, whole):
-    """Tell whether a component is a part of a larger one."""
+    """Check whether a component is part of a larger one."""
     return box[0] != whole[0] or box[1] != whole[1] or box[2] != whole[2] or box[3] != whole[3]
 
 
 @njit(cache=True, nogil=True)
 def _is_at_border(box, frame):
-    """Tell whether a box comes within a pixel of the border."""
+    """Check whether a box comes within a pixel of the frame's border."""
     return min(box[0], box[1]) <= 1 or box[2] >= frame.shape[1] - 2 or box[3] >= frame.shape[0] - 2
 
 
@@ -143,7 +143,7 @@ def _is_at_border(box, frame):
 def _area(frame, box, u, v, half):
     """First pixel (v, u), rows and columns of the scratch arrays.
 
-    The skirt of a component may reach the pixels of the frame that are around its box and not in the window's ring.
+    The skirt of a component may reach the pixels around its box that are in the frame and not in the window's ring.
     """
     reach, inner = int(SKIRT), half - RING
     left, right = max(box[0] - reach, u - inner, 0), min(box[2] + reach, u + inner, frame.shape[1] - 1)
@@ -153,9 +153,9 @@ def _area(frame, box, u, v, half):
 
 @njit(cache=True, nogil=True)
 def _grey(frame, v, u, invert):
-    """Grey value of a pixel, of dark frames subtracted from `invert` (-1 = bright).
+    """Grey value of a pixel; for dark blobs it is subtracted from `invert` (-1 = bright).
 
-    Beyond the border the last row or column repeats.
+    Beyond the border the last row or column is repeated.
     """
     value = np.float32(frame[min(max(v, 0), frame.shape[0] - 1), min(max(u, 0), frame.shape[1] - 1)])
     return np.float32(invert) - value if invert >= 0 else value
@@ -163,11 +163,11 @@ def _grey(frame, v, u, invert):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _background(frame, u, v, half, invert, ring):
-    """Fit a plane to the ring around a blob, without what else lies there.
+    """Fit a plane to the ring around a blob, robust to clutter there.
 
     Returns:
-        Noise, one standard deviation of a pixel, not less than that of rounding to grey levels; the standard deviation
-        of the plane's slopes; the plane at the middle of the window and its slopes.
+        Noise, the standard deviation of a pixel, at least that of rounding to grey levels; the standard deviation of
+        the plane's slopes; the plane's value at the centre of the window, and its slopes.
     """
     count = 0
     for y in range(-half, half + 1):
@@ -180,11 +180,11 @@ def _background(frame, u, v, half, invert, ring):
     value, x, y = ring[0, :count], ring[1, :count], ring[2, :count]
     middle = kernels.select_rank(ring[3], count, count // 2)
     quarter = kernels.select_rank(ring[3], count // 2 + 1, count // 4)
-    # The lower half tells the spread: clutter in the ring is bright. One grey level is the estimate's quantization.
+    # The lower half gives the spread, because clutter in the ring is bright. One grey level allows for quantization.
     reach = 4 * (np.float32(1.4826) * (middle - quarter) + 1)
     n = sx = sy = sxx = sxy = syy = g = gx = gy = 0.0
     for r in range(count):
-        # Centred on the middle: grey values of 16 bit lose nothing in single precision.
+        # Subtract the median: grey values of 16 bit then lose nothing in single precision.
         value[r] -= middle
         w = np.float32(1) if abs(value[r]) < reach else np.float32(0)
         n += w
@@ -211,7 +211,7 @@ def _solve(a, b, c, d, e, f, x, y, z):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _copy(frame, first, u, v, invert, plane, grey, offsets):
-    """Copy the area and its margin out of a frame without the background, and fill offsets from (u, v).
+    """Copy the area and its margin from a frame, subtract the background, and fill offsets from (u, v).
 
     Returns:
         The brightest pixel, background included.
@@ -235,7 +235,7 @@ def _copy(frame, first, u, v, invert, plane, grey, offsets):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _blur(values, means):
-    """Average the 3 x 3 pixels around each pixel of the area and of the pixels next to it."""
+    """Average the 3 x 3 pixels around each pixel of the area and of the adjacent pixels."""
     rows, columns = values.shape
     for i in range(1, rows - 1):
         above, middle, below, mean = values[i - 1], values[i], values[i + 1], means[i]
@@ -246,7 +246,7 @@ def _blur(values, means):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _gather(grey, x, y, own, other, marks, plane, saturation, start, fit):
-    """List the pixels around the edge of a blob that are its own and not saturated, for `fit_centre`.
+    """Collect the unsaturated pixels around the edge of a blob that belong to it, for `fit_centre`.
 
     Returns:
         Their number, 0 if there are too many; the last rows of `fit` are their offsets x, y and grey values.
@@ -261,7 +261,7 @@ def _gather(grey, x, y, own, other, marks, plane, saturation, start, fit):
     )  # fmt: skip
     listed_x, listed_y, listed_value = fit[ROWS - 3], fit[ROWS - 2], fit[ROWS - 1]
     two, zero, one, flat = np.float32(2), np.uint8(0), np.uint8(1), marks.reshape(-1)
-    for p in range(len(value)):  # all pixels alike, which is vectorized
+    for p in range(len(value)):  # treats all pixels alike, so that it is vectorized
         dx, dy = x[p] - x0, y[p] - y0
         outer = xx * dx * dx + two * xy * dx * dy + yy * dy * dy >= inner
         dim = level + tilt_x * x[p] + tilt_y * y[p] + value[p] < most
@@ -277,10 +277,10 @@ def _gather(grey, x, y, own, other, marks, plane, saturation, start, fit):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _weigh(smooth, noise, weight):
-    """Turn the territory in `weight` into how much a pixel belongs to the blob: from 0 to 1 with its brightness.
+    """Convert the territory in `weight` to weights of the blob's pixels, from 0 to 1 with increasing brightness.
 
     Returns:
-        How much the weight grows with the 3 x 3 mean.
+        Slope of the weight over the 3 x 3 mean.
     """
     rows, columns = smooth.shape
     top = np.float32(0)
@@ -299,7 +299,7 @@ def _weigh(smooth, noise, weight):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _find_peaks(grey, smooth, weight):
-    """Brightest pixel and brightest 3 x 3 mean of what is blob rather than background, and the sum of the blob."""
+    """Brightest pixel and brightest 3 x 3 mean of the blob, and the sum of the blob."""
     peak, top, total = np.float32(1e-6), np.float32(0), np.float32(0)
     for i in range(MARGIN, grey.shape[0] - MARGIN):
         part, value, mean = weight[i], grey[i], smooth[i]
@@ -313,7 +313,7 @@ def _find_peaks(grey, smooth, weight):
 
 @njit(cache=True, nogil=True)
 def _is_saturated(frame, first, invert, saturation, weight):
-    """Tell whether a pixel of the blob is at or above saturation."""
+    """Check whether a pixel of the blob is at or above saturation."""
     for i in range(MARGIN, weight.shape[0] - MARGIN):
         for j in range(MARGIN, weight.shape[1] - MARGIN):
             if weight[i, j] > 0.5 and _grey(frame, first[0] + i, first[1] + j, invert) >= saturation:

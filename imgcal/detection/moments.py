@@ -1,4 +1,4 @@
-"""Moments of a blob in its window, compiled: its shape, and its centroid where no ellipse can be fitted."""
+"""Compiled moments of a blob in its window: its shape, and its centroid where no ellipse can be fitted."""
 
 # Compiled functions take their types from their arguments.
 # ruff: noqa: ANN001, ANN201
@@ -11,16 +11,16 @@ import numpy as np
 from renderers.compiling import njit
 
 TWO_PEAKED = 0.515  # bimodality coefficient
-WAIST = 0.92  # of the mass to either side along the major axis: two blobs in one are narrower between their middles
+WAIST = 0.92  # of the mass to either side along the major axis: below, the blob is two merged ones
 LONGEST_PATCH = 3.0  # elongation of a flat square at 70 degrees; longer ones are seams and edges
-PART = 0.4  # of the largest mass in a bin: less is a speck of noise beside the blob, no second blob
-PROFILE = 24  # bins of the mass along the major axis, at most
-LEAST_WIDE = 1.6  # px, standard deviation along the minor axis: a waist of narrower blobs is lost in the blur
+PART = 0.4  # of the largest mass in a bin: less is noise beside the blob, not a second blob
+PROFILE = 24  # most bins of the mass along the major axis
+LEAST_WIDE = 1.6  # px, standard deviation along the minor axis: the waist of a narrower blob is lost in the blur
 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def find_ramp(grey, weight, scale, ramp):
-    """On the ramp between background and blob, the noise of the 3 x 3 mean moves the weight as well: how much."""
+    """Derivative of the weighted value by the 3 x 3 mean, whose noise also moves the weight between 0 and 1."""
     zero, one = np.float32(0), np.float32(1)
     for i in range(grey.shape[0]):
         part, value, slope = weight[i], grey[i], ramp[i]
@@ -30,7 +30,7 @@ def find_ramp(grey, weight, scale, ramp):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def find_centroid(grey, weight, ramp, x, y):
-    """Sum up the blob over all pixels at (x, y) from the middle of the window, as one row.
+    """Compute the centroid of a blob from all pixels at (x, y) from the centre of the window, as one row.
 
     Returns:
         Centroid x, y, and two sums of squared distances from it: weighted by the squared gain of each pixel's noise,
@@ -57,9 +57,9 @@ def find_centroid(grey, weight, ramp, x, y):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def find_waist(grey, weight, x, y, most, axis, middle, spread):
-    """Least mass along an axis between two parts with more, over the lesser of these: 1 = there is no waist.
+    """Smallest ratio along an axis of the mass to the lesser of the peaks on its two sides; 1 = there is no waist.
 
-    The axis is given by its cosine and sine, the blob's middle and standard deviation (px) along it, the rest as in
+    The axis is given by its cosine and sine, the blob's mean and standard deviation (px) along it; the rest is as in
     `find_shape`.
     """
     value, part = grey.reshape(-1), weight.reshape(-1)
@@ -71,7 +71,7 @@ def find_waist(grey, weight, x, y, most, axis, middle, spread):
             left = int(at)
             profile[left] += mass * (left + 1 - at)
             profile[left + 1] += mass * (at - left)
-    after = np.empty(PROFILE)  # the most from here on
+    after = np.empty(PROFILE)  # largest mass from here on
     after[PROFILE - 1] = profile[PROFILE - 1]
     for i in range(PROFILE - 2, -1, -1):
         after[i] = max(profile[i], after[i + 1])
@@ -86,12 +86,12 @@ def find_waist(grey, weight, x, y, most, axis, middle, spread):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def find_shape(grey, weight, x, y, most, patch):
-    """Tell the elongation of a blob whose masses are cut at `most`, whether it has two parts along its major axis, its
-    middle, and its moments xx, xy, yy. A flat `patch` may be a square.
+    """Find the elongation of a blob with masses clipped at `most`, whether it has two parts along its major axis, its
+    centroid, and its moments xx, xy, yy. A flat `patch` may be a square.
 
     Source: Sarle's bimodality coefficient, (skewness ** 2 + 1) / kurtosis: 0.50 for any filled ellipse and less when it
-    is blurred, 0.60 for two discs that touch and 0.51 to 0.57 when they are blurred, 0.56 for a uniform rod, which a
-    waist tells from them.
+    is blurred, 0.60 for two discs that touch and 0.51 to 0.57 when they are blurred. A uniform rod has 0.56, but no
+    waist.
     """
     value, part, zero, most = grey.reshape(-1), weight.reshape(-1), np.float32(0), np.float32(most)
     t = sx = sy = sxx = syy = sxy = cube = fourth = zero
@@ -104,7 +104,7 @@ def find_shape(grey, weight, x, y, most, patch):
     xx, yy, xy = sxx / total - x0 * x0, syy / total - y0 * y0, sxy / total - x0 * y0
     angle, swing = 0.5 * np.arctan2(2 * xy, xx - yy), np.hypot(xx - yy, 2 * xy)
     major, minor = (xx + yy + swing) / 2, (xx + yy - swing) / 2
-    elongation = np.sqrt(major / max(minor, 1 / 12))  # no narrower than a pixel
+    elongation = np.sqrt(major / max(minor, 1 / 12))  # at least a pixel wide
     cosine, sine = np.float32(np.cos(angle)), np.float32(np.sin(angle))
     start = np.float32(x0 * cosine + y0 * sine)
     for p in range(len(value)):
@@ -116,6 +116,6 @@ def find_shape(grey, weight, x, y, most, patch):
     bimodality = (third**2 / max(major, 1e-6) ** 3 + 1) * major**2 / max(fourth, 1e-6)
     two_peaked = bimodality > TWO_PEAKED and elongation > 1.3
     if two_peaked and patch and minor > LEAST_WIDE**2 and elongation < LONGEST_PATCH:
-        # Squares seen at an angle are as flat as two discs that touch, but have no waist.
+        # Squares seen at an angle are as flat as two touching discs, but have no waist.
         two_peaked = find_waist(grey, weight, x, y, most, (cosine, sine), start, np.sqrt(major)) < WAIST
     return elongation, two_peaked, (x0, y0), (xx, xy, yy)

@@ -9,7 +9,7 @@ from imgcal.errors import InputError
 
 Polarity = Literal["bright", "dark"]
 USUAL_RADIUS = 16.0
-"""Largest radius (px) of markers that nothing is known of."""
+"""Largest radius (px) of markers of unknown size."""
 
 
 @dataclass(frozen=True)
@@ -26,18 +26,18 @@ class DetectionOptions:
         imgcal.errors.InputError: radius limits: found 0.0 to 16.0, expected 0 < min < max <= 500 px
     """
 
-    polarity: Polarity = "bright"  # markers brighter or darker than what is around them
-    threshold: float | None = None  # least peak above the local background, grey levels; None = from the noise
-    dim_blobs: bool = False  # keep blobs far dimmer than the others, too, which a given threshold always does
+    polarity: Polarity = "bright"  # markers brighter or darker than their surroundings
+    threshold: float | None = None  # smallest peak above the local background, grey levels; None = from the noise
+    dim_blobs: bool = False  # also keep blobs that are far dimmer than the others; a given threshold implies this
     min_radius: float = 0.9  # px; a single hot pixel measures 0.56
     max_radius: float | None = None  # px; None = 16, and more where a frame shows several blobs of one larger size
     max_elongation: float = 4.0  # ratio of the axes of the ellipse of equal moments
-    bit_depth: int | None = None  # None = 8 for uint8 frames; 10, 12 or 16 for uint16, by the brightest pixel
+    bit_depth: int | None = None  # None = 8 for uint8 frames; 10, 12 or 16 for uint16, from the brightest pixel
     saturation: float | None = None  # first clipped grey value; None = 0.5 % below full scale
 
     @property
     def radius_limit(self) -> float:
-        """Largest radius (px) of blobs that may stand alone."""
+        """Largest radius (px) of a single blob."""
         return USUAL_RADIUS if self.max_radius is None else self.max_radius
 
     def __post_init__(self) -> None:

@@ -1,8 +1,8 @@
-"""Markers apart from what is far dimmer (paint on the floor, scratches, faint reflections) or of no marker's size.
+"""Separation of markers from blobs that are far dimmer (paint, scratches, faint reflections) or of another size.
 
-Markers of one object are alike: their peaks differ by distance, angle and illumination, a few times at most, and those
-in between fill the range. Blobs that are close to the background and several times dimmer than all the others, with
-nothing in between, are something else.
+Markers of one object are alike: distance, angle and illumination change their peaks by a small factor, and those in
+between fill the range. Blobs close to the background that are several times dimmer than all the others, with nothing in
+between, are not markers.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from imgcal.types import UNUSABLE
 
 GAP = 3.0  # ratio of neighbouring contrasts between two populations
 DIM = 0.08  # of full scale: the dim population is below, the bright one above
-LEAST_BRIGHT = 3  # blobs in a frame that the bright population must have
-ONE_SIZE = 1.6  # ratio of radii of markers of one size
-DIMMER = 0.5  # of the usual contrast of those of usual size: dimmer ones are no larger markers
-LEAST_LARGE = 3  # blobs of one size beyond the usual ones that must be there
-OFTEN = 0.25  # share of a camera's frames that must have a limit for the others to take it over
+LEAST_BRIGHT = 3  # smallest number of blobs of the bright population in a frame
+ONE_SIZE = 1.6  # largest ratio of radii of markers of one size
+DIMMER = 0.5  # relative to the usual contrast of blobs of usual size: dimmer ones are no larger markers
+LEAST_LARGE = 3  # smallest number of blobs of one size above the usual limit
+OFTEN = 0.25  # share of a camera's frames with a limit from which it applies to the other frames, too
 _UNUSABLE = int(UNUSABLE)
 
 
 def dim_limits(contrast: NDArray[np.floating], group: NDArray[np.integer], groups: int) -> NDArray[np.float64]:
-    """Contrast (G,) that separates two populations of a group of blobs, 0 where there is one.
+    """Contrast (G,) that separates two populations within a group of blobs, 0 where there is only one.
 
     Args:
         contrast: (K,) peaks above the background, shares of full scale.
-        group: (K,) which group each belongs to, 0 to G - 1.
+        group: (K,) index of each blob's group, 0 to G - 1.
         groups: G.
     """
     bright = contrast > DIM
-    above, below = np.full(groups, np.inf), np.zeros(groups)  # the ends of the gap about `DIM`
+    above, below = np.full(groups, np.inf), np.zeros(groups)  # bounds of the gap about `DIM`
     np.minimum.at(above, group[bright], contrast[bright])
     np.maximum.at(below, group[~bright], contrast[~bright])
     apart = (below < DIM) & (above / np.maximum(below, 1e-9) >= GAP)
@@ -44,12 +44,12 @@ def dim_limits(contrast: NDArray[np.floating], group: NDArray[np.integer], group
 
 
 def usable(blobs: Blobs) -> NDArray[np.bool_]:
-    """Mark blobs whose centres may be used: (K,)."""
+    """Select blobs with usable centres: (K,)."""
     return (blobs.flags & _UNUSABLE) == 0
 
 
 def usual_size(blobs: Blobs, limit: float) -> NDArray[np.bool_]:
-    """Mark blobs (K,) up to a radius `limit` (px), and larger ones if several are alike in size and no dimmer."""
+    """Select blobs (K,) up to a radius `limit` (px), and larger ones if several have one size and enough contrast."""
     small = blobs.radius <= limit
     if small.all():
         return small
@@ -64,9 +64,9 @@ def usual_size(blobs: Blobs, limit: float) -> NDArray[np.bool_]:
 
 
 def drop_dim(shots: Sequence[Blobs], options: DetectionOptions) -> list[Blobs]:
-    """Leave out the dim population of each frame of some snapshots.
+    """Remove the dim population from each frame of some snapshots.
 
-    A frame that shows too few markers to tell takes over the usual limit of its camera.
+    A frame with too few markers for a decision uses its camera's usual limit.
     """
     if options.dim_blobs or options.threshold is not None or not shots:
         return list(shots)

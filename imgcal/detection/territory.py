@@ -1,4 +1,4 @@
-"""Which pixels of a window belong to a blob, compiled: those around it that are no nearer to others."""
+"""Compiled territories: the pixels of a window that belong to a blob because they are not nearer to others."""
 
 # Compiled functions take their types from their arguments.
 # ruff: noqa: ANN001, ANN201, ANN202
@@ -11,20 +11,20 @@ import numpy as np
 from imgcal.detection.candidates import BLOCK
 from renderers.compiling import njit
 
-SKIRT = 3.5  # px, how far the blurred edge reaches beyond the component that was found
+SKIRT = 3.5  # px, how far the blurred edge reaches beyond the detected component
 SPREAD = 5  # px, up to which distances are exact
-MARGIN = SPREAD + 1  # px around the area: distances are asked for in the pixels next to it
-_FAR = 200  # px^2; with two distances added to it still within 8 bit
+MARGIN = SPREAD + 1  # px around the area: distances are also needed in the adjacent pixels
+_FAR = 200  # px^2; fits into 8 bit even with two distances added
 
 
 @njit(cache=True, nogil=True)
 def spread_labels(tile, labels, first, name, scratch, own, other):
-    """Fill squared distances (px^2) to the component `name` and to others; return whether there are others."""
+    """Compute squared distances (px^2) to the component `name` and to others; return whether there are others."""
     rows, columns = own.shape
     own[:] = _FAR
     other[:] = _FAR
     crowded = False
-    # Tiles begin with an empty one before the frame.
+    # The first tile is an empty one before the frame.
     for r in range(max(first[0] // BLOCK, -1) + 1, min((first[0] + rows - 1) // BLOCK + 2, tile.shape[0] - 1)):
         for c in range(max(first[1] // BLOCK, -1) + 1, min((first[1] + columns - 1) // BLOCK + 2, tile.shape[1] - 1)):
             t = tile[r, c]
@@ -46,9 +46,9 @@ def spread_labels(tile, labels, first, name, scratch, own, other):
 
 @njit(cache=True, nogil=True)
 def _spread(squared, scratch):
-    """Turn 0 and `_FAR` into squared distances from the zeros, up to `SPREAD` px along each axis.
+    """Convert 0 and `_FAR` to squared distances from the zeros, up to `SPREAD` px along each axis.
 
-    Rows are taken as one: what leaves a row on one side and enters the next does not get past the margin.
+    Rows are treated as one line: what wraps from one row to the next does not get past the margin.
     """
     flat, along = squared.reshape(-1), scratch.reshape(-1)
     _lower(flat, along, np.int64(1))
@@ -57,7 +57,7 @@ def _spread(squared, scratch):
 
 @njit(cache=True, nogil=True)
 def _lower(values, result, stride):
-    """Write the minimum over d of the values `d * stride` away plus d ** 2."""
+    """Compute the minimum over d of d ** 2 plus the values at distance `d * stride`."""
     for p in range(len(values)):
         result[p] = values[p]
     for d in range(1, SPREAD + 1):
@@ -69,12 +69,12 @@ def _lower(values, result, stride):
 
 @njit(cache=True, nogil=True)
 def claim(own, other, crowded, smooth, territory):
-    """Give a blob the pixels of the area that are no nearer to others than to it, up to its skirt: 1, all others 0.
+    """Set pixels of the area to 1 if they are within a blob's skirt and not nearer to others; all others to 0.
 
-    Pixels as near to others as to the blob are border to both.
+    Pixels at equal distance form the border of both blobs.
 
     Returns:
-        The brightest border with a neighbour, 0 without one.
+        The brightest border with a neighbour, 0 without a neighbour.
     """
     rows, columns = own.shape
     territory[:] = 0

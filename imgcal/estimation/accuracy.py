@@ -1,4 +1,4 @@
-"""How good a recalibrated rig is where it is used: predicted errors over the working volume, in pixels and in mm."""
+"""Predicted errors of a recalibrated rig over the working volume, in pixels and in mm."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from imgcal.geometry import rotate, undistort
 from imgcal.types import CameraRig
 
 GRID = 11
-"""Points along each side of the working volume; odd, so that there is a middle."""
+"""Points along each side of the working volume; odd, so that one lies at the centre."""
 ANCHORS = 7
-"""The same, of the points by which true and estimated rig are laid upon one another."""
+"""Points along each side of the coarser grid on which the true and the estimated rig are aligned."""
 MAP_SIZE = (16, 24)
-"""Rows and columns of each camera's map, which covers the whole image."""
+"""Rows and columns of each camera's error map, which covers the whole image."""
 MAP_DEPTHS = (0.05, 0.5, 0.95)
-"""Depths of the maps: these quantiles of the depths at which a camera sees the working volume."""
+"""Depths of the maps, as quantiles of the depths at which a camera sees the working volume."""
 
 EXCEPTIONAL = 2.0
-"""Times the median camera's error beyond which a camera is an exception."""
+"""Multiple of the median camera's error beyond which a camera is an exception."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,13 @@ class WorkingVolume:
     high: Tensor  # (3,) mm
 
     def grid(self, count: int = GRID) -> Tensor:
-        """Evenly spaced points, the faces included: (count, count, count, 3) mm, indexed by x, y, z."""
+        """Evenly spaced points, including the faces: (count, count, count, 3) mm, indexed by x, y, z."""
         steps = torch.linspace(0, 1, count, dtype=self.low.dtype, device=self.low.device)
         share = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), -1)
         return self.low + share * (self.high - self.low)
 
     def contains(self, points: Tensor) -> Tensor:
-        """Tell which points (..., 3) lie inside: (...) bool."""
+        """Check which points (..., 3) lie inside: (...) bool."""
         return ((points >= self.low) & (points <= self.high)).all(-1)
 
 
@@ -56,17 +56,17 @@ class WorkingVolume:
 class ErrorMaps:
     """Predicted errors over whole images, at some depths of each camera."""
 
-    px: Tensor  # (C, D, H, W) pixels; nan where a pixel belongs to no ray
-    depths: Tensor  # (C, D) mm; nan for a camera that sees nothing of the volume
+    px: Tensor  # (C, D, H, W) pixels; nan where a pixel has no ray
+    depths: Tensor  # (C, D) mm; nan for a camera that sees none of the volume
     inside: Tensor  # (C, D, H, W) bool, in the working volume
 
 
 @dataclass(frozen=True)
 class PredictedError:
-    """Errors to expect of a rig, after the rigid motion of the whole rig that makes them smallest.
+    """Expected errors of a rig, after the rigid motion of the whole rig that minimizes them.
 
-    All are expected (RMS) lengths, of the calibration's errors alone where nothing else is said. Pixels: image of a
-    point by the true rig against that by this one. Millimetres: a point seen by all cameras that have it in view,
+    All are expected (RMS) lengths, and come from the calibration's errors alone unless stated otherwise. Pixels: image
+    of a point by the true rig against that by this one. Millimetres: a point seen by all cameras that have it in view,
     without noise, triangulated with this rig, against the true point.
 
     Examples:
@@ -84,44 +84,44 @@ class PredictedError:
 
     volume: WorkingVolume
     camera_names: tuple[str, ...]  # C
-    uncertainty: RigUncertainty  # the same at any point
+    uncertainty: RigUncertainty  # predicts the same errors at any point
     px: Tensor  # (C, X, Y, Z) pixels over `volume.grid()`; nan where the camera does not see the point
     mm: Tensor  # (X, Y, Z) mm; nan where fewer than two cameras see the point
-    mm_with_noise: Tensor  # (X, Y, Z) mm, when each pixel is measured with `noise`, too
-    noise: float  # px, median standard deviation of the observations, each axis
+    mm_with_noise: Tensor  # (X, Y, Z) mm, with pixel noise of standard deviation `noise` included
+    noise: float  # px, median standard deviation of the observations, per axis
 
     def __repr__(self) -> str:
-        """Give the medians: `PredictedError(0.003 mm, 0.002 px, 10 cameras)`."""
+        """Show the medians: `PredictedError(0.003 mm, 0.002 px, 10 cameras)`."""
         return f"PredictedError({self.median_mm:.2g} mm, {self.median_px:.2g} px, {len(self.camera_names)} cameras)"
 
     @property
     def median_px(self) -> float:
-        """Median over cameras and places, as far as they are seen."""
+        """Median over cameras and the points that they see."""
         return _quantile(self.px, 0.5)
 
     @property
     def p95_px(self) -> float:
-        """Exceeded in 5 % of the places that cameras see."""
+        """95th percentile over cameras and the points that they see."""
         return _quantile(self.px, 0.95)
 
     @property
     def median_mm(self) -> float:
-        """Median over the part of the volume that two cameras see."""
+        """Median over the part of the volume that at least two cameras see."""
         return _quantile(self.mm, 0.5)
 
     @property
     def p95_mm(self) -> float:
-        """Exceeded in 5 % of the part of the volume that two cameras see."""
+        """95th percentile over the part of the volume that at least two cameras see."""
         return _quantile(self.mm, 0.95)
 
     @property
     def median_mm_with_noise(self) -> float:
-        """Median of what one measurement of a point is off, noise of its pixels included."""
+        """Median error of one triangulated point, pixel noise included."""
         return _quantile(self.mm_with_noise, 0.5)
 
     @property
     def camera_px(self) -> tuple[float, ...]:
-        """Median of each camera over what it sees of the volume, C; nan for one that sees nothing."""
+        """Median of each camera over the part of the volume that it sees, C; nan if it sees none."""
         return tuple(_quantile(camera, 0.5) for camera in self.px)
 
     @property
@@ -131,51 +131,51 @@ class PredictedError:
 
     @property
     def exceptions(self) -> tuple[int, ...]:
-        """Indices of the cameras that are known much worse than the others, the worst first."""
+        """Indices of the cameras with much larger errors than the others, the worst first."""
         known = torch.tensor(self.camera_px)
         usual = _quantile(known, 0.5)
         return tuple(int(i) for i in known.nan_to_num(-1.0).argsort(descending=True) if known[i] > EXCEPTIONAL * usual)
 
     @cached_property
     def mm_without_exceptions(self) -> Tensor:
-        """`mm` when the exceptions take no part in triangulation: (X, Y, Z)."""
+        """`mm` with the exceptions excluded from triangulation: (X, Y, Z)."""
         others = self.uncertainty.drop_cameras(self.exceptions)
         points = self.volume.grid().flatten(0, -2)
         return others.point_error(points, others.rig.project(points).visible).view(self.mm.shape)
 
     @cached_property
     def maps(self) -> ErrorMaps:
-        """Errors over each camera's whole image; worked out when they are first asked for."""
+        """Errors over each camera's whole image; computed on first access."""
         projection = self.uncertainty.rig.project(self.volume.grid().flatten(0, -2))
         return _maps(self.uncertainty, self.volume, torch.where(projection.visible, projection.depth, torch.nan))
 
     @property
     def seen_share(self) -> float:
-        """Share of the volume that two cameras see."""
+        """Share of the volume that at least two cameras see."""
         return float(self.mm.isfinite().double().mean())
 
     def summary(self) -> dict[str, Any]:
-        """Plain values for `result.json`; what is not known is None."""
+        """Plain values for `result.json`; unknown values are None."""
         worst = self.worst_camera
         return {
-            "median_px": _is_known(self.median_px),
-            "p95_px": _is_known(self.p95_px),
-            "median_mm": _is_known(self.median_mm),
-            "p95_mm": _is_known(self.p95_mm),
+            "median_px": _none_if_nan(self.median_px),
+            "p95_px": _none_if_nan(self.p95_px),
+            "median_mm": _none_if_nan(self.median_mm),
+            "p95_mm": _none_if_nan(self.p95_mm),
             "noise_px": self.noise,
-            "median_mm_with_noise": _is_known(self.median_mm_with_noise),
+            "median_mm_with_noise": _none_if_nan(self.median_mm_with_noise),
             "worst_camera": self.camera_names[worst],
-            "worst_camera_px": _is_known(self.camera_px[worst]),
+            "worst_camera_px": _none_if_nan(self.camera_px[worst]),
             "exceptions": [self.camera_names[i] for i in self.exceptions],
-            "median_mm_without_exceptions": _is_known(_quantile(self.mm_without_exceptions, 0.5)),
-            "per_camera_px": {n: _is_known(px) for n, px in zip(self.camera_names, self.camera_px, strict=True)},
+            "median_mm_without_exceptions": _none_if_nan(_quantile(self.mm_without_exceptions, 0.5)),
+            "per_camera_px": {n: _none_if_nan(px) for n, px in zip(self.camera_names, self.camera_px, strict=True)},
             "volume_mm": {"low": self.volume.low.tolist(), "high": self.volume.high.tolist()},
             "seen_by_two_cameras": self.seen_share,
         }
 
 
 class HasEstimate(Protocol):
-    """What holds an estimate beside other things: a `Calibration`."""
+    """An object with an `estimate`, for instance a `Calibration`."""
 
     @property
     def estimate(self) -> Estimate:
@@ -185,10 +185,10 @@ class HasEstimate(Protocol):
 def predicted_error(
     calibration: Estimate | HasEstimate, *, volume: WorkingVolume | None = None, covariance: Tensor | None = None
 ) -> PredictedError:
-    """Predict the errors that a recalibrated rig makes where it is used.
+    """Predict the errors of a recalibrated rig where it is used.
 
     Args:
-        calibration: what `calibrate` or `estimate` gave, without batch axes.
+        calibration: the result of `calibrate` or `estimate`, without batch axes.
         volume: where the rig is used; None = `working_volume(calibration)`.
         covariance: (K C, K C) of all cameras' parameters; None = `joint_covariance(calibration)`.
 
@@ -239,21 +239,21 @@ def predicted_error(
 
 
 def joint_covariance(calibration: Estimate) -> Tensor:
-    """Covariance of all cameras' parameters that the prediction starts from: (K C, K C).
+    """Covariance of all cameras' parameters for the prediction: (K C, K C).
 
-    The flat one: what `camera_covariance` adds by second order is mostly that a motion of the whole rig, of which
-    nothing but the prior is known, bends the parameters. That is no error, and a linear projection cannot take it out
-    again; for the rest, first order is enough (docs/benchmarks/tables.md, "Honesty").
+    This is the first-order covariance. The second-order part of `camera_covariance` is mostly due to motions of the
+    whole rig, which only the prior constrains: they change the parameters nonlinearly. Such a motion is no error, but a
+    linear projection cannot remove it. For the rest, first order is enough (docs/benchmarks/tables.md, "Honesty").
     """
     return camera_covariance(calibration, curved=False)
 
 
 def working_volume(calibration: Estimate) -> WorkingVolume:
-    """Where the rig is used, as far as a calibration knows.
+    """The volume where the rig is used, inferred from a calibration.
 
     Returns:
-        The box that holds the object, turned in any way, about every place where it was seen, and at the rig's working
-        distance, where the rig has one: a single snapshot then says where it belongs, too.
+        The box that holds the object, in any orientation, about every place where it was seen. If the rig has a working
+        distance, the place at that distance counts, too; a single snapshot then gives a useful box.
     """
     problem, rig = calibration.problem, detach_double(calibration.rig)
     pose = calibration.rig_from_object.to(torch.float64)
@@ -265,12 +265,12 @@ def working_volume(calibration: Estimate) -> WorkingVolume:
 
 
 def _maps(uncertainty: RigUncertainty, volume: WorkingVolume, depths: Tensor) -> ErrorMaps:
-    """Errors over whole images at some depths.
+    """Compute errors over whole images at some depths.
 
     Args:
         uncertainty: of the rig.
         volume: where the rig is used.
-        depths: (C, P) mm at which cameras see the volume, nan where they do not.
+        depths: (C, P) mm at which cameras see the volume; nan where a point is not visible.
     """
     rig = uncertainty.rig
     shown = torch.nanquantile(depths, depths.new_tensor(MAP_DEPTHS), dim=1).mT  # (C, D)
@@ -285,7 +285,7 @@ def _maps(uncertainty: RigUncertainty, volume: WorkingVolume, depths: Tensor) ->
 
 
 def _rays(rig: CameraRig, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Undistorted middles of the cells of each image: (C, H W, 2) on the z = 1 plane, (C, H W) bool whether any."""
+    """Undistorted cell centres of each image: (C, H W, 2) on the z = 1 plane, (C, H W) bool whether they are valid."""
     rows, columns = ((torch.arange(n, dtype=torch.float64, device=rig.focal_length.device) + 0.5) / n for n in size)
     share = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).flatten(0, 1)
     uv = share * rig.image_size[:, None] - 0.5
@@ -303,5 +303,5 @@ def _quantile(values: Tensor, share: float) -> float:
     return float(known.quantile(share)) if len(known) else float("nan")
 
 
-def _is_known(value: float) -> float | None:
+def _none_if_nan(value: float) -> float | None:
     return value if value == value else None

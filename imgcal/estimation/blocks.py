@@ -1,27 +1,27 @@
-"""How much more the snapshots disagree about the rig than their noise allows.
+"""Excess disagreement of the snapshots about the rig, beyond their noise.
 
-Errors of lenses, centroids and the object go with place and time, so that many snapshots say the same wrong thing: the
-inverse of the information, which takes all residuals for independent, is then too small. The snapshots are parted into
-blocks that follow each other, long enough to be nearly independent, and the estimate without each block is compared
-with the estimate from all. Were the residuals independent, the difference would have the covariance
+Errors of lenses, centroids and the object are correlated in space and time, so many snapshots share the same error. The
+inverse of the information, which assumes independent residuals, is then too small. The snapshots are divided into
+consecutive blocks, long enough to be nearly independent, and the estimate without each block is compared with the
+estimate from all. For independent residuals, the difference would have the covariance
 
     C_without - C,    C = (1 + sum H_b)^-1,    C_without = (1 + sum H_b - H_block)^-1,
 
-where H_b is a block's information about the (whitened) parameters once its poses have adapted, and 1 that of the prior.
+where H_b is a block's information about the (whitened) parameters with its poses marginalized, and 1 that of the prior.
 The squared differences over these variances, averaged over the parameters of a camera, are the factor by which the
-noise's part of its covariance is too small; one for all parameters keeps what the covariance says about their
-relations. A camera's own average, of few blocks, counts as much as that of all cameras: lenses differ widely, but six
-blocks know a camera's factor only roughly. Leaving a block out, rather than summing the residuals' pulls, counts what
-the fit has taken of a block that it rests on.
+noise part of its covariance is too small. One factor for all its parameters preserves their correlations. With few
+blocks, a camera's own average counts as much as that of all cameras: lenses differ widely, but six blocks determine a
+camera's factor only roughly. Leaving a block out, rather than summing the scores of the residuals, accounts for the
+leverage of a block on the fit.
 
 Source: the delete-block jackknife (Kunsch, Annals of Statistics 1989), studentized by its value for independent noise,
-as the bias-reduced cluster-robust covariances are (Bell and McCaffrey, Survey Methodology 2002). Errors that go on
-across the border between two blocks are added by the flat-top window of Politis and Romano (1995): twice the scatter of
-the double blocks less that of the single ones.
+as the bias-reduced cluster-robust covariances are (Bell and McCaffrey, Survey Methodology 2002). Errors that are
+correlated across the border between two blocks are added by the flat-top window of Politis and Romano (1995): twice the
+scatter of the double blocks less that of the single ones.
 
-To first order the difference is C times the block's pull, and 1 - 1/blocks makes up for what the fit has taken of a
-block: within a twentieth where blocks are alike. That takes one inverse instead of one for each block, and is enough to
-see that there is nothing to measure.
+To first order the difference is C times the block's score, and 1 - 1/blocks corrects for the block's leverage: to
+within a twentieth where blocks are alike. That takes one inverse instead of one per block, and is enough to see that
+there is no excess scatter to measure.
 """
 
 from __future__ import annotations
@@ -39,34 +39,34 @@ from imgcal.estimation.map_estimate import equations_at
 from imgcal.estimation.robust_losses import NamedLoss
 
 LEAST_BLOCKS = 6
-"""Blocks whose scatter is trusted."""
+"""Smallest number of blocks for a reliable scatter."""
 MANY_BLOCKS = 32
-"""Blocks at first, and less than twice as many: each costs a factorization; they are then joined two by two."""
+"""Blocks at first (up to twice as many): each costs a factorization; they are then joined two by two."""
 SURE = 4.0
-"""Standard deviations by which the scatter of some blocks must exceed what independent noise makes it."""
+"""Standard deviations by which the scatter must exceed its value for independent noise."""
 OWN = 0.5
-"""Weight of a camera's own scatter; the rest is that of all cameras."""
+"""Weight of a camera's own scatter; the remainder is the weight of the average over all cameras."""
 OVERLAP = 2 / 3
-"""Blocks that overlap all but fully tell as much as this share of those which do not."""
+"""Variance of the average over heavily overlapping blocks, relative to that over disjoint ones."""
 WORTH = 2.0
-"""Standard deviations by which it must do so to first order, which needs no inverse for each block, to be measured."""
+"""The same threshold for the first-order test, which needs no inverse per block and decides whether to measure."""
 LEAST_SAID = 1e-6
-"""Variance that leaving out a block adds to a parameter, in units of its prior, below which it is not looked at."""
+"""Smallest variance that leaving out a block must add to a parameter, in units of its prior, for it to be included."""
 
 
 @dataclass(frozen=True)
 class BlockScatter:
-    """Scatter of the blocks' influences, over what the noise makes it."""
+    """Scatter of the blocks' influences, relative to that of independent noise."""
 
     factor: Tensor | None = None  # (C,) on the standard deviations that noise gives a camera's parameters; at least 1
-    length: int = 0  # snapshots in a block, where they scatter most; 0 = no more than the noise makes them
+    length: int = 0  # snapshots in a block at the largest scatter; 0 = no excess over the noise
 
 
 def block_scatter(problem: Problem, solution: Solution, loss: NamedLoss) -> BlockScatter:
     """Measure the scatter for one rig, B = 1.
 
     Args:
-        problem: given, snapshots in the order of time.
+        problem: the problem, with snapshots in temporal order.
         solution: the minimum.
         loss: of the fit.
     """
@@ -105,11 +105,11 @@ def _powers_of_two(most: int) -> list[int]:
 
 
 def _is_worth_measuring(information: Tensor, pull: Tensor, lengths: list[int], cameras: int) -> bool:
-    """Tell whether blocks of any length scatter more than noise would make them, to first order; shapes as below."""
+    """Test to first order whether blocks of any length scatter more than noise would; shapes as in `_scatter`."""
     total = information.sum(0)
     total.diagonal().add_(1)
     covariance = torch.cholesky_inverse(torch.linalg.cholesky(total))
-    noise = (covariance - covariance @ covariance)[:cameras, :cameras]  # of the estimate; the rest is the prior's
+    noise = (covariance - covariance @ covariance)[:cameras, :cameras]  # due to noise; the rest is due to the prior
     known = noise.diagonal() > LEAST_SAID
     count = int(known.sum())
     if not count:
@@ -127,21 +127,21 @@ def _is_worth_measuring(information: Tensor, pull: Tensor, lengths: list[int], c
 
 
 class Scatter(NamedTuple):
-    """Squared changes of the parameters without each block over what independent noise makes them."""
+    """Squared changes of the parameters without each block, relative to independent noise."""
 
     average: float
     deviation: float  # standard deviation of the average, for independent noise
-    by_camera: Tensor  # (C,) half a camera's own average, half that of all
+    by_camera: Tensor  # (C,) half a camera's own average, half that of all cameras
 
 
 def _scatter(information: Tensor, pull: Tensor, joined: int, shape: torch.Size) -> Scatter:
-    """Squared changes of the parameters without each block over what independent noise makes them, averaged.
+    """Average the squared changes of the parameters without each block, relative to independent noise.
 
     Args:
         information: (B, D, D) of short blocks.
-        pull: (B, D) of the same.
-        joined: how many short blocks make a block; these overlap, and begin with each short one.
-        shape: (C, K) of the cameras' parameters, which come first; only these are looked at.
+        pull: (B, D) scores of the same.
+        joined: number of short blocks in a block; the blocks overlap, one begins with each short block.
+        shape: (C, K) of the cameras' parameters, which come first; only these are used.
     """
     wide = shape.numel()
     total = information.sum(0)
@@ -151,9 +151,9 @@ def _scatter(information: Tensor, pull: Tensor, joined: int, shape: torch.Size) 
     change: list[Tensor] = []
     expected: list[Tensor] = []
     for first, last in zip(summed, summed[joined:], strict=False):
-        without = torch.cholesky_inverse(torch.linalg.cholesky(total - (last - first)))[:wide]
-        change.append(without @ pull[len(change) : len(change) + joined].sum(0))
-        expected.append(without[:, :wide] - covariance)
+        remaining = torch.cholesky_inverse(torch.linalg.cholesky(total - (last - first)))[:wide]
+        change.append(remaining @ pull[len(change) : len(change) + joined].sum(0))
+        expected.append(remaining[:, :wide] - covariance)
     variance = torch.stack([block.diagonal() for block in expected]).sum(0)
     known = variance > LEAST_SAID
     if not bool(known.any()):
@@ -168,39 +168,39 @@ def _scatter(information: Tensor, pull: Tensor, joined: int, shape: torch.Size) 
 
 
 def _evidence(problem: Problem, state: State, size: int, loss: NamedLoss, first: int = 0) -> tuple[Tensor, Tensor]:
-    """What blocks of snapshots say about the whitened parameters of cameras and object, D in all.
+    """Information of blocks of snapshots about the whitened parameters of cameras and object, D in all.
 
     Args:
         problem: one rig.
         state: its minimum.
-        size: snapshots in a block; B blocks of them, what is left over is left out.
+        size: snapshots in each of the B blocks; leftover snapshots are ignored.
         loss: of the fit.
         first: the first snapshot of the first block.
 
     Returns:
-        (B, D, D) information and (B, D) pull, their poses marginalized, without the prior.
+        (B, D, D) information and (B, D) score, poses marginalized, without the prior.
     """
     count = (problem.uv.shape[1] - first) // size
     rows = slice(first, first + count * size)
 
-    def repeated(tensor: Tensor) -> Tensor:
+    def repeat(tensor: Tensor) -> Tensor:
         return tensor.expand(count, *tensor.shape[1:])
 
-    def parted(tensor: Tensor) -> Tensor:
+    def divide(tensor: Tensor) -> Tensor:
         return tensor[0, rows].unflatten(0, (count, size))
 
     own_std, own_offset = problem.object_prior_std, state.object_offset
     blocks = replace(
         problem,
-        uv=parted(problem.uv),
-        root_weight=parted(problem.root_weight),
-        factory=problem.factory.map_tensors(lambda tensor, _: repeated(tensor)),
-        prior_std=repeated(problem.prior_std),
-        object_prior_std=None if own_std is None else repeated(own_std),
+        uv=divide(problem.uv),
+        root_weight=divide(problem.root_weight),
+        factory=problem.factory.map_tensors(lambda tensor, _: repeat(tensor)),
+        prior_std=repeat(problem.prior_std),
+        object_prior_std=None if own_std is None else repeat(own_std),
     )
     there = State(
-        repeated(state.offset), parted(state.rotation), parted(state.centre),
-        None if own_offset is None else repeated(own_offset),
+        repeat(state.offset), divide(state.rotation), divide(state.centre),
+        None if own_offset is None else repeat(own_offset),
     )  # fmt: skip
     equations = equations_at(blocks, there, loss)
     own, coupling = equations.object, equations.coupling.permute(0, 1, 4, 2, 3).flatten(3)  # (B, S, 6, K C)

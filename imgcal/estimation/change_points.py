@@ -1,12 +1,12 @@
 """Score tests for a camera that has moved: at which snapshot does it stop agreeing with the rest of the rig?
 
-For a camera and a snapshot the question is whether a step of the camera's values from that snapshot on would explain
-the residuals better. All other unknowns, the cameras' values and the poses, are free to change with it: they are
-eliminated from the normal equations, so that no estimate has to be made again for any of the candidates. Residuals are
-clipped, as Huber's loss clips them: a few wrong labels cannot make up a step.
+For a camera and a snapshot, the test asks whether a step of the camera's values from that snapshot on would explain the
+residuals better. All other unknowns, the other cameras' values and the poses, may change with it. They are eliminated
+from the normal equations, so no candidate needs a new estimate. Residuals are clipped, as Huber's loss clips them, so
+that a few wrong labels cannot mimic a step.
 
-A capture is asked once, after the fact, for steps as small as all of it can show: all values of the rig are
-free, those of the lenses included.
+The search runs once over a whole capture, offline, and finds steps as small as all of its data can show: all values of
+the rig are free, lens parameters included.
 """
 
 from __future__ import annotations
@@ -26,46 +26,46 @@ from imgcal.estimation.map_estimate import equations_by_snapshot
 from imgcal.estimation.robust_losses import NamedLoss
 
 STEP = 8
-"""Values of a camera that may step: rotation, position, focal lengths."""
+"""Values of a camera that can step: rotation, position, focal lengths."""
 WIDEST_STEP = 10.0
-"""Standard deviation of a step, in those of the factory values."""
+"""Standard deviation of a step, in prior standard deviations of the factory values."""
 CLIP = 5.0
-"""Standard deviations beyond which a residual counts no more."""
+"""Standard deviations at which a residual is clipped."""
 LEAST_SNAPSHOTS = 2
-"""On either side of a step: one snapshot alone may be a slip of another kind."""
+"""On either side of a step: one snapshot alone may be an outlier of another kind."""
 MOST_TIMES = 128
-"""Places of a step that are tried in one pass; longer captures are searched in two."""
+"""Candidate snapshots that are tested in one pass; longer captures are searched in two."""
 GROWTH = 1.5
-"""Of the number of snapshots on the shorter side, from one place to the next where a step is first looked for."""
+"""Ratio between successive candidates of the first screening, in snapshots from the nearer end."""
 NEARBY = 0.5
-"""Of its statistic that a step keeps at the nearest of these places, at least; four fifths are expected."""
+"""Smallest share of a step's statistic that remains at the nearest of these candidates; four fifths are expected."""
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Step:
-    """The likeliest place of a step, and how likely."""
+    """The most likely step and its statistic."""
 
     camera: int
     row: int  # first snapshot after it
-    statistic: float  # chi-squared of `STEP` degrees of freedom where there is none
+    statistic: float  # chi-squared with `STEP` degrees of freedom if there is no step
     rivals: Array  # (C,) the largest statistic of each camera
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """Normal equations snapshot by snapshot, poses eliminated: whitened values of V cameras."""
+    """Normal equations of each snapshot, poses eliminated, for the whitened values of V cameras."""
 
     camera: Array  # (S, V, K, K) information of the labels
     gradient: Array  # (S, V, K) with clipped residuals
-    coupling: Array  # (S, 6, K V) with the pose, which is whitened
-    pull: Array  # (S, 6) gradient of the whitened pose
-    prior: Array  # (V, K) offsets: the prior's gradient
+    coupling: Array  # (S, 6, K V) with the whitened pose
+    pull: Array  # (S, 6) gradient by the whitened pose
+    prior: Array  # (V, K) offsets, which are the prior's gradient
 
     @cached_property
     def information(self) -> Array:
-        """Of all cameras together, poses eliminated: (K V, K V)."""
+        """Information of all cameras together, poses eliminated: (K V, K V)."""
         tall = self.coupling.reshape(-1, self.prior.size)
         total = np.eye(self.prior.size) - tall.T @ tall
         blocks = total.reshape(*self.prior.shape, *self.prior.shape)
@@ -75,12 +75,12 @@ class Blocks:
 
     @cached_property
     def _factor(self) -> Array:
-        """Lower factor of the information."""
+        """Lower Cholesky factor of the information."""
         return np.asarray(np.linalg.cholesky(self.information))
 
     @cached_property
     def covariance(self) -> Array:
-        """Of all cameras' whitened values: (K V, K V)."""
+        """Covariance of all cameras' whitened values: (K V, K V)."""
         return np.asarray(np.linalg.inv(self.information), dtype=np.float64)
 
     @cached_property
@@ -92,7 +92,7 @@ class Blocks:
         return np.asarray(cho_solve((self._factor, True), right, check_finite=False))
 
     def statistics(self, cameras: Sequence[int], rows: NDArray[np.int64]) -> Array:
-        """Score statistics of steps of some cameras before each of some snapshots, in increasing order: (R, K)."""
+        """Score statistics of steps at each of some snapshots (increasing), for each of some cameras: (R, K)."""
         chosen, size = np.asarray(cameras), self.prior.size
         width = self.prior.shape[1]
         stepping = (width * chosen[:, None] + np.arange(STEP)).ravel()
@@ -117,13 +117,13 @@ class Blocks:
 
 
 def _reverse_cumsum(parts: Array) -> Array:
-    """Replace parts (R, ...) by their sum from each of them on."""
+    """Replace parts (R, ...) by their sums from each part to the end."""
     np.cumsum(parts[::-1], axis=0, out=parts[::-1])
     return parts
 
 
 def linearize_snapshots(problem: Problem, state: State) -> Blocks:
-    """Linearize snapshot by snapshot, at a state of one rig."""
+    """Linearize one rig's problem snapshot by snapshot at a state."""
     full = clipped = equations_by_snapshot(problem, state, NamedLoss("squared"))
     whitened = full.residual[:, 0] * problem.root_weight[0].unsqueeze(-2)
     if bool((whitened.square().sum(-2) > CLIP**2).any()):
@@ -131,7 +131,7 @@ def linearize_snapshots(problem: Problem, state: State) -> Blocks:
     lower = torch.linalg.cholesky(full.pose[:, 0])
     coupling = torch.linalg.solve_triangular(lower, full.coupling[:, 0].flatten(1, 2).mT, upper=False)
     pull = torch.linalg.solve_triangular(lower, clipped.pose_gradient[:, 0, :, None], upper=False)[..., 0]
-    # The prior's pull is the same in each of them, and counts once.
+    # Every snapshot's equations contain the prior; it must count only once.
     gradient = clipped.camera_gradient - state.offset
     camera = full.camera - torch.eye(full.camera.shape[-1], dtype=lower.dtype)
     return Blocks(
@@ -140,15 +140,15 @@ def linearize_snapshots(problem: Problem, state: State) -> Blocks:
 
 
 def likeliest_step(blocks: Blocks, seen: NDArray[np.bool_], least: float = 0.0) -> Step | None:
-    """Find the camera and the snapshot at which a step explains most.
+    """Find the camera and the snapshot at which a step explains the most.
 
     Args:
         blocks: of S snapshots and V cameras.
         seen: (S, V) bool, snapshots in which a camera has labels.
-        least: statistic of a step that matters; others are looked for only where some camera has one.
+        least: smallest statistic of interest; without a camera near it in the screening, the search ends early.
 
     Returns:
-        None where nothing could be seen to step, or no step is so likely.
+        The most likely step, or None where no camera has enough snapshots or no statistic reaches `least`.
     """
     places = {camera: rows for camera in range(seen.shape[1]) if len(rows := _places(seen[:, camera]))}
     first = [c for c, most in _screen(blocks, places).items() if most >= NEARBY * least] if least else list(places)
@@ -164,14 +164,14 @@ def likeliest_step(blocks: Blocks, seen: NDArray[np.bool_], least: float = 0.0) 
 
 
 def _places(seen: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Snapshots at which a camera that is `seen` (S,) in some may be told to step."""
+    """Candidate snapshots for a step of a camera with labels in the snapshots `seen` (S,)."""
     shown = np.flatnonzero(seen)
     return shown[LEAST_SNAPSHOTS : len(shown) - LEAST_SNAPSHOTS + 1]
 
 
 def _screen(blocks: Blocks, places: Mapping[int, NDArray[np.int64]]) -> dict[int, float]:
-    """Largest statistic of each camera over a few of its places, in one go: a step nearby shows there, too."""
-    few = {camera: rows[_prior_std(len(rows))] for camera, rows in places.items()}
+    """Screen all cameras at once: the largest statistic of each over a few candidates. Nearby steps show there, too."""
+    few = {camera: rows[_sparse_indices(len(rows))] for camera, rows in places.items()}
     if not few:
         return {}
     rows = np.unique(np.concatenate(list(few.values())))
@@ -184,8 +184,8 @@ def _screen(blocks: Blocks, places: Mapping[int, NDArray[np.int64]]) -> dict[int
     return largest
 
 
-def _prior_std(count: int) -> NDArray[np.int64]:
-    """Numbers of a few of so many places, denser towards either end, where a place matters more."""
+def _sparse_indices(count: int) -> NDArray[np.int64]:
+    """Indices of a few of `count` candidates, denser towards either end, where the position matters more."""
     steps = LEAST_SNAPSHOTS * GROWTH ** np.arange(np.log(max(count, 2)) / np.log(GROWTH))
     near = np.unique(np.ceil(steps).astype(np.int64) - LEAST_SNAPSHOTS)
     near = near[near <= (count - 1) // 2]
@@ -193,7 +193,7 @@ def _prior_std(count: int) -> NDArray[np.int64]:
 
 
 def _search(blocks: Blocks, camera: int, rows: NDArray[np.int64]) -> tuple[float, int]:
-    """Largest statistic of a camera over some places, and the place."""
+    """Largest statistic of a camera over some candidates, and its snapshot."""
     tried = rows
     if len(rows) > MOST_TIMES:
         coarse = rows[np.unique(np.linspace(0, len(rows) - 1, MOST_TIMES).astype(int))]
@@ -206,10 +206,10 @@ def _search(blocks: Blocks, camera: int, rows: NDArray[np.int64]) -> tuple[float
 
 
 def dispersion(blocks: Blocks, seen: NDArray[np.bool_]) -> float:
-    """How many times larger statistics are than independent noise makes them, where nothing steps; at least one.
+    """Factor by which statistics without a step exceed those of independent noise; at least one.
 
     Errors of lenses, of the object and of blob centres depend on where the object is, and so on time: each snapshot
-    says less than it seems to.
+    carries less information than independent noise would suggest.
     """
     found = []
     for camera in range(seen.shape[1]):
@@ -221,10 +221,10 @@ def dispersion(blocks: Blocks, seen: NDArray[np.bool_]) -> float:
 
 
 def least_significant(candidates: int, error: float) -> float:
-    """Statistic from which `is_significant` holds."""
+    """Smallest statistic for which `is_significant` holds."""
     return float(chdtri(STEP, error / max(candidates, 1)))
 
 
 def is_significant(statistic: float, candidates: int, error: float) -> bool:
-    """Tell whether a statistic is larger than chance makes the largest of so many, but for an error probability."""
+    """Test a statistic as the largest of `candidates`, at error probability `error`."""
     return candidates * float(chdtrc(STEP, statistic)) < error

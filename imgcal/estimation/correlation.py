@@ -1,9 +1,9 @@
-"""How long errors remember: the integrated autocorrelation time of series of residuals, from the series themselves.
+"""Integrated autocorrelation time of residuals, estimated from the series themselves.
 
-Errors of real captures go on from frame to frame: a marker that is half hidden, a lens that is off at one place in the
-image. N such samples say as much as N / tau independent ones, where tau = 1 + 2 (rho_1 + rho_2 + ...) and rho_k is the
-autocorrelation at lag k. The sum ends where the autocorrelation can no longer be told from that of white noise, so
-that tau of white noise is one but for chance.
+Errors of real captures are correlated between frames: a half-hidden marker, a lens model that is off at one place in
+the image. N such samples carry as much information as N / tau independent ones, where tau = 1 + 2 (rho_1 + rho_2 + ...)
+and rho_k is the autocorrelation at lag k. The sum ends where the autocorrelation is no longer distinguishable from that
+of white noise, so that tau of white noise is one except by chance.
 
 Source: Politis and White, "Automatic block-length selection for the dependent bootstrap" (Econometric Reviews 2004),
 with the correction by Patton, Politis and White (2009): the rule for the last lag, and the flat-top window.
@@ -15,25 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 SURE = 2.0
-"""An autocorrelation counts from `SURE` (log10 n / n)^1/2 on, n pairs: three standard deviations of white noise."""
+"""An autocorrelation is significant above `SURE` (log10 n / n)^1/2 for n pairs: three sigma of white noise."""
 QUIET = 5
-"""Lags in a row that must not count before the sum ends."""
+"""Consecutive lags without significant autocorrelation that end the sum."""
 MOST_LAGS = 0.25
-"""Of the length of a series, the lags that are looked at: of longer ones there are too few independent pairs."""
+"""Largest lag, as a share of the series' length: longer lags have too few independent pairs."""
 FIRST_LAGS = 32
-"""Lags that are looked at first; more where the autocorrelation has not died away by then."""
+"""Lags tried first; more are tried where the autocorrelation has not died away by then."""
 LEAST_PAIRS = 16
-"""Pairs of samples from which an autocorrelation is looked at."""
+"""Smallest number of pairs of samples from which an autocorrelation is computed."""
 OUTLYING = 5.0
-"""Standard deviations (from the median absolute deviation) to which samples are clipped: outliers whiten a series."""
+"""Standard deviations (from the median absolute deviation) at which samples are clipped: outliers whiten a series."""
 
 
 def autocorrelation(series: NDArray[np.floating], lags: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Autocorrelation of series with gaps at lags 0 to `lags`, and how many pairs of samples it rests on.
+    """Autocorrelation of series with gaps at lags 0 to `lags`, and the number of sample pairs behind it.
 
     Args:
-        series: (S, C, ...) samples in the order of time, NaN where there is none. What follows the axis C are parallel
-            series of the same source, pooled with weights by their variance.
+        series: (S, C, ...) samples in temporal order, NaN where missing. The axes after C are parallel series of the
+            same source, pooled with weights by their variance.
         lags: at most S - 1.
 
     Returns:
@@ -63,18 +63,18 @@ def correlation_time(series: NDArray[np.floating]) -> NDArray[np.float64]:
     """Integrated autocorrelation time of each source, in samples; at least one.
 
     Args:
-        series: (S, C, ...) samples in the order of time, NaN where there is none; see `autocorrelation`. Samples are
-            comparable with each other (divided by their own standard deviation, where those differ).
+        series: (S, C, ...) samples in temporal order, NaN where missing; see `autocorrelation`. The samples must have
+            comparable variance (divide them by their standard deviations where those differ).
 
     Returns:
-        (C,) number of successive samples that say as much as one independent sample; one for white noise, and where the
-        samples are too few to tell.
+        (C,) number of successive samples that carry as much information as one independent sample; one for white noise
+        and where the samples are too few.
 
     Examples:
         >>> rng = np.random.default_rng(1)
         >>> white = rng.normal(size=(2000, 1))
-        >>> held = np.repeat(white, 10, axis=0)  # each value ten times
-        >>> float(correlation_time(white)[0]), 8 < float(correlation_time(held)[0]) < 12
+        >>> repeated = np.repeat(white, 10, axis=0)  # each value ten times
+        >>> float(correlation_time(white)[0]), 8 < float(correlation_time(repeated)[0]) < 12
         (1.0, True)
     """
     count, sources = series.shape[:2]
@@ -90,17 +90,17 @@ def correlation_time(series: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def effective_size(series: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Number of independent samples that say as much as the samples of each source do: (C,).
+    """Effective number of independent samples of each source: (C,).
 
     Args:
-        series: (S, C, ...), as for `correlation_time`. A moment counts once, however many parallel series know it.
+        series: (S, C, ...), as for `correlation_time`. A time counts once, however many parallel series have a sample.
     """
     known = np.isfinite(series).reshape(*series.shape[:2], -1).any(-1)
     return known.sum(0) / correlation_time(series)
 
 
 def _centre(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Series (S, C, D) without their medians, which are no correlation, and without the tails of outliers."""
+    """Subtract the medians of series (S, C, D) and clip outliers."""
     known = np.isfinite(x)
     if not known.any():
         return x
@@ -116,7 +116,7 @@ def _centre(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _last_lag(rho: NDArray[np.float64], pairs: NDArray[np.float64]) -> int:
-    """Last lag that counts before `QUIET` in a row do not; 0 = none. See `autocorrelation` for the arrays (L + 1,)."""
+    """Last significant lag before `QUIET` insignificant ones; 0 = none. Arrays (L + 1,) are from `autocorrelation`."""
     noise = SURE * np.sqrt(np.log10(np.maximum(pairs, 10)) / np.maximum(pairs, 1))
     counts = (pairs >= LEAST_PAIRS) & (np.nan_to_num(rho) > noise)
     last = 0
@@ -131,9 +131,9 @@ def _last_lag(rho: NDArray[np.float64], pairs: NDArray[np.float64]) -> int:
 def _integrate(rho: NDArray[np.float64], pairs: NDArray[np.float64], last: int) -> float:
     """Sum of an autocorrelation (L + 1,) over both signs of the lag by the flat-top window; at least one.
 
-    The window is one up to the last lag that counts, and falls to zero at twice that lag. It ends earlier where the
-    autocorrelation falls to zero: errors that last do not oscillate, but the mean that has been taken off a short
-    series makes its far lags negative (Geyer, "Practical Markov chain Monte Carlo", Statistical Science 1992).
+    The window is one up to the last significant lag, and falls to zero at twice that lag. It ends earlier where the
+    autocorrelation falls to zero: lasting errors do not oscillate, but subtracting the mean of a short series makes its
+    long lags negative (Geyer, "Practical Markov chain Monte Carlo", Statistical Science 1992).
     """
     lag = np.arange(1, min(2 * last, len(rho)))
     window = np.clip(2 * (1 - lag / (2 * max(last, 1))), 0.0, 1.0)

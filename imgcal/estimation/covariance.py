@@ -1,7 +1,7 @@
 """Posterior covariance of an estimate: of each camera, of the cameras relative to one another, of the poses.
 
-All begin with the Laplace approximation: the inverse of the Gauss-Newton information at the minimum, prior included.
-Those of the cameras and of the object add what the curvature of the posterior does to second order: `curvature.py`.
+All start from the Laplace approximation: the inverse of the Gauss-Newton information at the minimum, prior included.
+Those of the cameras and of the object add a second-order term for the curvature of the posterior: `curvature.py`.
 """
 
 # Compiled functions take their types from their arguments.
@@ -29,11 +29,11 @@ from renderers.compiling import njit
 
 UNDETERMINED = "covariance: the observations do not determine the object's pose in every snapshot"
 LEAST_STD = 1e-9
-"""Prior standard deviation (rad, mm, pixels, 1) of what is fixed, where it is divided by."""
+"""Floor of prior standard deviations (rad, mm, pixels, 1) in divisions, for fixed parameters."""
 HUBER = 3.0
-"""Standard deviations, as those of an estimate: residuals beyond tell less of how parameters follow each other."""
+"""Huber threshold in standard deviations, as for an estimate: larger residuals count less in couplings."""
 FEW_SNAPSHOTS = 10
-"""Up to which `remaining_variance` eliminates the cameras of an exact object, not the poses."""
+"""Up to this many, `remaining_variance` eliminates the cameras (exact object only) instead of the poses."""
 
 
 def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
@@ -41,13 +41,13 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
 
     Args:
         estimate: the estimate.
-        curved: add the second order; without, it is the inverse of the information, and of the scatter between blocks
-            of snapshots where that was larger.
+        curved: add the second order. Without it, the result is the inverse of the information, inflated by the scatter
+            between blocks of snapshots where that was larger.
 
     Returns:
         (*B, K C, K C) in the units and order of `CameraRig.parameter_names`, camera after camera; rotations are small
-        left rotations about the estimated orientation. Includes the gauge: a motion of the whole rig is known only as
-        well as the prior knows it; see `relative_covariance`.
+        left rotations about the estimated orientation. Includes the gauge: only the prior constrains a motion of the
+        whole rig; see `relative_covariance`.
 
     Raises:
         RefusedError: the information is singular (a snapshot with too few fiducials).
@@ -62,7 +62,7 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
         )
         covariance = by_prior + factor[:, None] * (covariance - by_prior) * factor
     covariance = covariance + _by_modes(estimate)
-    scale = _unwhitening(estimate).flatten(1, 2)  # (B, K C, K): one block a camera
+    scale = _unwhitening(estimate).flatten(1, 2)  # (B, K C, K): one block per camera
     blocks = covariance.unflatten(1, (cameras, -1)).unflatten(-1, (cameras, -1))
     per_camera = scale.unflatten(1, (cameras, -1))
     physical = torch.einsum("bcij,bcjdk,bdlk->bcidl", per_camera, blocks, per_camera)
@@ -75,7 +75,7 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
 
 
 def _by_modes(estimate: Estimate) -> Tensor:
-    """What the object's modes, known only so well, add to the covariance of the cameras' whitened offsets."""
+    """Covariance that the uncertainty of the object's modes adds to the cameras' whitened offsets."""
     if estimate.modes is None:
         return estimate.problem.prior_std.new_zeros(())
     follow = estimate.modes.follow.flatten(1)
@@ -95,23 +95,23 @@ def whitened_covariance(solution: Solution) -> Tensor:
         return torch.cholesky_inverse(reduced.kept)[:, :size, :size]
     inverse = torch.cholesky_inverse(reduced.eliminated)
     half = torch.linalg.solve_triangular(reduced.eliminated.mT, reduced.whitened, upper=True).flatten(1, 2)
-    prior_std = torch.linalg.solve_triangular(reduced.kept, half.mT, upper=False)
-    covariance = prior_std.mT @ prior_std
+    half_inverse = torch.linalg.solve_triangular(reduced.kept, half.mT, upper=False)
+    covariance = half_inverse.mT @ half_inverse
     blocks = covariance.unflatten(1, (cameras, -1)).unflatten(-1, (cameras, -1))
     blocks.diagonal(dim1=1, dim2=3).add_(inverse.permute(0, 2, 3, 1))
     return covariance
 
 
 def joint_information(estimate: Estimate) -> Tensor:
-    """Joint information of the cameras' parameters and of the object's offset, the poses let free.
+    """Joint information of the cameras' parameters and of the object's offset, the poses marginalized.
 
     Args:
         estimate: without batch axes.
 
     Returns:
         (D, D), D = K C + M: inverse covariance in the units and order of `CameraRig.parameter_names`, camera after
-        camera, then of the object's offset in standard deviations of its prior. What is fixed has the information of
-        `LEAST_STD`. As wide as the scatter between blocks of snapshots, where that was larger than the noise says.
+        camera, then of the object's offset in standard deviations of its prior. Fixed parameters have the information
+        of `LEAST_STD`. Reduced by the scatter between blocks of snapshots, where that was larger than the noise.
 
     Raises:
         RefusedError: the information is singular.
@@ -125,7 +125,7 @@ def joint_information(estimate: Estimate) -> Tensor:
     information = (reduced.kept @ reduced.kept.mT)[0]
     prior = torch.eye(len(information), dtype=information.dtype)
     if estimate.modes is not None:
-        # Woodbury: modes, known only so well, take from what is known of the cameras that follow them.
+        # Woodbury: the uncertainty of the modes reduces the information about the cameras that they affect.
         follow = information.new_zeros(len(estimate.modes.offset), len(information))
         of_cameras = estimate.modes.follow.flatten(1)
         follow[:, : of_cameras.shape[1]] = of_cameras
@@ -140,21 +140,21 @@ def joint_information(estimate: Estimate) -> Tensor:
 
 
 def _weakened_equations(estimate: Estimate, inflation: Tensor) -> NormalEquations:
-    """Normal equations in which the labels of each camera have standard deviations larger by a factor (C,).
+    """Normal equations with the labels' standard deviations of each camera enlarged by a factor (C,).
 
-    The labels are weakened before poses are eliminated: a change of cameras, object and poses together that no image
-    shows, as that of the scale, is then shown by none. Factors on the information once poses are eliminated would give
-    such a change information, as soon as cameras have different ones.
+    The labels are reweighted before the poses are eliminated. A joint change of cameras, object and poses that no image
+    can show, such as that of scale, then still gets no information. Factors applied after the elimination would give it
+    some as soon as they differ between cameras.
     """
     problem, solution = estimate.problem, estimate.solution
     distance = solution.equations.residual.square().sum(-2).sqrt() * problem.root_weight  # (1, S, C, N)
-    robust = (HUBER / distance.clamp_min(HUBER)).sqrt()  # the root of the loss's weight
+    robust = (HUBER / distance.clamp_min(HUBER)).sqrt()  # square root of the loss's weight
     weaker = replace(problem, root_weight=problem.root_weight * robust / inflation[:, None])
     return equations_at(weaker, solution.state, NamedLoss("squared"))
 
 
 def _floor_prior_std(estimate: Estimate, least: float) -> Estimate:
-    """The same estimate, its prior's standard deviations at least so large that they can be divided by."""
+    """Copy an estimate with the prior's standard deviations at least `least`, so that they can be divided by."""
     problem = estimate.problem
     return replace(estimate, problem=replace(problem, prior_std=problem.prior_std.clamp_min(least)))
 
@@ -179,16 +179,16 @@ def camera_std(estimate: Estimate) -> Tensor:
 
 
 def flat_std(estimate: Estimate) -> Tensor:
-    """`camera_std` without the second order, in a hundredth of the time: (*B, C, K)."""
+    """`camera_std` without the second order, a hundred times faster: (*B, C, K)."""
     left = torch.from_numpy(remaining_variance(estimate.solution)).to(estimate.problem.prior_std)
     std = left.clamp_min(0).sqrt() * estimate.problem.prior_std
     return std.reshape(*estimate.chi2.shape, *std.shape[1:])
 
 
 def remaining_variance(solution: Solution) -> NDArray[np.float64]:
-    """Part of each factory value's prior variance that the observations leave: (B, C, K), 1 = they say nothing.
+    """Share of each factory value's prior variance that remains: (B, C, K); 1 = the observations add nothing.
 
-    What `camera_std` gives over the spread, squared, but for the curvature of rotations; in a fraction of the time.
+    Equals `camera_std` over the prior's, squared, except for the curvature of rotations, and is much faster.
 
     Raises:
         RefusedError: the information is singular.
@@ -208,7 +208,7 @@ def remaining_variance(solution: Solution) -> NDArray[np.float64]:
 
 
 def _by_poses(equations: NormalEquations) -> NDArray[np.float64]:
-    """Diagonals (B, C, K) by way of the poses' dense information."""
+    """Diagonals (B, C, K) from the poses' dense information."""
     camera, coupling, pose = _doubles(equations.camera, equations.coupling, equations.pose)
     variance = np.empty(camera.shape[:3])
     for b in range(len(variance)):
@@ -218,7 +218,7 @@ def _by_poses(equations: NormalEquations) -> NDArray[np.float64]:
 
 
 def _by_cameras(equations: NormalEquations) -> NDArray[np.float64]:
-    """Diagonals (B, C, K) by way of the dense information of the cameras and, behind them, of the object."""
+    """Diagonals (B, C, K) from the dense information of the cameras and, after them, of the object."""
     camera, coupling, pose = _doubles(equations.camera, equations.coupling, equations.pose)
     batch, cameras = camera.shape[:2]
     coupling = coupling.transpose(0, 1, 4, 2, 3).reshape(*pose.shape[:3], -1)  # (B, S, 6, K C)
@@ -245,8 +245,8 @@ def _doubles(*tensors: Tensor) -> tuple[NDArray[np.float64], ...]:
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _diagonal_without_poses(kept, coupling, poses, result):
-    """First diagonal entries (D,) of the inverse of `kept` (K, K), less what poses (S, 6, 6) take that couple by
-    (S, 6, K); overwrites `kept`, and gives nan where a factorization fails.
+    """First diagonal entries (D,) of the inverse of `kept` (K, K) after eliminating poses (S, 6, 6) with coupling
+    (S, 6, K). Overwrites `kept`; nan where a factorization fails.
     """
     count, size, wide = coupling.shape
     lower, half, row = np.empty((size, size)), np.empty((size, wide)), np.empty(wide)
@@ -281,9 +281,9 @@ def _diagonal_without_poses(kept, coupling, poses, result):
 
 @njit(cache=True)
 def _diagonal(blocks, coupling, poses, result):
-    """Diagonal (C, K) of the inverse of the arrow of blocks (C, K, K), coupling (C, K, 6 S), poses (S, 6, 6).
+    """Diagonal (C, K) of the inverse of an arrow matrix: blocks (C, K, K), coupling (C, K, 6 S), poses (S, 6, 6).
 
-    The first two arrays are overwritten; nan where a factorization fails.
+    Overwrites the first two arrays; nan where a factorization fails.
     """
     wide, size = coupling.shape[2], blocks.shape[1]
     kept, row = np.zeros((wide, wide)), np.empty(wide)
@@ -328,7 +328,7 @@ def _diagonal(blocks, coupling, poses, result):
 
 @njit(cache=True)
 def _invert_factor(matrix):
-    """Replace the lower triangle of a symmetric matrix by the inverse of its Cholesky factor, nan without one."""
+    """Replace the lower triangle of a symmetric matrix by the inverse of its Cholesky factor; nan where that fails."""
     if not kernels.cholesky(matrix):
         for j in range(len(matrix)):
             matrix[j, j] = np.nan
@@ -342,7 +342,7 @@ def _invert_factor(matrix):
 
 
 def relative_covariance(estimate: Estimate, reference: int = 0) -> Tensor:
-    """Covariance with the extrinsics relative to a reference camera: free of the gauge.
+    """Covariance with the extrinsics relative to a reference camera: independent of the gauge.
 
     Returns:
         (*B, K C, K C) like `camera_covariance`; the rotation is that of cam_from_reference, the position that of the
@@ -359,10 +359,10 @@ def relative_covariance(estimate: Estimate, reference: int = 0) -> Tensor:
 
 
 def relative_jacobian(rig: CameraRig, reference: int) -> Tensor:
-    """Derivative of all parameters relative to a reference camera by the parameters: (*B, K C, K C).
+    """Jacobian of all parameters relative to a reference camera by the parameters: (*B, K C, K C).
 
-    For cam_from_reference = R_i R_r^T, a left rotation w_i - R_i R_r^T w_r; for the position p = R_r (c_i - c_r), the
-    change w_r x p + R_r (dc_i - dc_r).
+    For cam_from_reference = R_i R_r^T, it is a left rotation w_i - R_i R_r^T w_r; for the position p = R_r (c_i - c_r),
+    it is w_r x p + R_r (dc_i - dc_r).
     """
     cameras, rotation, positions = rig.num_cameras, rig.cam_from_rig.rotation, rig.positions
     to_reference = rotation[..., reference : reference + 1, :, :]
@@ -381,7 +381,7 @@ def relative_jacobian(rig: CameraRig, reference: int) -> Tensor:
 
 
 def relative_difference(rig: CameraRig, other: CameraRig, reference: int = 0) -> Tensor:
-    """Error of a rig against another one, extrinsics relative to a reference camera: (*B, C, K), gauge-free.
+    """Error of a rig against another one, extrinsics relative to a reference camera: (*B, C, K), independent of gauge.
 
     Examples:
         >>> import imgcal
@@ -400,7 +400,7 @@ def _relative_to(rig: CameraRig, reference: int) -> CameraRig:
 
 
 def _unwhitening(estimate: Estimate) -> Tensor:
-    """Derivative of the parameters by the whitened offsets: (B, C, K, K)."""
+    """Jacobian of the parameters by the whitened offsets: (B, C, K, K)."""
     problem, state = estimate.problem, estimate.solution.state
     prior_std = problem.prior_std.detach()
     scale = torch.diag_embed(prior_std)
@@ -410,9 +410,9 @@ def _unwhitening(estimate: Estimate) -> Tensor:
 
 
 def scale_response(estimate: Estimate) -> Tensor:
-    """How the parameters follow the scale of the object's file: (K C,) change of each by a relative change of one.
+    """Sensitivity of the parameters to the object's scale: (K C,) change of each by a relative change of one.
 
-    The poses follow, too, and fiducials as far as they have tolerances; the prior of the cameras holds against it.
+    The poses adapt, too, and so do the fiducials within their tolerances; the cameras' prior resists.
 
     Args:
         estimate: without batch axes.
@@ -432,7 +432,7 @@ def scale_response(estimate: Estimate) -> Tensor:
     if bool(factorization.reduced.failed.any()):
         raise RefusedError(UNDETERMINED)
     lower = factorization.reduced.kept[0]
-    # A step of the last unknown by one is followed by -A^-1 a of the others; with the Cholesky factor, -L^-T l.
+    # A unit step of the last unknown changes the others by -A^-1 a; with the Cholesky factor, -L^-T l.
     follow = -torch.linalg.solve_triangular(lower[:-1, :-1].mT, lower[-1, :-1, None], upper=True)[:, 0]
     cameras = estimate.rig.num_cameras
     whitened = follow[: problem.prior_std[0].numel()].unflatten(0, (cameras, -1))
@@ -459,8 +459,8 @@ def pose_covariance(estimate: Estimate) -> Tensor:
 def object_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
     """Joint covariance of the estimated fiducials' coordinates: (*B, 3 N, 3 N) mm^2, in the object's frame.
 
-    Zero where the object was given as exact. A common motion of all fiducials is known only as well as their tolerances
-    know it; see `imgcal.estimation.object_shape` for what does not depend on that.
+    Zero where the object was given as exact. Only the fiducials' tolerances constrain their common motion; see
+    `imgcal.estimation.object_shape` for quantities that do not depend on it.
 
     Args:
         estimate: the estimate.

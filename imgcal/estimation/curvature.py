@@ -1,13 +1,13 @@
-"""What the Laplace approximation leaves out: the posterior is curved, and its ellipsoid is flat.
+"""Second-order covariance that the Laplace approximation leaves out, because the posterior is curved.
 
-Where the data leave some directions wide open (one snapshot, a wide prior), moving along them bends the image by more
-than the noise, and the directions that the data determine well must follow. To second order, a step x of the
+Where the data leave some directions wide open (one snapshot, a wide prior), moving along them changes the image
+nonlinearly by more than the noise, and the well-determined directions must compensate. To second order, a step x of the
 posterior's own size is followed by
 
     d(x) = -H^-1 J^T W q(x),      q(x) = (r(x) + r(-x)) / 2 - r(0),
 
 where r are the residuals, J their Jacobian and W their weights at the minimum, H the information. d is even in x, so
-that it adds its own mean square to the covariance. It is averaged over pairs x, -x drawn from the flat posterior.
+its mean square adds to the covariance. It is averaged over pairs x, -x drawn from the Gaussian posterior.
 
 Source: the bias of nonlinear least squares, Box, "Bias in nonlinear estimation" (J. R. Stat. Soc. B 1971), and
 parameter curvature, Bates and Watts (J. R. Stat. Soc. B 1980), by sampling instead of second derivatives.
@@ -41,15 +41,15 @@ from imgcal.estimation.map_estimate import Estimate
 from imgcal.types import CameraRig
 
 MOST_PAIRS, LEAST_PAIRS = 256, 64
-"""Drawn for one snapshot; for many, where the posterior is narrow and hardly curved."""
+"""Pairs drawn for one snapshot, and for many, where the posterior is narrow and hardly curved."""
 AT_ONCE, POINTS_AT_ONCE = 16, 2**16
-"""Pairs that are projected together: more where they show so few points in all."""
+"""Pairs that are projected together; more as long as they have at most this many points in all."""
 MOST_KEPT_NUMBERS = 2**17
-"""Random numbers that are kept for the next estimate of the same size: drawing them takes as long as using them."""
+"""Random numbers cached for the next estimate of the same size: drawing them takes as long as using them."""
 
 
 def curvature_covariance(estimate: Estimate, quantity: Callable[[CameraRig, Tensor], Tensor]) -> Tensor:
-    """Mean square of what second order adds to a quantity.
+    """Mean square of the second-order change of a quantity.
 
     Args:
         estimate: with batch axes *B.
@@ -57,7 +57,7 @@ def curvature_covariance(estimate: Estimate, quantity: Callable[[CameraRig, Tens
             zero for the estimate itself.
 
     Returns:
-        (*B, Q, Q), symmetric and not negative: to be added to the covariance of the flat posterior.
+        (*B, Q, Q), positive semidefinite: to be added to the covariance of the Gaussian posterior.
     """
     problem, solution = estimate.problem, estimate.solution
     factorization = solution.factorization
@@ -71,18 +71,18 @@ def curvature_covariance(estimate: Estimate, quantity: Callable[[CameraRig, Tens
 
 
 def _both_ways(x: Step) -> Step:
-    """Steps (B, K, ...) and behind them their opposites: (B, 2 K, ...)."""
+    """Concatenate steps (B, K, ...) and their negatives: (B, 2 K, ...)."""
     return x.map(lambda part: torch.cat((part, -part), dim=1))
 
 
 def _add_rig_axis(problem: Problem) -> Problem:
-    """The problem for many rigs each: its cameras have an axis behind the batch, (B, 1)."""
+    """Give the cameras an axis for many rigs each, behind the batch: (B, 1)."""
     factory = problem.factory.map_tensors(lambda tensor, _: tensor.unsqueeze(1))
     return replace(problem, factory=factory, prior_std=problem.prior_std.unsqueeze(1))
 
 
 def _step_rigs(problem: Problem, state: State, x: Step, follow: Step) -> tuple[CameraRig, Tensor]:
-    """Rigs (B, 2 K) and fiducials (B, 2 K, N, 3) mm after steps both ways, and what follows them either way."""
+    """Rigs (B, 2 K) and fiducials (B, 2 K, N, 3) mm after steps in both directions and their second-order response."""
     camera = (state.offset.unsqueeze(1) + x.camera).unflatten(1, (2, -1)) + follow.camera.unsqueeze(1)
     rigs = rig_at(_add_rig_axis(problem), camera.flatten(1, 2))
     points = points_at(problem, state).unsqueeze(1).expand(-1, x.camera.shape[1], -1, -1)
@@ -93,14 +93,14 @@ def _step_rigs(problem: Problem, state: State, x: Step, follow: Step) -> tuple[C
 
 
 def _own_shift(problem: Problem, offset: Tensor) -> Tensor:
-    """How offsets of the object (B, K, M) shift its fiducials: (B, K, N, 3) mm."""
+    """Shift of the fiducials by offsets of the object (B, K, M): (B, K, N, 3) mm."""
     assert problem.object_prior_std is not None
     step = offset * problem.object_prior_std.unsqueeze(1)
     return problem.points * step[..., -1, None, None] + step[..., :-1].unflatten(-1, (-1, 3))
 
 
 def _draw(factorization: Factorization, state: State, pairs: int) -> Step:
-    """Draw steps from the flat posterior: camera (B, K, C, parameters), pose (B, K, S, 6), object (B, K, M)."""
+    """Draw steps from the Gaussian posterior: camera (B, K, C, parameters), pose (B, K, S, 6), object (B, K, M)."""
     reduced = factorization.reduced
     batch, count, size, wide = reduced.whitened.shape
     kept, eliminated = _normal((batch, wide, pairs), (batch, count, size, pairs), like=reduced.kept)
@@ -115,7 +115,7 @@ def _draw(factorization: Factorization, state: State, pairs: int) -> Step:
 
 
 def _normal(*shapes: tuple[int, ...], like: Tensor) -> tuple[Tensor, ...]:
-    """Standard normal numbers, always the same ones: the same estimate has the same covariance."""
+    """Draw standard normal numbers with a fixed seed, so that equal estimates have equal covariances."""
     if sum(math.prod(shape) for shape in shapes) <= MOST_KEPT_NUMBERS:
         return _kept_normal(shapes, like.dtype, like.device)
     return _new_normal(shapes, like.dtype, like.device)

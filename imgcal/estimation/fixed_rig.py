@@ -1,4 +1,4 @@
-"""Where the object is, by a rig that is taken as it stands: six numbers, in one compiled call."""
+"""The object's pose with a fixed rig: six parameters, in one compiled call."""
 
 # Compiled functions take their types from their arguments.
 # ruff: noqa: ANN001, ANN202
@@ -29,7 +29,7 @@ TOLERANCE = 1e-4
 
 @dataclass(frozen=True)
 class FixedRigFit:
-    """The most probable pose of an object, the rig being known."""
+    """The most probable pose of an object, given the rig."""
 
     rig_from_object: RigidTransform  # (1,)
     residual: NDArray[np.float64]  # (C, N, 2) pixels, predicted minus observed; zero where not seen
@@ -43,13 +43,13 @@ def fit_pose(
     rig_from_object: RigidTransform,
     options: EstimationOptions = EstimationOptions(loss="cauchy"),
 ) -> FixedRigFit:
-    """Find the object's pose.
+    """Estimate the object's pose.
 
     Args:
         observations: (1, C, N), on the CPU.
-        rig: without batch axes; held.
+        rig: without batch axes; stays fixed.
         points: (N, 3) mm, the fiducials.
-        radius: (N,) mm of spherical ones.
+        radius: (N,) mm of spherical fiducials.
         rig_from_object: (1,) first guess.
         options: loss and threshold.
 
@@ -74,10 +74,10 @@ def fit_pose(
     weight = np.where(seen, 1 / np.where(seen, observations.sigma.numpy(), 1.0), 0.0).astype(np.float64)
     points = points.double()
     centroid = points.mean(0)
-    held = rig.focal_length.new_zeros(rig.num_cameras, 10 + rig.distortion.shape[-1]).double()
+    fixed_std = rig.focal_length.new_zeros(rig.num_cameras, 10 + rig.distortion.shape[-1]).double()
     problem = Problem(
         torch.from_numpy(uv)[None], torch.from_numpy(weight)[None], points - centroid, centroid,
-        None if radius is None else radius.double().square(), rig, held,
+        None if radius is None else radius.double().square(), rig, fixed_std,
     )  # fmt: skip
     rotation = rig_from_object.rotation.detach().double().reshape(1, 3, 3).numpy()
     centre = rig_from_object.translation.detach().double().reshape(1, 3).numpy() + rotation @ centroid.numpy()
@@ -91,11 +91,11 @@ def fit_pose(
         turned,
         position,
         *values,
-        held.numpy(),
+        fixed_std.numpy(),
         np.empty(0),
     )
     poses = (np.stack((rotation, rotation)), np.stack((centre, centre)))
-    (_, cameras, _, fiducials), free = uv.shape, held.shape[1]
+    (_, cameras, _, fiducials), free = uv.shape, fixed_std.shape[1]
     blocks = (
         np.empty((2, cameras, free, free)), np.empty((2, 1, 6, free * cameras)), np.empty((2, 1, 6, 6)),
         np.empty((2, 0, free * cameras)), np.empty((2, cameras, free)), np.empty((2, 1, 6)), np.empty((2, 0)),
@@ -112,7 +112,7 @@ def fit_pose(
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _fit_pose(given, offset, poses, blocks, loss, threshold):
-    """Levenberg-Marquardt on a pose; the row of the best, -1 where the pose is not determined."""
+    """Run Levenberg-Marquardt on a pose. Returns the row of the best state, or -1 where the pose is not determined."""
     rotation, centre = poses
     camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual = blocks
     own, steady = np.empty(0), np.empty((0, 0))

@@ -1,4 +1,4 @@
-"""Two estimates of one rig differ by a motion of the whole rig too, which no image shows. Here it is taken out."""
+"""Alignment of two estimates of one rig, which may differ by a motion of the whole rig that no image shows."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
 FINE = 0.1
-"""Pixels: differences between two estimates that are forgiven before a camera counts as moved."""
+"""Pixels: tolerated difference between two estimates before a camera counts as moved."""
 
 
 def align(rig: CameraRig, reference: CameraRig, points_reference: Tensor, cameras: Sequence[int]) -> CameraRig:
     """Move a whole rig so that some of its cameras see given points where those of a reference see them.
 
-    What is matched are images near the object, not positions and rotations: an estimate knows those well, and these
-    only together. A camera of the chosen ones that does not fit the others has little influence.
+    The alignment matches images near the object, not positions and rotations: an estimate knows the images well, but
+    positions and rotations only in combination. A selected camera that disagrees with the others has little influence.
 
     Args:
         rig: without batch axes.
         reference: the same cameras.
         points_reference: (M, 3) mm in the reference's frame, where the object was.
-        cameras: numbers of those that have not moved.
+        cameras: indices of the cameras that have not moved.
 
     Returns:
         The rig in the reference's frame; `rig` itself where the cameras see too little.
@@ -41,9 +41,9 @@ def align(rig: CameraRig, reference: CameraRig, points_reference: Tensor, camera
     observations = Observations(there.uv[None], torch.full_like(there.uv[None, ..., 0], FINE), seen[None])
     cloud = CalibrationObject(points_reference, torch.ones_like(points_reference))
     start = RigidTransform.identity(1, dtype=points_reference.dtype)
-    held = torch.zeros(len(chosen), rig.num_parameters, dtype=points_reference.dtype)
+    fixed_std = torch.zeros(len(chosen), rig.num_parameters, dtype=points_reference.dtype)
     fit = estimate(
-        observations, rig.select(chosen), cloud, start, prior_std=held, options=EstimationOptions(loss="cauchy")
+        observations, rig.select(chosen), cloud, start, prior_std=fixed_std, options=EstimationOptions(loss="cauchy")
     )
     rig_from_reference = fit.rig_from_object[0]
     cam_from_rig = rig.cam_from_rig

@@ -1,7 +1,7 @@
 """Gradients through a MAP solution, by the implicit function theorem.
 
-At the minimum the gradient g of the cost by the unknowns x is zero whatever the data are, so dx = -H^-1 dg. One more
-Newton step, x - H^-1 g with H held constant, therefore has the value of the solution and exactly its derivative.
+At the minimum the gradient g of the cost by the unknowns x is zero for any data, so dx = -H^-1 dg. One more Newton
+step, x - H^-1 g with H held constant, therefore has the value of the solution and exactly its derivative.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from imgcal.estimation.robust_losses import RobustKernel
 
 
 def attach_gradient(problem: Problem, solution: Solution, loss: RobustKernel) -> State:
-    """Return the solution's state, connected to whatever in `problem` requires a gradient."""
+    """Return the solution's state, connected to every tensor in `problem` that requires a gradient."""
     factory = problem.factory
     inputs = (
         problem.uv, problem.root_weight, problem.prior_std, problem.points, problem.object_prior_std,
@@ -49,7 +49,7 @@ def map_cost(problem: Problem, state: State, loss: RobustKernel) -> Tensor:
 
 
 def _gradient(problem: Problem, state: State, loss: RobustKernel, create_graph: bool) -> Step:
-    """Gradient of the cost by a step away from `state`."""
+    """Gradient of the cost by a step from `state`."""
     with torch.enable_grad():
         step = _zero_step(state)
         cost = map_cost(problem, retract(problem, state, *step), loss).sum()
@@ -108,7 +108,7 @@ def _conjugate_gradients(product: Callable[[Step], Step], precondition: Callable
 
 
 def _parts(step: Step) -> tuple[Tensor, ...]:
-    """Leave out the part of an exact object."""
+    """List the parts of a step; an exact object has none."""
     return tuple(part for part in step if part is not None)
 
 
@@ -123,14 +123,14 @@ def _add(first: Step, second: Step, factor: Tensor) -> Step:
 
 
 class _NewtonStep(torch.autograd.Function):
-    """-H^-1 g, with H symmetric and held constant."""
+    """-H^-1 g for symmetric, constant H."""
 
     @staticmethod
     def forward(
         ctx: Any, inverse_hessian: Callable[[Step], Step], camera: Tensor, pose: Tensor, own: Tensor | None = None
     ) -> Step:
         ctx.inverse_hessian = inverse_hessian
-        # At the minimum the step itself is zero up to rounding; taking it as zero keeps the solver's answer to the bit.
+        # At the minimum the step is zero up to rounding; returning exactly zero keeps the solver's answer bit for bit.
         zeros = (None if part is None else torch.zeros_like(part) for part in (camera, pose, own))
         return tuple(zeros)  # type: ignore[return-value]
 
@@ -141,7 +141,7 @@ class _NewtonStep(torch.autograd.Function):
 
 
 class _Solve(torch.autograd.Function):
-    """H^-1 v, with H symmetric and held constant: derivatives in forward direction come from the transpose of this."""
+    """H^-1 v for symmetric, constant H. It is its own transpose, which gives higher derivatives."""
 
     @staticmethod
     def forward(ctx: Any, inverse_hessian: Callable[[Step], Step], *vector: Tensor) -> Step:

@@ -25,17 +25,17 @@ from imgcal.estimation.robust_losses import RobustKernel
 LEAST_DAMPING = 1e-9
 MOST_DAMPING = 1e12
 RELAX = 0.2
-"""Of the damping, after a step that lowered the cost as expected; less and less than expected: up to GREATEST_RELAX."""
+"""Factor on the damping after a step that lowered the cost as expected; grows to `GREATEST_RELAX` for worse steps."""
 GREATEST_RELAX = 2.0
 FIRST_GROWTH = 4.0
-"""Of the damping, after the first of a series of rejected steps; doubled with each further one."""
+"""Factor on the damping after the first of a series of rejected steps; doubled with each further one."""
 
 Record = TypeVar("Record", State, NormalEquations, ObjectEquations)
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Where the iteration ended, rig by rig."""
+    """Final state of the iteration, for each rig."""
 
     state: State
     equations: NormalEquations
@@ -44,24 +44,24 @@ class Solution:
 
     @cached_property
     def factorization(self) -> Factorization:
-        """Of the equations, undamped: what covariances are made from."""
+        """Factorization of the undamped equations, for covariances."""
         return factorize(self.equations)
 
 
 def minimize(problem: Problem, start: State, loss: RobustKernel, max_iterations: int, tolerance: float) -> Solution:
     """Minimize the MAP cost of every rig of a batch.
 
-    A step that does not lower the cost, or whose factorization fails, is rejected and retried with more damping, each
-    time twice as much more: never taken, never replaced by nothing. After a step that was taken, the damping follows
-    from how much of the expected decrease came true (Nielsen 1999).
+    A step that does not lower the cost, or whose factorization fails, is rejected and retried with more damping; the
+    factor doubles each time. After an accepted step, the damping follows from the ratio of the actual to the expected
+    decrease (Nielsen 1999).
 
     Args:
-        problem: what is given, with one batch axis B.
+        problem: the problem, with one batch axis B.
         start: first guess.
         loss: robust loss.
         max_iterations: linearizations at most, for each rig.
-        tolerance: a rig has converged when a step is expected to lower its cost by less than this, absolute (the cost
-            is in units of squared standard deviations) or than the rounding errors of cost and pixels.
+        tolerance: a rig has converged when the expected decrease of its cost is below this absolute value (the cost is
+            in units of squared standard deviations) or below the rounding errors of cost and pixels.
 
     Returns:
         The best state found for each rig, with its normal equations.
@@ -84,8 +84,8 @@ def minimize(problem: Problem, start: State, loss: RobustKernel, max_iterations:
             state, equations = trial_state, trial
         else:
             state, equations = _where(better, trial_state, state), _where(better, trial, equations)
-        # A tiny step that does not help has met the rounding error: this is the minimum. Damping alone also makes steps
-        # tiny, so only a lightly damped one counts.
+        # A tiny step that does not help has reached the rounding error: this is the minimum. Strong damping also makes
+        # steps tiny, so only a lightly damped one counts.
         converged = converged | (small & (damping <= 1e-3) & ~torch.isinf(equations.cost))
         relax = 1 - (2 * (before - trial.cost) / gain - 1) ** 3
         damping = torch.where(better, damping * relax.clamp(RELAX, GREATEST_RELAX), damping * growth)
@@ -95,7 +95,7 @@ def minimize(problem: Problem, start: State, loss: RobustKernel, max_iterations:
 
 
 def pixel_rounding(problem: Problem) -> Tensor:
-    """Decrease of the cost that the rounding of pixels can feign: (B,); it matters in single precision alone."""
+    """Decrease of the cost that pixel rounding can mimic: (B,); matters only in single precision."""
     whitened = problem.uv * problem.root_weight.unsqueeze(-2)
     return (4 * torch.finfo(whitened.dtype).eps) ** 2 * whitened.square().flatten(1).sum(1)
 
@@ -105,10 +105,10 @@ def damped_step(equations: NormalEquations, damping: Tensor) -> tuple[Step, Tens
 
     Args:
         equations: blocks and gradients.
-        damping: (B,) relative addition to the diagonals.
+        damping: (B,) added to the diagonals, relative to them.
 
     Returns:
-        The step, the predicted decrease of the cost (B,), failed factorization (B,).
+        The step, the predicted decrease of the cost (B,), and whether the factorization failed (B,).
     """
     right = Step(-equations.camera_gradient, -equations.pose_gradient, None)
     if equations.object is not None:
@@ -123,10 +123,10 @@ def damped_step(equations: NormalEquations, damping: Tensor) -> tuple[Step, Tens
 
 @dataclass(frozen=True)
 class Factorization:
-    """The normal equations' arrow, factorized."""
+    """Factorization of the arrow-shaped normal equations."""
 
     reduced: schur.Reduced
-    cameras_first: bool  # the cameras were eliminated, else the snapshots
+    cameras_first: bool  # the cameras were eliminated, otherwise the snapshots
 
     def solve(self, right: Step) -> Step:
         """Solve for a right-hand side."""
@@ -137,7 +137,7 @@ class Factorization:
         return Step(camera, pose, border)
 
     def solve_many(self, right: Step) -> Step:
-        """Solve for K right-hand sides at once: (B, K, ...) in, the same out."""
+        """Solve for K right-hand sides at once: (B, K, ...) to (B, K, ...)."""
         camera, pose = right.camera.movedim(1, -1), right.pose.movedim(1, -1)
         border = None if right.object is None else right.object.movedim(1, -1)
         if self.cameras_first:
@@ -150,12 +150,12 @@ class Factorization:
 def factorize(
     equations: NormalEquations, damping: Tensor | None = None, cameras_first: bool | None = None
 ) -> Factorization:
-    """Factorize the arrow.
+    """Factorize the arrow-shaped equations.
 
     Args:
         equations: the blocks.
-        damping: (B,) relative addition to the diagonals.
-        cameras_first: what to eliminate; None = whichever leaves the smaller dense system.
+        damping: (B,) added to the diagonals, relative to them.
+        cameras_first: eliminate the cameras first; None = choose the smaller dense system.
     """
     camera, pose, own = equations.camera, equations.pose, equations.object
     if damping is not None:
@@ -174,14 +174,14 @@ def factorize(
 
 
 def _damp(blocks: Tensor, damping: Tensor) -> Tensor:
-    """Enlarge the diagonals of blocks (B, P, p, p) by a relative addition (B,)."""
+    """Scale the diagonals of blocks (B, P, p, p) by 1 + damping (B,)."""
     blocks = blocks.clone()
     blocks.diagonal(dim1=-2, dim2=-1).mul_(1 + damping[:, None, None])
     return blocks
 
 
 def better(first: Solution, second: Solution) -> Solution:
-    """Choose rig by rig the solution of the lower cost."""
+    """Choose for each rig the solution with the lower cost."""
     choose = first.equations.cost <= second.equations.cost
     return Solution(
         _where(choose, first.state, second.state),
@@ -192,7 +192,7 @@ def better(first: Solution, second: Solution) -> Solution:
 
 
 def replace_rows(solution: Solution, rows: Tensor, by: Solution, iterations: int) -> Solution:
-    """Put other solutions (R,) in the place of some rows (R,) of a batch."""
+    """Replace some rows (R,) of a batch by other solutions (R,)."""
     index = torch.zeros(len(solution.converged), dtype=torch.long, device=rows.device)
     chosen = torch.ones_like(index, dtype=torch.bool)
     index[rows], chosen[rows] = torch.arange(len(rows), device=rows.device), False
@@ -205,7 +205,7 @@ def replace_rows(solution: Solution, rows: Tensor, by: Solution, iterations: int
 
 
 def select_rows(record: Record, index: Tensor) -> Record:
-    """Index axis B of a record of tensors; what is None, such as the part of an exact object, stays so."""
+    """Index axis B of a record of tensors; None, as for an exact object, stays None."""
     values = {field.name: getattr(record, field.name) for field in fields(record)}
     chosen: dict[str, object] = {
         name: select_rows(value, index) if isinstance(value, ObjectEquations) else value[index]
@@ -216,7 +216,7 @@ def select_rows(record: Record, index: Tensor) -> Record:
 
 
 def _where(choose: Tensor, first: Record, second: Record) -> Record:
-    """Choose rig by rig between two records of tensors with leading axis B."""
+    """Choose for each rig between two records of tensors with leading axis B."""
     chosen: dict[str, object] = {}
     for field in fields(first):
         a, b = getattr(first, field.name), getattr(second, field.name)

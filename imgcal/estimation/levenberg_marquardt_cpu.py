@@ -1,7 +1,7 @@
-"""The solver's fast path on CPUs: `levenberg_marquardt.minimize` compiled to one loop a rig, without temporaries.
+"""The solver's fast path on CPUs: `levenberg_marquardt.minimize` compiled to one loop per rig, without temporaries.
 
-`linearization.py`, `schur.py` and `levenberg_marquardt.py` say the same in tensors, run on any device, and this is
-tested against them. Names, units and layouts are theirs. Rigs of a batch run in parallel.
+`linearization.py`, `schur.py` and `levenberg_marquardt.py` do the same in tensors, on any device; tests compare the
+two. Names, units and layouts are the same. Rigs of a batch run in parallel.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def minimize(
     """Do the work of `levenberg_marquardt.minimize` for tensors on the CPU.
 
     Args:
-        problem: what is given, batch axis B; one floating-point type throughout.
+        problem: the problem, batch axis B; one floating-point type throughout.
         start: first guess.
         loss: a key of `LOSS_CODES`.
         threshold: the loss's threshold in standard deviations.
@@ -78,14 +78,14 @@ def minimize(
 
 @contextmanager
 def _threads_of_torch() -> Iterator[None]:
-    """Let compiled loops use as many threads as torch. Both use OpenMP, and have afterwards what they had before."""
+    """Let compiled loops use as many threads as torch, and restore both settings afterwards. Both use OpenMP."""
     threads, compiled = torch.get_num_threads(), numba.get_num_threads()
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
     try:
         yield
     finally:
         numba.set_num_threads(compiled)
-        torch.set_num_threads(threads)  # the last word: numba's setting is OpenMP's, too
+        torch.set_num_threads(threads)  # must come last: numba's setting changes OpenMP's, too
 
 
 def linearize(problem: Problem, state: State, loss: str, threshold: float) -> NormalEquations:
@@ -100,13 +100,13 @@ def linearize(problem: Problem, state: State, loss: str, threshold: float) -> No
 
 @dataclass(frozen=True)
 class _Blocks:
-    """The normal equations as the compiled loops lay them out, B rigs; M columns of the object stand behind."""
+    """The normal equations in the layout of the compiled loops, B rigs; the object's M columns come last."""
 
     cameras_first: bool
     camera: Tensor  # (B, C, K, K)
     coupling: Tensor  # (B, C, K, 6 S + M) where cameras are eliminated first, else (B, S, 6, K C + M)
     pose: Tensor  # (B, S, 6, 6)
-    border: Tensor  # (B, M, as wide), lower triangle
+    border: Tensor  # (B, M, same width as coupling), lower triangle
     camera_gradient: Tensor  # (B, C, K)
     pose_gradient: Tensor  # (B, S, 6)
     own_gradient: Tensor  # (B, M)
@@ -115,7 +115,7 @@ class _Blocks:
 
     @classmethod
     def of(cls, problem: Problem, rows: int) -> _Blocks:
-        """Make room for so many of those of a problem."""
+        """Allocate the blocks of a problem for `rows` rows."""
         _, snapshots, cameras, _, fiducials = problem.uv.shape
         own = 0 if problem.object_prior_std is None else problem.object_prior_std.shape[1]
         free = problem.prior_std.shape[-1]
@@ -128,7 +128,7 @@ class _Blocks:
         return cls(cameras_first, *(problem.uv.new_empty(rows, *size) for size in sizes))
 
     def only(self, row: int) -> _Blocks:
-        """Keep one row; the cost is the first, the only one."""
+        """Select one row. The cost has only one."""
         return _Blocks(self.cameras_first, *[*(part[row : row + 1] for part in self.parts), self.cost[:1]])
 
     @property
@@ -138,7 +138,7 @@ class _Blocks:
         return (self.camera, self.coupling, self.pose, self.border, *gradients, self.residual)
 
     def equations(self) -> NormalEquations:
-        """The same as `linearization.linearize` has them."""
+        """Convert to the layout of `linearization.linearize`."""
         wide = self.coupling.shape[-1] - self.border.shape[1]
         coupling, across = self.coupling[..., :wide], self.border[..., :wide]
         if self.cameras_first:
@@ -159,9 +159,9 @@ class _Blocks:
 
 
 def _object_spread(problem: Problem, state: State, rows: int) -> tuple[Tensor, State]:
-    """Spread of the object's parameters (B, M), M = 0 where it is exact, and a copy of the state with as many.
+    """Prior standard deviations of the object's parameters (B, M), M = 0 if exact, and a copy of the state with M.
 
-    The state of a single rig is copied to all `rows`, else there are as many rigs.
+    The state of a single rig is copied to all `rows`; otherwise there are as many rigs as rows.
     """
     prior_std = (
         problem.uv.new_empty(len(problem.uv), 0) if problem.object_prior_std is None else problem.object_prior_std
@@ -179,7 +179,7 @@ def _problem_arrays(problem: Problem) -> tuple[Tensor, ...]:
 
 
 def camera_positions(rig: CameraRig) -> Tensor:
-    """The rig's `positions`, without gradients: those of tensors wait for a dozen of small operations."""
+    """The rig's `positions`, without gradients: faster than the dozen small tensor operations of the property."""
     rotation, translation = rig.cam_from_rig.rotation.detach().numpy(), rig.cam_from_rig.translation.detach().numpy()
     return torch.from_numpy(-(rotation.swapaxes(-1, -2) @ translation[..., None])[..., 0])
 
@@ -190,7 +190,7 @@ def _parts(state: State) -> tuple[Tensor, ...]:
 
 
 def shared_arrays(problem: Problem) -> tuple[np.ndarray | None, ...]:
-    """What `linearization_cpu` is given of all rigs alike."""
+    """Inputs of `linearization_cpu` that all rigs of the batch share."""
     points, squared = problem.points, problem.radius_squared
     if problem.part_of is not None:
         points = torch.cat((points, problem.part_of[:, None].to(points)), 1)
@@ -221,7 +221,7 @@ def _arrays(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:
 
 @njit(parallel=True, cache=True, fastmath=kernels.FAST)
 def _minimize_all(given, state, blocks, cost, converged, iterations, limits, tolerances):
-    """Levenberg-Marquardt on all rigs of a batch; the outputs hold the best states and their normal equations."""
+    """Run Levenberg-Marquardt on all rigs of a batch; the outputs receive the best states and their equations."""
     for b in prange(len(cost)):
         own, found = select_state(state, b), select_blocks(blocks, b)
         offset, rotation, centre, own_offset = own
@@ -251,20 +251,20 @@ def _minimize_all(given, state, blocks, cost, converged, iterations, limits, tol
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _minimize_rig(given, states, blocks, cost, converged, iterations, limits, tolerance):
-    """Levenberg-Marquardt on one rig.
+    """Run Levenberg-Marquardt on one rig.
 
     Args:
-        given: of one rig; see `linearization_cpu`.
-        states: two rows, the best so far and the one that is tried; the first row is the start.
+        given: inputs of one rig; see `linearization_cpu`.
+        states: two rows, the best so far and the current trial; the first row is the start.
         blocks: of the normal equations, two rows as well.
-        cost: (1,) of the best.
+        cost: (1,) of the best state.
         converged: (1,) whether a minimum was found.
-        iterations: (1,) how many were made.
-        limits: whether cameras are eliminated first, the loss and its threshold, iterations at most.
-        tolerance: on the cost.
+        iterations: (1,) number of iterations.
+        limits: whether cameras are eliminated first, the loss, its threshold, and the most iterations.
+        tolerance: expected decrease of the cost at which to stop.
 
     Returns:
-        The row of the best.
+        The row of the best state.
     """
     camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, _ = blocks
     cameras_first, loss, threshold, max_iterations = limits
@@ -314,7 +314,7 @@ def _solve(
     blocks, coupling, kept, border, right_blocks, right_kept, right_border, damping, factor, whitened, schur,
     step_blocks, step_kept, step_border,
 ):  # fmt: skip
-    """Solve the damped arrow for minus the gradients; return the predicted decrease, nan if a factorization fails."""
+    """Solve the damped equations for minus the gradients; return the predicted decrease, nan if a factor fails."""
     count, size, wide = coupling.shape
     size_kept = kept.shape[1]
     first_border = wide - len(border)
@@ -386,15 +386,15 @@ def _solve(
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _pair(first):
-    """Make room for two arrays like the given one, which becomes the first of them."""
-    both = np.empty((2,) + first.shape, first.dtype)  # noqa: RUF005 (numba knows no other way)
+    """Allocate two arrays like the given one, and copy it to the first."""
+    both = np.empty((2,) + first.shape, first.dtype)  # noqa: RUF005 (numba does not support unpacking here)
     _copy(both[0], first)
     return both
 
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _copy(destination, source):
-    """Copy an array; a loop of its own, because that compiles several times faster than a slice assignment."""
+    """Copy an array by a loop, which compiles several times faster than a slice assignment."""
     to, of = destination.reshape(-1), source.reshape(-1)
     for i in range(len(to)):
         to[i] = of[i]

@@ -1,8 +1,8 @@
-"""Residuals and normal equations of one snapshot of lights, each of which may be anywhere: compiled.
+"""Residuals and normal equations of one snapshot of independent lights, compiled.
 
-What `linearization_cpu.linearize_rig` does for a rigid object, with three numbers of a place for each light instead of
-the six of a pose. Cameras are linearized where they are (their offset is zero). A camera that shakes shifts all its
-lights alike, by an unknown that is taken out: it couples their places.
+Like `linearization_cpu.linearize_rig` for a rigid object, but with a position (3) per light instead of one pose (6).
+Cameras are linearized at their current values (zero offset). A shaking camera shifts all its lights by the same unknown
+amount. This shift is marginalized, which couples the lights' positions.
 """
 
 # Compiled functions take their types from their arguments.
@@ -23,16 +23,16 @@ def linearize_lights(given, places, blocks, loss, threshold, shake):
     """Fill the blocks of the normal equations and return the cost.
 
     Args:
-        given: squared radii (N,) of the lights, the lenses' models, pixels (C, 2, N) and the roots of their weights
-            (C, N), rotation, position, focal length, principal point and distortion of the cameras, and the units
-            (C, K) of their errors.
+        given: squared radii (N,) of the lights, the lenses' models, pixels (C, 2, N) and the square roots of their
+            weights (C, N), rotation, position, focal length, principal point and distortion of the cameras, and the
+            units (C, K) of their errors.
         places: (N, 3) mm.
-        blocks: of this snapshot, filled: information of each camera (C, K, K) with one added to its diagonal, coupling
-            (3 N, D), information of the places (3 N, 3 N), one on the diagonal for a hidden light; gradients
+        blocks: outputs for this snapshot: information of each camera (C, K, K) with one added to its diagonal, coupling
+            (3 N, D), information of the positions (3 N, 3 N), one on the diagonal for a hidden light; gradients
             (C, K) and (3 N,), residuals (C, 2, N).
         loss: code of the robust loss.
-        threshold: of it.
-        shake: (C,) pixels by which cameras shake; empty = they do not.
+        threshold: threshold of the robust loss.
+        shake: (C,) pixels, standard deviation of each camera's shake; empty = no camera shakes.
     """
     radius_squared, lenses, uv, root_weight, rotation, position, focal, principal, distortion, unit = given
     camera, coupling, pose, camera_gradient, pose_gradient, residual = blocks
@@ -158,7 +158,7 @@ def linearize_lights(given, places, blocks, loss, threshold, shake):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _to_camera(rotation, position, place, point):
-    """Write a place (3,) of the rig's frame in a camera's frame."""
+    """Transform a point (3,) from the rig's frame to a camera's frame."""
     for i in range(3):
         point[i] = 0.0
         for j in range(3):

@@ -1,15 +1,15 @@
 """Reprojection residuals with analytic Jacobians, summed into the blocks of the normal equations.
 
-The unknowns are, for each camera, K offsets from the factory values, *whitened*: divided by the prior's standard
-deviation, so that the prior is the unit matrix and a parameter of zero spread stays fixed; for each snapshot, 6
-local offsets of the object: a rotation (left, about its centroid) and a translation in units of the object's depth;
-and, where the object is known within tolerances only, its own M = 3 N + 1 offsets, whitened as well: of each
-fiducial's coordinates (mm, in the object's frame), and one scale of all distances.
+The unknowns of each camera are K *whitened* offsets from the factory values: they are divided by the prior standard
+deviation, so that the prior's information is the identity and a parameter with zero standard deviation stays fixed.
+Those of each snapshot are 6 local offsets of the object: a rotation (left, about its centroid) and a translation in
+units of the object's depth. Where the object is known only within tolerances, it has M = 3 N + 1 offsets of its own,
+also whitened: each fiducial's coordinates (mm, in the object's frame), and one scale of all distances.
 
-Turns that move no fiducial (of a stick about itself, of a single light) have no derivative and couple to nothing. They
-get unit information, which fixes them, adds nothing to any other unknown and leaves every determinant as it is.
+Rotations that move no fiducial (a stick about its axis, a single light) have no derivative and no coupling. They get
+unit information, which fixes them, adds nothing to any other unknown and leaves every determinant unchanged.
 
-Axes: B rigs, S snapshots, C cameras, N fiducials. Components stand before fiducials, so that every step works on long
+Axes: B rigs, S snapshots, C cameras, N fiducials. Components come before fiducials, so that every step works on long
 contiguous rows.
 """
 
@@ -40,7 +40,7 @@ POSE_PARAMETERS = 6
 
 @dataclass(frozen=True)
 class Problem:
-    """What is given: observations, the object, the factory rig and how far it may have drifted."""
+    """The estimation problem: observations, the object, the factory rig and its prior."""
 
     uv: Tensor  # (B, S, C, 2, N) pixels, observed
     root_weight: Tensor  # (B, S, C, N) 1 / sigma where seen, 0 elsewhere
@@ -51,12 +51,12 @@ class Problem:
     prior_std: Tensor  # (B, C, K) prior standard deviation of each parameter
     object_prior_std: Tensor | None = None  # (B, M) prior standard deviation of the object's parameters; None = exact
     modes: Tensor | None = None  # (K, N, 3) mm, about the centroid, by one prior standard deviation; see `shape_modes`
-    mode_offset: Tensor | None = None  # (K,) how much of each `points` have, whitened; None = nothing
-    part_of: Tensor | None = None  # (N,) object to which each fiducial belongs, where there are several; None = one
+    mode_offset: Tensor | None = None  # (K,) whitened offset of each mode that `points` include; None = zero
+    part_of: Tensor | None = None  # (N,) object to which each fiducial belongs, for several objects; None = one
 
     @property
     def pose_freedom(self) -> Tensor:
-        """How many numbers the observations show of all poses of a rig together: (B,)."""
+        """Number of pose parameters of each rig that the observations can determine: (B,)."""
         ranks = torch.tensor([pose_rank(points) for points in self.points_of_parts()], device=self.uv.device)
         if self.part_of is None:
             return self.uv.shape[1] * ranks.expand(len(self.uv))
@@ -69,12 +69,12 @@ class Problem:
         return [self.points[self.part_of == part] for part in range(int(self.part_of.max()) + 1)]
 
     def part_of_rows(self) -> Tensor:
-        """Object that each row shows, where there are several: (B, S); the first one where it shows nothing."""
+        """Object in each row, for several objects: (B, S); the first object for an empty row."""
         assert self.part_of is not None
         return self.part_of[(self.root_weight > 0).any(2).int().argmax(-1)]
 
     def select(self, rows: Tensor) -> Problem:
-        """Keep the given rigs, (R,) indices."""
+        """Select rigs by their indices (R,)."""
         prior_std = None if self.object_prior_std is None else self.object_prior_std[rows]
         return replace(
             self,
@@ -88,9 +88,9 @@ class Problem:
 
 @dataclass(frozen=True)
 class State:
-    """What is sought."""
+    """The unknowns."""
 
-    offset: Tensor  # (B, C, K) whitened: (parameter - factory) / spread
+    offset: Tensor  # (B, C, K) whitened: (parameter - factory) / prior_std
     rotation: Tensor  # (B, S, 3, 3) rig_from_object
     centre: Tensor  # (B, S, 3) mm, the object's centroid in the rig frame
     object_offset: Tensor | None = None  # (B, M) whitened; None = the object is exact
@@ -98,7 +98,7 @@ class State:
 
 @dataclass(frozen=True)
 class ObjectEquations:
-    """The object's part of the normal equations; `own` includes the prior's unit matrix, `gradient` its pull."""
+    """The object's part of the normal equations. `own` and `gradient` include the prior's identity and gradient."""
 
     camera: Tensor  # (B, C, K, M) coupling with the cameras
     pose: Tensor  # (B, S, 6, M) coupling with the poses
@@ -108,7 +108,7 @@ class ObjectEquations:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Gauss-Newton blocks at a state. `camera` includes the prior's unit matrix, `camera_gradient` its pull."""
+    """Gauss-Newton blocks at a state. `camera` and `camera_gradient` include the prior's identity and gradient."""
 
     cost: Tensor  # (B,) half the sum of robust squared residuals, data and prior
     camera: Tensor  # (B, C, K, K)
@@ -121,17 +121,17 @@ class NormalEquations:
 
 
 def rig_at(problem: Problem, offset: Tensor) -> CameraRig:
-    """Turn whitened offsets (B, C, K) into a rig."""
+    """Convert whitened offsets (B, C, K) to a rig."""
     return problem.factory.retract(offset * problem.prior_std)
 
 
 def pose_at(problem: Problem, state: State) -> RigidTransform:
-    """Turn the state's poses into transforms of the object's own frame: (B, S) rig_from_object."""
+    """Convert the state's poses to transforms of the object's own frame: (B, S) rig_from_object."""
     return RigidTransform(state.rotation, state.centre - state.rotation @ problem.centroid)
 
 
 def points_at(problem: Problem, state: State) -> Tensor:
-    """Fiducials about the centroid of the object as it is given: (B, N, 3) mm in the object's frame."""
+    """Fiducials relative to the centroid of the object as given: (B, N, 3) mm in the object's frame."""
     points = problem.points.expand(len(state.offset), -1, -1)
     if state.object_offset is None or problem.object_prior_std is None:
         return points
@@ -140,14 +140,14 @@ def points_at(problem: Problem, state: State) -> Tensor:
 
 
 class Step(NamedTuple):
-    """A change of a state, or a vector that is paired with one, such as a gradient."""
+    """A change of a state, or a vector of the same shape, such as a gradient."""
 
     camera: Tensor  # (B, C, K) whitened
     pose: Tensor  # (B, S, 6)
     object: Tensor | None = None  # (B, M) whitened; None = the object is exact
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Step:
-        """Apply a function to every part that there is."""
+        """Apply a function to every part that is not None."""
         return Step(function(self.camera), function(self.pose), None if self.object is None else function(self.object))
 
 
@@ -164,15 +164,15 @@ def retract(
 
 
 def linearize(problem: Problem, state: State, loss: Callable[[Tensor], tuple[Tensor, Tensor]]) -> NormalEquations:
-    """Evaluate residuals and Jacobians, and sum them up.
+    """Evaluate residuals and Jacobians, and accumulate the normal equations.
 
     Args:
-        problem: what is given.
+        problem: the problem.
         state: where to linearize.
         loss: maps squared whitened residuals (B, S, C, N) to (robust loss, its derivative), both per observation.
 
     Returns:
-        The blocks. The cost is infinite where a seen fiducial lies behind its camera.
+        The blocks. The cost is infinite where an observed fiducial lies behind its camera.
     """
     at = jacobian_at(problem, state)
     residual = at.residual
@@ -212,23 +212,23 @@ def linearize(problem: Problem, state: State, loss: Callable[[Tensor], tuple[Ten
 
 
 def append_scale(problem: Problem, by_fiducial: Tensor) -> Tensor:
-    """Append the derivative by the object's scale: (B, S, C, 3, 2, N) -> (B, S, C, 4, 2, N)."""
+    """Append the derivative with respect to the object's scale: (B, S, C, 3, 2, N) -> (B, S, C, 4, 2, N)."""
     by_scale = (by_fiducial * problem.points.mT[:, None]).sum(-3, keepdim=True)
     return torch.cat((by_fiducial, by_scale), dim=-3)
 
 
 def object_columns(sums: Tensor) -> Tensor:
-    """Order sums (..., 4, N) as the object's parameters (..., M): coordinates fiducial by fiducial, then the scale."""
+    """Order sums (..., 4, N) like the object's parameters (..., M): coordinates of each fiducial, then the scale."""
     return torch.cat((sums[..., :3, :].mT.flatten(-2), sums[..., 3, :].sum(-1, keepdim=True)), dim=-1)
 
 
 def _object_equations(problem: Problem, offset: Tensor, rows: Tensor, by_fiducial: Tensor) -> ObjectEquations:
-    """Sum up what the object's parameters add.
+    """Accumulate the object's part of the normal equations.
 
     Args:
-        problem: what is given.
+        problem: the problem.
         offset: (B, M) the object's state.
-        rows: (B, S, C, K + 7, 2, N) weighted Jacobian and residual, as `_jacobian` orders them.
+        rows: (B, S, C, K + 7, 2, N) weighted Jacobian and residual, in the order of `jacobian_at`.
         by_fiducial: (B, S, C, 3, 2, N) weighted derivative of each pixel by its own fiducial's coordinates (mm).
     """
     fiducials = rows.shape[-1]
@@ -257,7 +257,7 @@ def _object_equations(problem: Problem, offset: Tensor, rows: Tensor, by_fiducia
 
 
 def _depth_unit(state: State) -> Tensor:
-    """Length that makes a translation as large in the image as a rotation: (B, S, 1) mm."""
+    """Unit of translations, chosen so that they move the image as much as rotations: (B, S, 1) mm."""
     return state.centre.norm(dim=-1, keepdim=True).clamp_min(1.0)
 
 
@@ -268,7 +268,7 @@ class Jacobian:
     by_rig: Tensor  # (B, S, C, K + 7, 2, N): by K whitened camera and 6 pose parameters; the residual as last row
     by_fiducial: Tensor | None  # (B, S, C, 3, 2, N) by the fiducial's own coordinates (mm); None = the object is exact
     residual: Tensor  # (B, S, C, 2, N) pixels, predicted minus observed
-    behind: Tensor  # (B,) bool: a seen fiducial lies behind its camera
+    behind: Tensor  # (B,) bool: an observed fiducial lies behind its camera
 
 
 def robust_weight(problem: Problem, at: Jacobian, loss: Callable[[Tensor], tuple[Tensor, Tensor]]) -> Tensor:
@@ -278,7 +278,7 @@ def robust_weight(problem: Problem, at: Jacobian, loss: Callable[[Tensor], tuple
 
 
 def jacobian_at(problem: Problem, state: State) -> Jacobian:
-    """Differentiate all pixels by what they depend on.
+    """Differentiate all pixels with respect to the unknowns.
 
     With p = R (q + centre - position) the point in the camera and q the rotated fiducial, the derivative of a pixel
     with respect to a left rotation of the camera is p x d, with respect to the position -R^T d, with respect to a

@@ -1,14 +1,14 @@
-"""Residuals and normal equations on CPUs: `linearization.py` compiled to one loop a rig, without temporaries.
+"""Residuals and normal equations on CPUs: `linearization.py` compiled to one loop per rig, without temporaries.
 
-Three tuples of arrays go in and out: what is `given` (points of the object and their squared radii, the lenses' models,
-observations and the roots of their weights, the factory rig, the prior, that of the object), the `state`, and the
-`blocks` of the normal equations. Layouts: `levenberg_marquardt_cpu._Blocks`; what fits each camera and what each
-snapshot is summed up before it is written. The object's own parameters stand behind the coupled ones, and have a border
-of their own. Where several objects were in view, the points have a fourth column: the number of the object; each row
-shows one.
+There are three tuples of arrays. `given` holds the object's points and their squared radii, the lenses' models, the
+observations and the square roots of their weights, the factory rig, its prior, and that of the object. `state` holds
+the unknowns and `blocks` the normal equations, laid out as in `levenberg_marquardt_cpu._Blocks`. Products are summed
+for each camera and snapshot before they are written. The object's own parameters come last among the coupled ones, and
+have their own border. With several objects, the points have a fourth column, the number of the object; each row shows
+one object.
 
-Where a camera shakes, all that it sees in a snapshot is shifted alike, by an unknown amount: the most probable
-shift is taken out of the residuals, and what it might have been instead out of the normal equations (Schur complement).
+A shaking camera shifts all its observations of a snapshot by the same unknown amount. The most probable shift is
+subtracted from the residuals, and the shift is eliminated from the normal equations (Schur complement).
 """
 
 # Compiled functions take their types from their arguments.
@@ -23,7 +23,7 @@ from imgcal.geometry import NEAREST_DEPTH, kernels, lens_kernels
 from renderers.compiling import njit
 
 SHIFTS = 50
-"""Rounds at most in which a shift is found; each weighs residuals anew."""
+"""Most iterations of reweighting for a shift."""
 
 
 @njit(cache=True, fastmath=kernels.FAST)
@@ -44,7 +44,7 @@ def linearize_all(given, state, blocks, cost, cameras_first, loss, threshold):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def given_values(given, b):
-    """What is given of one rig; the points and their radii are those of all."""
+    """Select the inputs of one rig; the points and their radii are shared by all."""
     (
         points, radius_squared, lenses, uv, root_weight,
         rotation0, position0, focal0, principal0, distortion0, prior_std, own_std,
@@ -57,14 +57,14 @@ def given_values(given, b):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def select_state(state, b):
-    """One row of a state."""
+    """Select one row of a state."""
     offset, rotation, centre, own_offset = state
     return offset[b], rotation[b], centre[b], own_offset[b]
 
 
 @njit(cache=True, fastmath=kernels.FAST)
 def select_blocks(blocks, b):
-    """One row of normal equations."""
+    """Select one row of normal equations."""
     camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual = blocks
     return (
         camera[b], coupling[b], pose[b], border[b], camera_gradient[b], pose_gradient[b], own_gradient[b], residual[b],
@@ -75,8 +75,8 @@ def select_blocks(blocks, b):
 def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
     """Fill the blocks of the normal equations and return the cost.
 
-    `shake`: (S, C) pixels, one standard deviation of a shift that all points of a camera share in a snapshot; empty =
-    none. It is for equations in which poses are eliminated first.
+    `shake`: (S, C) pixels, standard deviation of a shift that all points of a camera share in a snapshot; empty = no
+    shake. Only for equations in which poses are eliminated first.
     """
     (
         points, radius_squared, lenses, uv, root_weight,
@@ -233,7 +233,7 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _fill_turns_of_row(points, root_weight, turns):
-    """Do what `fill_free_turns` does for the object that a row shows by its weights (C, N)."""
+    """Do the work of `fill_free_turns` for the object that a row shows according to its weights (C, N)."""
     cameras, fiducials = root_weight.shape
     shown = 0
     for n in range(fiducials - 1, -1, -1):
@@ -250,7 +250,7 @@ def _fill_turns_of_row(points, root_weight, turns):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _fix_turns(rotation, turns, pose):
-    """Add unit information (6, 6) on the turns that move no fiducial, as `linearization.linearize` does."""
+    """Add unit information to `pose` (6, 6) for rotations that move no fiducial, as `linearization.linearize` does."""
     for i in range(3):
         for j in range(3):
             for k in range(3):
@@ -260,7 +260,7 @@ def _fix_turns(rotation, turns, pose):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _start_object(own_offset, coupling, border, own_gradient):
-    """Clear the object's part of the blocks, put its prior there, and return the prior's cost."""
+    """Reset the object's part of the blocks to its prior, and return the prior's cost."""
     size, wide = border.shape
     first, cost = wide - size, 0.0
     for p in range(coupling.shape[0]):
@@ -277,7 +277,7 @@ def _start_object(own_offset, coupling, border, own_gradient):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _add_object(rows, rows_own, ru, rv, c, s, n, coupling, border, own_gradient, cameras_first):
-    """Add what one observation says of its fiducial's coordinates and of the object's scale."""
+    """Add the information of one observation about its fiducial's coordinates and the object's scale."""
     size, wide = border.shape
     first, last, free = wide - size, size - 1, rows.shape[1] - 6
     for k in range(4):
@@ -303,7 +303,7 @@ def _add_object(rows, rows_own, ru, rv, c, s, n, coupling, border, own_gradient,
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _project(given, state, c, s, scale, camera_at, residual):
-    """Write what a camera sees in a snapshot, predicted minus observed: (2, N) pixels."""
+    """Write the residuals of a camera in a snapshot, predicted minus observed: (2, N) pixels."""
     points, radius_squared, lenses, uv, _, _, _, _, _, _, _, own_std = given
     _, rotation, centre, own_offset = state
     rotation_cam, position, parameters, coefficients, (fx, fy, cx, cy) = camera_at
@@ -327,7 +327,7 @@ def _project(given, state, c, s, scale, camera_at, residual):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def take_shift(residual, root_weight, shake, loss, threshold, shift):
-    """Write the most probable shift of a camera's image (2,), and return what it costs."""
+    """Write the most probable shift of a camera's image (2,), and return its prior cost."""
     shift[:] = 0
     for _ in range(SHIFTS):
         total, u, v = 1 / shake**2, 0.0, 0.0
@@ -350,7 +350,7 @@ def take_shift(residual, root_weight, shake, loss, threshold, shift):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _add_shared(rows, rows_own, weight, n, shared, shared_own):
-    """Add the derivatives of one observation to those of the shift that it shares."""
+    """Add the derivatives of one observation to those of the common shift."""
     size = shared_own.shape[1]
     for r in range(2):
         for i in range(shared.shape[1]):
@@ -363,7 +363,7 @@ def _add_shared(rows, rows_own, weight, n, shared, shared_own):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _subtract_object(share, shared, shared_own, c, s, coupling, border):
-    """Take out of the object's part of the blocks what a shift may have been; poses are eliminated first."""
+    """Eliminate a common shift from the object's part of the blocks; for poses that are eliminated first."""
     size, wide = border.shape
     first, free = wide - size, shared.shape[1] - 6
     for own in range(size):

@@ -1,4 +1,4 @@
-"""MAP estimation of a rig from labelled fiducials: `estimate`, and what it returns."""
+"""MAP estimation of a rig from labelled fiducials: `estimate` and its result."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from imgcal.messages import brief
 from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior, check_observations
 
 PATIENCE = 15
-"""Steps after which a rig begins again; from factory values within their prior, 6 are usual."""
+"""Steps after which a rig starts over; from factory values within their prior, 6 are usual."""
 COARSER = (3000.0, 300.0, 30.0, 3.0)
-"""Times the standard deviation of the observations, in stages."""
+"""Factors on the standard deviation of the observations, in stages."""
 COARSE_TOLERANCE = 0.1
 
 
@@ -44,13 +44,13 @@ class EstimationOptions:
 
     loss: Literal["squared", "huber", "cauchy", "geman_mcclure"] = "huber"
     threshold: float = 3.0  # standard deviations, where the loss stops being quadratic
-    max_iterations: int = 100  # of one attempt; see `minimize`
+    max_iterations: int = 100  # per attempt; see `minimize`
     tolerance: float = 1e-4  # expected decrease of the cost (half a squared standard deviation) at which to stop
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The most probable rig, the object's poses, and how well they are known. `covariance.py` reads the last part.
+    """The most probable rig and poses of the object, with the data for `covariance.py` at the end.
 
     Examples:
         >>> import imgcal
@@ -71,42 +71,42 @@ class Estimate:
     rig_from_object: RigidTransform  # (*B, S)
     residual: Tensor  # (*B, S, C, N, 2) pixels, predicted minus observed; zero where not seen
     chi2: Tensor  # (*B) sum of squared whitened residuals (robust), data and prior
-    dof: Tensor  # (*B) expected chi2: 2 observations - what the object shows of its poses (each prior pays for itself)
+    dof: Tensor  # (*B) expected chi2: 2 observations - rank of the poses (prior terms and their parameters cancel)
     converged: Tensor  # (*B) bool
     iterations: int
     points_object: Tensor  # (*B, N, 3) mm, the fiducials as estimated; as given where the object is exact
     problem: Problem  # (B,) flattened, as solved
     solution: levenberg_marquardt.Solution  # (B,) flattened: state and normal equations at the minimum
     inflation: Tensor | None = field(default=None, kw_only=True)
-    """(C,) factors on what noise adds to each camera's standard deviations, where blocks of snapshots scatter more:
-    `block_scatter`; None = they do not."""
+    """(C,) factors on the noise part of each camera's standard deviations, where blocks of snapshots scatter more than
+    the noise: `block_scatter`; None = they do not."""
     modes: ModeEvidence | None = field(default=None, kw_only=True)
-    """How well the object's modes are known, and what follows them; None = it has none."""
+    """Uncertainty of the object's modes, and how the cameras depend on them; None = no modes."""
 
     @property
     def mean_inflation(self) -> float:
-        """Root mean square of `inflation`: what the object, which all cameras see, is inflated by; 1 = none."""
+        """Root mean square of `inflation`, for the object, which all cameras see; 1 = no inflation."""
         return 1.0 if self.inflation is None else float(self.inflation.square().mean().sqrt())
 
     def covariance(self, reference: int = 0) -> Tensor:
         """Covariance of the cameras relative to one of them: (*B, K C, K C); see `relative_covariance`."""
-        from imgcal.estimation.covariance import relative_covariance  # it builds on this module
+        from imgcal.estimation.covariance import relative_covariance  # avoids a circular import
 
         return relative_covariance(self, reference)
 
     @property
     def chi2_per_dof(self) -> Tensor:
-        """About 1 where residuals fit the noise and the prior: (*B)."""
+        """About 1 where the residuals agree with the noise and the prior: (*B)."""
         return self.chi2 / self.dof
 
     @property
     def rms(self) -> Tensor:
-        """RMS length of the residuals of the seen fiducials, as OpenCV's calibrateCamera returns it: (*B) pixels."""
+        """RMS length of the observed fiducials' residuals, as OpenCV's calibrateCamera returns it: (*B) pixels."""
         count = (self.problem.root_weight > 0).flatten(1).sum(1).clamp_min(1).reshape(self.chi2.shape)
         return (self.residual.square().flatten(len(self.chi2.shape)).sum(-1) / count).sqrt()
 
     def __repr__(self) -> str:
-        """Say what it is, and shapes instead of walls of numbers."""
+        """Show the type and shapes instead of walls of numbers."""
         poses = brief(self.rig_from_object.translation)
         return f"Estimate({self.rig!r}, poses {poses}, residual {brief(self.residual)}, {self.iterations} iterations)"
 
@@ -121,28 +121,28 @@ def estimate(
     initial_rig: CameraRig | None = None,
     options: EstimationOptions = EstimationOptions(),
 ) -> Estimate:
-    """Find the rig and the object's poses that best explain the observations and the factory calibration.
+    """Estimate the rig and the object's poses that best explain the observations and the factory calibration.
 
-    The rig is constant over the snapshots while the object moves. Differentiable: where an input requires a gradient,
-    it flows through the solution by the implicit function theorem, to uv, sigma, the factory rig and the spread.
+    The rig is constant over the snapshots while the object moves. Differentiable in uv, sigma, the factory rig and the
+    prior's standard deviations: gradients flow through the solution by the implicit function theorem.
 
     Args:
         observations: (*B, S, C, N).
         rig: the factory rig, (*B) or without batch axes.
-        obj: N fiducials; a radius makes their images ellipses, whose centres are what is observed. Where it has
-            tolerances, its shape is estimated too, one shape for all snapshots; that of a stick is taken as it is. Its
-            modes are left at zero.
+        obj: N fiducials. With a radius, their images are ellipses, and the observations are the centres of those. With
+            tolerances, the object's shape is estimated too, one shape for all snapshots; a stick's shape stays fixed.
+            The object's modes stay zero.
         rig_from_object: (*B, S) first guess of the poses; None = `initial_pose`.
         prior_std: (*B, C, K) standard deviation of each factory value, as `CameraRig.parameter_names`; zero keeps a
             value fixed; None = the rig's own prior, or `RigPrior()`.
-        initial_rig: (*B) where to start, a network's output for example; None = the factory rig.
+        initial_rig: (*B) where to start, for example a network's output; None = the factory rig.
         options: how to minimize.
 
     Returns:
-        The estimate. `converged` must be looked at: a rig that has not converged is returned where it ended.
+        The estimate. Check `converged`: a rig that has not converged is returned in its last state.
 
     Raises:
-        InputError: shapes that do not belong together; something seen with a sigma of zero or less.
+        InputError: inconsistent shapes; an observed fiducial with a sigma of zero or less.
 
     Examples:
         >>> import imgcal
@@ -167,15 +167,15 @@ def estimate(
 
 
 def make_loss(options: EstimationOptions) -> NamedLoss:
-    """Return the robust loss that the options name."""
+    """Create the robust loss that the options name."""
     return NamedLoss(options.loss, options.threshold)
 
 
 def minimize(problem: Problem, start: State, options: EstimationOptions) -> levenberg_marquardt.Solution:
-    """Find the minimum from a start, on the CPU by the compiled solver; no gradient flows through it.
+    """Minimize from a start, on the CPU with the compiled solver; no gradient flows through the result.
 
-    Precise observations make narrow, winding valleys of the cost. A rig that is not through after `PATIENCE` steps
-    begins again with less precise ones, and comes back to the given precision by and by (graduated non-convexity).
+    Precise observations make narrow, winding valleys of the cost. A rig that has not converged after `PATIENCE` steps
+    starts over with larger standard deviations, which shrink to the given ones in stages (graduated non-convexity).
     """
     first = _solve(problem, start, replace(options, max_iterations=min(options.max_iterations, PATIENCE)))
     rows = (~first.converged).nonzero().squeeze(-1)
@@ -210,7 +210,7 @@ def _solve(problem: Problem, start: State, options: EstimationOptions) -> levenb
 
 
 def equations_at(problem: Problem, state: State, loss: NamedLoss) -> NormalEquations:
-    """Normal equations at a state, by the compiled loops where they can; no gradient flows through them."""
+    """Compute the normal equations at a state, with compiled loops on the CPU; no gradient flows through them."""
     with torch.no_grad():
         if problem.uv.device.type == "cpu":
             return levenberg_marquardt_cpu.linearize(problem, state, loss.name, loss.threshold)
@@ -218,13 +218,13 @@ def equations_at(problem: Problem, state: State, loss: NamedLoss) -> NormalEquat
 
 
 def equations_by_snapshot(problem: Problem, state: State, loss: NamedLoss) -> NormalEquations:
-    """Normal equations of each snapshot of one rig (B = 1), as of S rigs of one snapshot each, the object held.
+    """Compute the normal equations of each snapshot of one rig (B = 1), as S rigs of one snapshot, with a fixed object.
 
-    Each of them has the whole prior; less that, and summed, they are those of the rig.
+    Each includes the whole prior. Without it, their sum gives the equations of the rig.
     """
     count = problem.uv.shape[1]
 
-    def repeated(tensor: Tensor) -> Tensor:
+    def repeat(tensor: Tensor) -> Tensor:
         return tensor.expand(count, *tensor.shape[1:])
 
     alone = replace(
@@ -232,18 +232,18 @@ def equations_by_snapshot(problem: Problem, state: State, loss: NamedLoss) -> No
         uv=problem.uv[0].unsqueeze(1),
         root_weight=problem.root_weight[0].unsqueeze(1),
         points=points_at(problem, state)[0],
-        factory=problem.factory.map_tensors(lambda tensor, _: repeated(tensor)),
-        prior_std=repeated(problem.prior_std),
+        factory=problem.factory.map_tensors(lambda tensor, _: repeat(tensor)),
+        prior_std=repeat(problem.prior_std),
         object_prior_std=None,
     )
-    there = State(repeated(state.offset), state.rotation[0].unsqueeze(1), state.centre[0].unsqueeze(1))
+    there = State(repeat(state.offset), state.rotation[0].unsqueeze(1), state.centre[0].unsqueeze(1))
     return equations_at(alone, there, loss)
 
 
 def make_estimate(
     problem: Problem, solution: levenberg_marquardt.Solution, state: State, batch: torch.Size = torch.Size()
 ) -> Estimate:
-    """Say what a solution means; `state` is the solution's, possibly with a gradient."""
+    """Build the estimate from a solution; `state` is the solution's, possibly with a gradient."""
     seen = problem.root_weight > 0
     plain = state is solution.state and state.offset.device.type == "cpu"  # no gradient to carry
     rigs, poses = (levenberg_marquardt_cpu.rig_at if plain else rig_at)(problem, state.offset), pose_at(problem, state)
@@ -266,7 +266,7 @@ def make_estimate(
 def make_problem(
     observations: Observations, rig: CameraRig, obj: CalibrationObject, prior_std: Tensor | None
 ) -> Problem:
-    """Flatten the batch axes and whiten: see `estimate`."""
+    """Flatten the batch axes and whiten; see `estimate`."""
     cameras, fiducials = observations.seen.shape[-2:]
     if (
         cameras != rig.num_cameras
@@ -275,13 +275,13 @@ def make_problem(
     ):
         raise InputError(
             f"observations: found uv {tuple(observations.uv.shape)} and seen {tuple(observations.seen.shape)}, "
-            f"expected (..., snapshots, {rig.num_cameras} cameras, {obj.num_fiducials} fiducials) and the same with "
-            "coordinates"
+            f"expected uv (..., snapshots, {rig.num_cameras} cameras, {obj.num_fiducials} fiducials, 2) and seen "
+            "without the last axis"
         )
     if observations.shake is not None:
         raise InputError(
-            "observations: found `shake`, which only a running rig (`RigKeeper`) takes into account: estimate from "
-            "observations without it"
+            "observations: found `shake`, which only a running rig (`RigKeeper`) supports; expected observations "
+            "without it"
         )
     batch = observations.seen.shape[:-3]
     count = batch.numel()
@@ -318,7 +318,7 @@ def object_prior_std(obj: CalibrationObject) -> Tensor:
 
 
 def initial_state(problem: Problem, rig_from_object: RigidTransform, initial_rig: CameraRig | None) -> State:
-    """Turn a first guess into a state of the problem."""
+    """Convert a first guess to a state of the problem."""
     count, snapshots = problem.uv.shape[:2]
     rotation = rig_from_object.rotation.detach().to(problem.uv).reshape(count, snapshots, 3, 3)
     translation = rig_from_object.translation.detach().to(problem.uv).reshape(count, snapshots, 3)

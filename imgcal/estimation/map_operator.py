@@ -1,4 +1,4 @@
-"""The search for the most probable state as an operator of PyTorch: see `imgcal.operators`."""
+"""The minimization for the most probable state as an operator of PyTorch: see `imgcal.operators`."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ FACTORY = ("focal_length", "principal_point", "distortion", "camera_rotation", "
 
 
 def map_state(problem: Problem, start: State, options: str) -> tuple[State, Tensor]:
-    """Find the most probable state of a problem, differentiable in all but the object, also where PyTorch traces.
+    """Find the most probable state of a problem, differentiable in all but the object and traceable by PyTorch.
 
     Args:
-        problem: what is given, (B,).
-        start: where to start; with (B, 0) poses, they are found by `initial_pose`.
-        options: how to minimize, as `encode_options` returns it.
+        problem: the problem, (B,).
+        start: where to start; with (B, 0) poses, `initial_pose` computes them.
+        options: as `encode_options` returns them.
 
     Returns:
-        The state, and (B,) bool: converged.
+        The state, and (B,) bool: whether it has converged.
     """
     empty, rig = problem.uv.new_zeros(len(problem.uv), 0), problem.factory
     *state, converged = OPERATOR(
@@ -57,12 +57,12 @@ def map_state(problem: Problem, start: State, options: str) -> tuple[State, Tens
 
 
 def encode_options(options: EstimationOptions) -> str:
-    """Write options as `map_state` takes them."""
+    """Encode options as `map_state` takes them."""
     return json.dumps(asdict(options))
 
 
 def prepend_lenses(rig: CameraRig, options: str) -> str:
-    """Put the lens models of a rig, which no tensor says, before what else an operator is told."""
+    """Prepend a rig's lens models, which no tensor holds, to an operator's options."""
     return f"{','.join(rig.lens_models)}|{options}"
 
 

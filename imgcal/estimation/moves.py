@@ -1,8 +1,8 @@
-"""Cameras that moved while snapshots were taken: when, by how much, and whose the motion is.
+"""Cameras that moved while snapshots were taken: which ones, when, and by how much.
 
-A motion has no owner without a gauge: relative to a camera that was bumped, all the others moved. So a camera is given
-a second place from some snapshot on, and everything is estimated again; the fewest such steps that leave nothing to
-explain are the answer. Most cameras stand still, and they are what the others are measured against.
+Motion is relative, so a gauge is needed: relative to a camera that was bumped, all the others moved. A candidate camera
+therefore gets a second place from some snapshot on, and everything is estimated again. The answer is the smallest set
+of such steps that leaves nothing significant unexplained. Most cameras stand still, and they fix the gauge.
 """
 
 from __future__ import annotations
@@ -32,35 +32,35 @@ from imgcal.estimation.correlation import correlation_time
 from imgcal.estimation.linearization import Problem, State, points_at, pose_at, rig_at
 from imgcal.estimation.map_estimate import equations_at, minimize
 from imgcal.estimation.robust_losses import NamedLoss, huber
-from imgcal.types import Kind, MovedCamera
+from imgcal.types import PARAMETER_KINDS, Kind, MovedCamera
 
 ERROR = 1e-5
-"""Probability of naming a camera in a capture in which none has moved, as far as noise is what it is said to be."""
+"""Probability of naming a camera in a capture in which none has moved, if the noise is as stated."""
 LEAST_MOVE = 0.15
-"""Pixels, in the image of the camera: smaller ones do no harm, and slow drifts of every rig reach them. Errors that
-last reach more, by the root of what they add to the variance of snapshots."""
+"""Pixels, in the image of the camera: smaller moves do no harm, and slow drifts of every rig reach them. Multiplied by
+the square root of the dispersion, since correlated errors reach more."""
 LEAST_GAIN = 50.0
-"""Chi-squared of the kind of values that explains a step best."""
+"""Smallest chi-squared of the kind of values that explains a step best."""
 LEAST_MOTION = 0.9
-"""Of the chi-squared of a step of all values, the part that a motion alone explains, noise in the others apart."""
+"""Share of a step's chi-squared that a motion alone must explain, not counting the noise in other values."""
 LEAST_SIGMAS = 5.0
-"""Standard deviations, given the dispersion, of the kind of values that explains a step best."""
+"""Smallest size in standard deviations, given the dispersion, of the kind of values that explains a step best."""
 MOST_UNEXPLAINED = 0.5
-"""Of what does not fit in a camera that stands still, the part that may be left where it has several places."""
+"""Largest share of a camera's misfit that may remain after it is given several places."""
 LEAST_LEAD = 0.8
-"""Of the clearest camera's statistic: another one that explains as much may be the one that moved."""
+"""Relative to the best camera's statistic: another one that reaches this may be the one that moved."""
 
 EPISODE, LEAST_EPISODE = 2.0, 3
-"""Correlation times that a passing error may last, and the snapshots that it may last at least where errors last."""
+"""Longest transient error in correlation times, and its smallest length in snapshots where errors are correlated."""
 LEAST_LABELS = 2
-"""Labels of a camera from which the shift of its image in a snapshot counts."""
+"""Smallest number of labels from which the shift of a camera's image in a snapshot is computed."""
 
 KINDS: dict[Kind, tuple[slice, float]] = {
-    "rotation": (slice(0, 3), 180 / np.pi),
-    "position": (slice(3, 6), 1.0),
-    "focal_length": (slice(6, 8), 0.5**0.5),
+    "rotation": (PARAMETER_KINDS["rotation"], 180 / np.pi),
+    "position": (PARAMETER_KINDS["position"], 1.0),
+    "focal_length": (PARAMETER_KINDS["focal_length"], 0.5**0.5),
 }
-"""Which values of a camera, and the factor from their length to what is told: degrees, mm, px along one axis."""
+"""Values of a camera by kind, and the factor from their norm to the reported size: degrees, mm, px along one axis."""
 
 MOTION = slice(0, 6)  # rotation and position
 
@@ -69,25 +69,25 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Places:
-    """A rig in which a camera may have several places, one after the other: V of them, each seen as a camera."""
+    """A rig in which a camera may have several places in succession: V places, each treated as a camera."""
 
     problem: Problem  # one rig of V cameras
     state: State
-    camera: tuple[int, ...]  # (V,) of the rig
-    first: tuple[int, ...]  # (V,) row of the first snapshot
+    camera: tuple[int, ...]  # (V,) camera of the rig
+    first: tuple[int, ...]  # (V,) row of the place's first snapshot
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
-        """Snapshots in which there are labels: (S, V)."""
+        """Snapshots with labels: (S, V)."""
         return (self.problem.root_weight[0] > 0).any(-1).numpy()
 
     @cached_property
     def blocks(self) -> Blocks:
-        """Normal equations, snapshot by snapshot."""
+        """Normal equations of each snapshot."""
         return linearize_snapshots(self.problem, self.state)
 
     def divide(self, step: Step, options: EstimationOptions) -> Places:
-        """Give a camera another place from a step on, and estimate again."""
+        """Give a camera a new place from a step on, and estimate again."""
         problem, state, last = self.problem, self.state, len(self.camera)
         copies = [*range(last), step.camera]
         root_weight = problem.root_weight[:, :, copies].clone()
@@ -106,7 +106,7 @@ class Places:
         return Places(parted, solution.state, camera, first)
 
     def camera_places(self, camera: int) -> list[int]:
-        """Numbers of a camera's places, in the order of time."""
+        """Indices of a camera's places, in temporal order."""
         return sorted((v for v, c in enumerate(self.camera) if c == camera), key=lambda v: self.first[v])
 
     def shift(self, before: int, after: int) -> float:
@@ -119,27 +119,27 @@ class Places:
         return float(distance.median()) if len(distance) else 0.0
 
     def costs(self, place: int) -> Array:
-        """What each snapshot's labels would cost if their camera stood at one of its places: (S,) half chi-squared."""
+        """Cost of each snapshot's labels if their camera were at one of its places: (S,) half chi-squared."""
         loss, _ = huber(self._squared_residuals(place, self.camera_places(self.camera[place])), CLIP)
         return 0.5 * loss.sum(-1).numpy()
 
     def misfit(self, camera: int) -> float:
-        """Chi-squared of a camera's labels, each clipped, beyond what noise makes it."""
+        """Chi-squared of a camera's labels, each clipped, in excess of the noise."""
         own = [self._squared_residuals(place, [place]) for place in self.camera_places(camera)]
         labels = [(self.problem.root_weight[0][:, place] > 0).sum() for place in self.camera_places(camera)]
         return float(sum(part.clamp_max(CLIP**2).sum() for part in own) - 2 * sum(labels))
 
-    def without(self, place: int, rows: NDArray[np.int64]) -> Places:
-        """Leave out the labels that one of the places has in some snapshots; the estimate stays."""
+    def drop_labels(self, place: int, rows: NDArray[np.int64]) -> Places:
+        """Drop the labels of one place in some snapshots; the estimate stays."""
         root_weight = self.problem.root_weight.clone()
         root_weight[:, rows, place] = 0
         return replace(self, problem=replace(self.problem, root_weight=root_weight))
 
     def episode(self, camera: int) -> int:
-        """Successive snapshots of a camera that a passing error may last; 0 = errors do not last.
+        """Longest transient error of a camera, in successive snapshots; 0 = errors are not correlated.
 
-        The shift that the labels of an image share shows how long errors last. All cameras together count as well: one
-        that sees little is taken to be like the others.
+        The duration follows from the common shift of all labels of an image. All cameras together count as well, so
+        that a camera with few labels is treated like the others.
         """
         shifts = self._shifts()
         own = float(correlation_time(shifts[:, [camera]])[0])
@@ -161,11 +161,11 @@ class Places:
         return shifts
 
     def _squared_residuals(self, place: int, labels: list[int]) -> Tensor:
-        """Squared whitened residuals (S, N) of the labels of some places of a camera, if it stood at one of them."""
+        """Squared whitened residuals (S, N) of the labels of some places of a camera, predicted from one of them."""
         rig, poses = rig_at(self.problem, self.state.offset)[0], pose_at(self.problem, self.state)[0]
         points = poses.apply(points_at(self.problem, self.state)[0] + self.problem.centroid)
         uv = rig.select([place]).expand(len(points)).project(points, self._radius).uv[:, 0]
-        weight = self.problem.root_weight[0][:, labels].sum(1)  # of whichever place holds the label
+        weight = self.problem.root_weight[0][:, labels].sum(1)  # at most one place has the label
         return ((uv - self.problem.uv[0, :, place].mT) * weight[..., None]).square().sum(-1)
 
     @property
@@ -174,7 +174,7 @@ class Places:
         return None if squared is None else squared.sqrt()
 
     def change(self, before: int, after: int, noise: float) -> Change:
-        """Difference between two places of a camera, with what is known of it."""
+        """Difference between two places of a camera, with its information."""
         offset, prior_std = self.state.offset[0].numpy(), self.problem.prior_std[0, before].numpy()
         covariance = self.blocks.covariance.reshape(len(self.camera), len(prior_std), len(self.camera), len(prior_std))
         joint = covariance[before, :, before] + covariance[after, :, after]
@@ -192,25 +192,25 @@ class Change:
     prior_std: Array  # (K,) standard deviations of the prior
 
     def gain(self, part: slice) -> float:
-        """Chi-squared of the difference where only a part of the values may differ."""
+        """Chi-squared of the difference if only some of the values may differ."""
         return float(self.pull[part] @ np.linalg.solve(self.information[part, part], self.pull[part]))
 
     @property
     def is_physical(self) -> bool:
-        """Tell whether a motion, or another focal length, explains it: errors of the lens would take all values."""
+        """Check that a motion or a change of focal length explains it; errors of the lens would change all values."""
         kinds = max(self.gain(part) for part, _ in KINDS.values())
         motion = max(self.gain(MOTION), self.gain(KINDS["focal_length"][0]))
-        others = int((self.prior_std > 0).sum()) - MOTION.stop  # each of them takes one from noise alone
+        others = int((self.prior_std > 0).sum()) - MOTION.stop  # noise alone gives each an expected chi2 of one
         return kinds >= LEAST_GAIN and motion >= LEAST_MOTION * (self.gain(slice(None)) - others)
 
     @property
     def is_certain(self) -> bool:
-        """Tell whether its size is known to be more than errors of lenses make of many small steps."""
+        """Check that its size is significant, unlike that of the small steps that lens errors cause."""
         _, size, sigma = self.size()
         return size >= LEAST_SIGMAS * sigma
 
     def size(self) -> tuple[Kind, float, float]:
-        """Kind, size and standard deviation, by the one kind of values that explains the difference best."""
+        """Kind, size and standard deviation, for the one kind of values that explains the difference best."""
         kind = max(KINDS, key=lambda name: self.gain(KINDS[name][0]))
         part, unit = KINDS[kind]
         alone, scale = np.linalg.inv(self.information[part, part]), unit * self.prior_std[part]
@@ -227,14 +227,14 @@ def find_moves(
     """Look for cameras that have moved between two snapshots.
 
     Args:
-        problem: one rig of C cameras, with all labels, those that do not fit included.
+        problem: one rig of C cameras, with all labels, outliers included.
         state: the estimate.
         camera_names: C.
-        snapshot_names: S, in the order of time.
-        options: how estimates are made.
+        snapshot_names: S, in temporal order.
+        options: how to estimate.
 
     Returns:
-        In the order of time. Where two cameras explain a motion alike, both are named: "cam01 or cam02".
+        In temporal order. Where two cameras explain a motion equally well, both are named: "cam01 or cam02".
     """
     cameras = len(camera_names)
     places = still = Places(problem, state, tuple(range(cameras)), (0,) * cameras)
@@ -248,7 +248,7 @@ def find_moves(
             break
         divided = _locate(places, step, options)
         if divided is not None:
-            # What is left when the step has been explained says how much of it correlated errors may feign.
+            # The statistics that remain after the step show how much of it correlated errors can mimic.
             left = dispersion(divided.blocks, divided.seen)
             new = len(divided.camera) - 1
             if (
@@ -263,18 +263,18 @@ def find_moves(
                 continue
         left_out.add(places.camera[step.camera])
     moving = {places.camera[v] for v in doubts}
-    # Labels that are wrong in many snapshots pull hither and thither, and no few places explain them.
+    # Labels that are wrong in many snapshots scatter in all directions, so a few places cannot explain them.
     steady = {c for c in moving if places.misfit(c) > MOST_UNEXPLAINED * still.misfit(c)}
     return _describe(places, doubts, moving - steady, noise, camera_names, snapshot_names)
 
 
 def _locate(places: Places, step: Step, options: EstimationOptions) -> Places | None:
-    """Divide a camera's time where its two places explain most; None = too near to an end to be told from a slip."""
+    """Find the snapshot at which two places explain the most; None = too near an end to distinguish from an outlier."""
     divided = places.divide(step, options)
     new = len(divided.camera) - 1
     for _ in range(4):
         shown = np.flatnonzero(places.seen[:, step.camera])
-        # From a snapshot on, the new place instead of the old one: the sum of what that saves.
+        # Sum what the new place saves against the old one from each snapshot on.
         saved = (divided.costs(step.camera) - divided.costs(new))[shown]
         row = int(shown[np.cumsum(saved[::-1])[::-1].argmax()])
         if min((shown < row).sum(), (shown >= row).sum()) < LEAST_SNAPSHOTS:
@@ -287,16 +287,16 @@ def _locate(places: Places, step: Step, options: EstimationOptions) -> Places | 
 
 
 def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: float) -> bool:
-    """Tell whether a step is significant without the episode that speaks most for it, on either side.
+    """Check that a step stays significant without its most supportive episode on either side.
 
-    An error that passes is no motion: a target at the edge of an image, or behind an arm, may seem to be off by pixels
-    for some snapshots.
+    A transient error is no motion: a target at the edge of an image, or behind an arm, may seem to be off by pixels for
+    some snapshots.
 
     Args:
         places: before the camera's time was divided.
-        divided: afterwards, the new place being the last.
-        camera: number of the place that was divided.
-        least: statistic from which a step is significant.
+        divided: afterwards; the new place is the last.
+        camera: index of the divided place.
+        least: smallest significant statistic.
     """
     new = len(divided.camera) - 1
     length, row = divided.episode(divided.camera[new]), divided.first[new]
@@ -308,7 +308,7 @@ def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: fl
         if len(rows) <= length:
             return False
         first = int(np.convolve(gain[rows], np.ones(length), "valid").argmax())
-        rest = places.without(camera, rows[first : first + length])
+        rest = places.drop_labels(camera, rows[first : first + length])
         if rest.blocks.statistics([camera], np.array([row]))[0, 0] < least:
             return False
     return True

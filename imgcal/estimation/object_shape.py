@@ -1,9 +1,9 @@
-"""Is the object what its file says? Tests by what the residuals of a fit say about each fiducial, and the cure.
+"""Does the object match its file? Tests of each fiducial from the residuals of a fit, and tolerances to fix it.
 
-A fiducial that is off its place pulls all its residuals the same way in the object's frame, whatever the snapshot. The
-pull is the gradient of the cost by the fiducials' coordinates, and its variance the information that is left when rig
-and poses have adapted: a score test (Rao, Proc. Camb. Phil. Soc. 1948), which needs no second fit. The object's scale
-is a direction of its own: nothing but the prior of the cameras' positions knows it.
+A misplaced fiducial shifts all its residuals in the same direction in the object's frame, in every snapshot. The score
+is the gradient of the cost by the fiducials' coordinates. Its variance is the information that remains after rig and
+poses are marginalized. This is a score test (Rao, Proc. Camb. Phil. Soc. 1948), which needs no second fit. The object's
+scale is a separate direction: only the prior of the cameras' positions determines it.
 """
 
 from __future__ import annotations
@@ -35,50 +35,50 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 
 UNSURE = 1e-9
-"""Of the largest information, below which a direction of the shape counts as undetermined (a rigid motion, for one)."""
+"""Relative to the largest information: directions of the shape below it are undetermined (e.g. a rigid motion)."""
 WIDE = 0.05
-"""Of the object's size: how far off a fiducial is thought to be before the data have spoken."""
+"""Initial tolerance of a fiducial, relative to the object's size."""
 NARROW = 1e-4
-"""Of the object's size: a fiducial that is off by less is in its place."""
+"""Relative to the object's size: smaller offsets of a fiducial count as none."""
 MOST_FIDUCIALS = 64
-"""Of an object whose shape is asked about: boards and clouds with more are taken as they are measured."""
+"""Largest number of fiducials whose shape is tested: larger boards and clouds are trusted as measured."""
 WIDEST = 2.0
-"""Factor on the variance of a common tolerance, at most, for how few displacements it was learnt from."""
+"""Largest factor on the variance of a common tolerance that allows for the few displacements behind it."""
 COMPLEXITY = 3.0
 """Log evidence that each further tolerance must gain."""
 LEAD = 5.0
-"""Log odds from which some fiducials are taken to be exact beside others that are off: those hold the scale alone then.
+"""Smallest log odds for treating some fiducials as exact and others as off: the exact ones then fix the scale.
 Wands of five fiducials that are all off reach 3.7 in 800."""
 SNAPSHOTS_TO_BEND = 8
-"""From which the pulls of single snapshots are compared with each other."""
+"""Smallest number of snapshots whose scores are compared with each other."""
 LEAST_NOISE = 0.01
-"""Of the noise that was stated: what residuals of exact data leave is the solver's, and says nothing of the object."""
+"""Floor of the noise relative to the stated one: smaller residuals come from the solver, not from the object."""
 ROUNDS = 60
-"""Of `learnt_tolerances` and of `offsets`, at most."""
+"""Most iterations in `learnt_tolerances` and in `offsets`."""
 
 
 @dataclass(frozen=True)
 class ShapeEvidence:
-    """What a fit says about the object, linearized: N fiducials."""
+    """Linearized information of a fit about the object's N fiducials."""
 
     information: Array  # (3 N, 3 N) mm^-2, of the fiducials' coordinates, rig and poses marginalized
-    pull: Array  # (3 N,) mm^-1, information times the displacement from `places` that the data ask for
-    places: Array  # (N, 3) mm, where the object's file puts the fiducials, about their centroid
-    points: Array  # (N, 3) mm, where the fit has them, about the same point
-    tolerance: Array  # (N,) mm, granted to them in this fit
+    pull: Array  # (3 N,) mm^-1, information times the best-fitting displacement from `places`
+    places: Array  # (N, 3) mm, the fiducials as in the object's file, relative to their centroid
+    points: Array  # (N, 3) mm, the fiducials as fitted, relative to the same point
+    tolerance: Array  # (N,) mm, their tolerances in this fit
     chi2: float  # of the fit, data and priors
     freedom: float  # its degrees of freedom
 
     @cached_property
     def directions(self) -> tuple[Floats, Floats, Floats]:
-        """What the data determine: directions (3 N, D), the variance (D,) that noise gives them, displacements (D,)."""
+        """Determined directions (3 N, D), the noise variance (D,) along them, and displacements (D,)."""
         values, vectors = np.linalg.eigh(self.information)
         sure = values > UNSURE * values[-1]
         vectors, variance = vectors[:, sure], 1 / values[sure]
         return vectors, variance, variance * (vectors.T @ self.pull)
 
     def _covariance(self, tolerance: Array) -> Array:
-        """Covariance (D, D) of those displacements, were the fiducials off by tolerances (N,) mm."""
+        """Covariance (D, D) of those displacements if the fiducials had tolerances (N,) mm."""
         vectors, variance, _ = self.directions
         return (vectors.T * np.repeat(tolerance**2, 3)) @ vectors + np.diag(variance)
 
@@ -91,17 +91,17 @@ class ShapeEvidence:
         return vectors, displacement, np.linalg.inv(self._covariance(self.tolerance))
 
     def log_evidence(self, tolerance: Array) -> float:
-        """Log likelihood of what the data ask for, were the fiducials off by tolerances (N,) mm."""
+        """Log likelihood of the displacements if the fiducials had tolerances (N,) mm."""
         covariance, displacement = self._covariance(tolerance), self.directions[2]
         _, log_det = np.linalg.slogdet(covariance)
         return -0.5 * float(displacement @ np.linalg.solve(covariance, displacement) + log_det)
 
     @cached_property
     def scale_error(self) -> tuple[float, float]:
-        """Relative scale of the object that explains the data best, less one, and its standard deviation."""
+        """Best-fitting relative scale of the object, minus one, and its standard deviation."""
         scale = self.points.ravel()
         weight, found = float(scale @ self.information @ scale), float(scale @ self.pull)
-        # One camera, wherever it is, cannot know how large the object is.
+        # A single camera cannot determine the object's size.
         if weight <= UNSURE * float(np.abs(self.information).max()) * float(scale @ scale):
             return 0.0, np.inf
         if self.tolerance.any():
@@ -111,16 +111,16 @@ class ShapeEvidence:
         return found / weight, weight**-0.5
 
     def bent_sigma(self, scatter: float = 1.0) -> float:
-        """How sure it is that the object is bent, its scale left aside, in standard deviations of a normal variable.
+        """Significance of a deformation of the object other than scale, in standard deviations of a normal variable.
 
-        An F test: what displacements of the fiducials beyond their tolerances would explain, against what they leave.
+        An F test: the chi2 that displacements beyond the tolerances would explain, against the remaining chi2.
 
         Args:
-            scatter: how much more the snapshots disagree than noise allows; see `pull_scatter`.
+            scatter: excess disagreement of the snapshots over the noise; see `pull_scatter`.
 
         Returns:
-            Zero for an object of more than `MOST_FIDUCIALS`: what is left of a lens that the model does not know looks
-            like a deformed grid, too.
+            Zero for an object of more than `MOST_FIDUCIALS`: there, lens errors that the model cannot express look like
+            a deformed grid, too.
         """
         ratio, mine, rest = self._ratio
         if mine <= 0 or rest <= 0:
@@ -129,7 +129,7 @@ class ShapeEvidence:
 
     @cached_property
     def _ratio(self) -> tuple[float, float, float]:
-        """F statistic of `bent_sigma` where snapshots agree, and its degrees of freedom."""
+        """F statistic of `bent_sigma` for a scatter of one, and its degrees of freedom."""
         if len(self.places) > MOST_FIDUCIALS:
             return 0.0, 0.0, 0.0
         _, displacement, precision = self._determined_directions
@@ -144,17 +144,17 @@ class ShapeEvidence:
 
 @dataclass(frozen=True)
 class ScaleEvidence:
-    """What a fit says about an exact object of so many fiducials that its shape is not asked about."""
+    """Information of a fit about an exact object with too many fiducials to test its shape."""
 
-    scale_error: tuple[float, float]  # as of `ShapeEvidence`
+    scale_error: tuple[float, float]  # as in `ShapeEvidence`
 
     def bent_sigma(self) -> float:
-        """Zero: it is not asked; see `ShapeEvidence.bent_sigma`."""
+        """Zero: the shape is not tested; see `ShapeEvidence.bent_sigma`."""
         return 0.0
 
 
 def object_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ShapeEvidence | ScaleEvidence | None:
-    """Ask a fit of one rig (B = 1) about the object that it took; None where rig and poses are undetermined."""
+    """Extract a fit's evidence about its object, for one rig (B = 1); None where rig and poses are undetermined."""
     solid = all(pose_rank(points) == 6 for points in problem.points_of_parts())
     if problem.object_prior_std is None and (len(problem.points) > MOST_FIDUCIALS or not solid):
         return scale_evidence(problem, solution, loss)
@@ -162,7 +162,7 @@ def object_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Sh
 
 
 def scale_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ScaleEvidence | None:
-    """Find the `scale_error` of an exact object in a time that grows with its fiducials, not with their cube.
+    """Compute the `scale_error` of an exact object in time linear in its fiducials instead of cubic.
 
     Args:
         problem: of one rig, with an exact object.
@@ -170,20 +170,20 @@ def scale_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Sca
         loss: of the fit.
 
     Returns:
-        None where rig and poses are undetermined.
+        The evidence; None where rig and poses are undetermined.
     """
     found = direction_evidence(problem, solution, loss, problem.points[None])
     if found is None:
         return None
     left = found.information[0, 0]
-    # As of `ShapeEvidence`, but against what a fiducial says before rig and poses have adapted.
+    # As in `ShapeEvidence`, but relative to a fiducial's information before rig and poses are marginalized.
     if left <= UNSURE * found.alone * problem.points.square().sum():
         return ScaleEvidence((0.0, np.inf))
     return ScaleEvidence((float(found.pull[0] / left), float(left) ** -0.5))
 
 
 def shape_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ShapeEvidence | None:
-    """Ask a fit of one rig (B = 1) about all of the object's shape; None where rig and poses are undetermined."""
+    """Extract a fit's evidence about the whole shape, one rig (B = 1); None where rig and poses are undetermined."""
     state = solution.state
     points = points_at(problem, state)[0]
     size = 3 * len(points) + 1
@@ -193,7 +193,7 @@ def shape_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Sha
     reduced, own = factorize(equations).reduced, equations.object
     if own is None or bool(reduced.failed.any()):
         return None
-    # The object stands behind cameras or poses: the last part of the factor is that of what both leave of it.
+    # The object comes after cameras or poses: the last part of the factor belongs to its marginal information.
     lower = reduced.kept[0, -size:, -size:][:-1, :-1].cpu().double().numpy()
     information = lower @ lower.T - np.eye(size - 1)  # the prior of `unit`
     gradient = own.gradient[0, :-1].cpu().double().numpy()
@@ -215,9 +215,9 @@ def shape_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Sha
 
 
 def pull_scatter(problem: Problem, state: State, loss: RobustKernel) -> float:
-    """Variance of the snapshots' pulls about their mean, over that of noise; 1 at least, and for a few snapshots.
+    """Variance of the snapshots' scores about their mean, relative to noise; at least 1, and 1 for few snapshots.
 
-    Errors of lenses and centroids that belong to places rather than to fiducials pull differently in each snapshot.
+    Errors of lenses and centroids depend on places, not on fiducials, so their scores differ between snapshots.
 
     Args:
         problem: of one rig, with an object that is not exact.
@@ -232,7 +232,7 @@ def pull_scatter(problem: Problem, state: State, loss: RobustKernel) -> float:
     weight = robust_weight(problem, at, loss)[0, :, :, None, None, :]
     by_pose, by_fiducial = at.by_rig[0, ..., -POSE_PARAMETERS - 1 : -1, :, :], at.by_fiducial[0]  # (S, C, 6 or 3, 2, N)
     pull = (by_fiducial * weight * at.residual[0].unsqueeze(-3)).sum((1, 3)).mT.flatten(1)  # (S, 3 N)
-    # The poses have adapted to each snapshot: what they took is no longer in its pull.
+    # Each snapshot's fit has adapted its pose: subtract the part of the variance that the pose absorbed.
     own = (by_fiducial.square() * weight).sum((1, 3)).mT.flatten(1)
     across = torch.einsum("scirn,scjrn->sinj", by_pose, by_fiducial * weight).flatten(2)  # (S, 6, 3 N)
     among = torch.einsum("scirn,scjrn->sij", by_pose, by_pose * weight)
@@ -244,15 +244,15 @@ def pull_scatter(problem: Problem, state: State, loss: RobustKernel) -> float:
 
 
 def learnt_tolerances(shape: ShapeEvidence) -> Array:
-    """Learn from the data how far each fiducial may be off: automatic relevance determination.
+    """Estimate each fiducial's tolerance from the data by automatic relevance determination.
 
-    Where one or two are off, the others stay in their places, and so hold the object's frame and scale. Where many are,
-    nothing says which, and all get the same tolerance. The evidence of the data decides.
+    Where one or two are off, the others stay in place and fix the object's frame and scale. Where many are off, the
+    data cannot tell which, and all get the same tolerance. The evidence decides between the two.
 
     Returns:
-        (N,) mm, standard deviations; those that were granted where they are enough.
+        (N,) mm, standard deviations; the given tolerances where they are large enough.
 
-    Source: MacKay, "Bayesian interpolation" (Neural Computation 1992), one precision a fiducial.
+    Source: MacKay, "Bayesian interpolation" (Neural Computation 1992), one precision per fiducial.
     """
     size = float(np.sqrt(np.square(shape.places).sum(1).mean()))
     floor = np.maximum(shape.tolerance, NARROW * size)
@@ -263,13 +263,13 @@ def learnt_tolerances(shape: ShapeEvidence) -> Array:
     off = int((alone > shape.tolerance).sum())
     if shape.log_evidence(alone) - COMPLEXITY * off >= shape.log_evidence(common) - COMPLEXITY + LEAD:
         return alone
-    # What no image shows, the scale, is as uncertain as a tolerance is that few displacements have shown: its
-    # distribution is Student's, of which the variance is kept.
+    # No image shows the scale, so it is as uncertain as a tolerance that few displacements determine. Its distribution
+    # is Student's t; use its variance.
     return np.maximum(one * (freedom / max(freedom - 2, freedom / WIDEST)) ** 0.5, shape.tolerance)
 
 
 def _learn_each(shape: ShapeEvidence, size: float, floor: Array) -> Array:
-    """Iterate tolerances (N,) mm that are as large as the displacements they allow, not below `floor`."""
+    """Iterate tolerances (N,) mm to match the displacements that they allow, not below `floor`."""
     prior_std = np.maximum(WIDE * size, floor)
     for _ in range(ROUNDS):
         precision = np.repeat(prior_std**-2.0, 3)
@@ -284,11 +284,11 @@ def _learn_each(shape: ShapeEvidence, size: float, floor: Array) -> Array:
 
 
 def _learn_one(shape: ShapeEvidence, size: float) -> tuple[float, float]:
-    """Iterate one tolerance (mm) for all fiducials; and tell how many displacements have shown it."""
+    """Iterate one tolerance (mm) for all fiducials. Returns it and the effective number of displacements behind it."""
     _, variance, displacement = shape.directions
     prior_std, freedom = WIDE * size, 0.0
     for _ in range(ROUNDS):
-        kept = prior_std**2 / (variance + prior_std**2)  # of each displacement
+        kept = prior_std**2 / (variance + prior_std**2)  # shrinkage factor of each displacement
         previous, freedom = prior_std, max(float(kept.sum()), 1e-3)
         prior_std = float(np.sqrt(np.square(kept * displacement).sum() / freedom))
         prior_std = min(max(prior_std, NARROW * size), 10 * WIDE * size)
@@ -299,7 +299,7 @@ def _learn_one(shape: ShapeEvidence, size: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class FiducialOffset:
-    """How far a fiducial is from the place that the object's file gives it."""
+    """Offset of a fiducial from its place in the object's file."""
 
     fiducial: int  # row of the object file
     offset: Array  # (3,) mm in the object's frame
@@ -312,12 +312,12 @@ class FiducialOffset:
 
 
 def offsets(estimate: Estimate, points: Array) -> tuple[FiducialOffset, ...]:
-    """Compare the estimated fiducials with their places `points` (N, 3) mm, fiducial by fiducial.
+    """Compare the estimated fiducials with their places `points` (N, 3) mm, one by one.
 
-    A rigid motion of the object is no displacement: the object is first laid onto its places so that as many fiducials
-    as possible are where they belong; each of several objects by itself.
+    A rigid motion of the object is no displacement. The object is first aligned so that as many fiducials as possible
+    are in their places; each of several objects separately.
 
-    Source: S-transformation (Baarda 1973) with weights that follow the displacements, as in deformation analysis.
+    Source: S-transformation (Baarda 1973) with weights that depend on the displacements, as in deformation analysis.
     """
     found, covariance = (
         estimate.points_object.detach().double().numpy(),

@@ -1,8 +1,8 @@
-"""First guess of an object's pose from labelled fiducials, all cameras together, without iterating on images.
+"""Initial guess of an object's pose from labelled fiducials in all cameras, without iterating on images.
 
 The distance of a fiducial from the ray through its pixel is linear in the pose's nine rotation entries and the
-translation. With the translation eliminated, what is left is a quadratic form on rotations, nine by nine whatever the
-number of cameras and fiducials, minimized from the best of sixty starts at once.
+translation. With the translation eliminated, a quadratic form on rotations remains, nine by nine for any number of
+cameras and fiducials. It is minimized from the best of sixty starts at once.
 
 Source: object-space error of Lu, Hager and Mjolsness (PAMI 2000), generalized cameras as in Schweighofer and Pinz (BMVC
 2008), quadratic form in the rotation entries as in SQPnP (Terzakis and Lourakis, ECCV 2020).
@@ -28,12 +28,12 @@ from renderers.compiling import njit
 
 STARTS = 8
 AT_REST = 1e-9
-"""Radians: a step that shows that a rotation is where it belongs."""
+"""Radians: a smaller step means that the rotation has converged."""
 
 
 @dataclass(frozen=True)
 class _QuadraticForm:
-    """cost(r) = r^T matrix r + 2 vector^T r + constant for r = the rotation's entries, row by row."""
+    """cost(r) = r^T matrix r + 2 vector^T r + constant, where r holds the rotation's entries row by row."""
 
     matrix: Tensor  # (P, 9, 9)
     vector: Tensor  # (P, 9)
@@ -44,17 +44,17 @@ class _QuadraticForm:
 def initial_pose(
     observations: Observations, rig: CameraRig, obj: CalibrationObject, iterations: int = 10
 ) -> RigidTransform:
-    """Estimate where the object is, with the rig taken as it stands.
+    """Estimate the object's pose with a fixed rig.
 
     Args:
-        observations: (*B, S, C, N); what is seen of each snapshot must show all of the object's pose that there is.
+        observations: (*B, S, C, N); each snapshot must determine the object's pose.
         rig: (*B) or without batch axes.
         obj: N fiducials, planar or not.
         iterations: Gauss-Newton steps on the rotation.
 
     Returns:
         (*B, S) rig_from_object with the smallest object-space error among those in front of the cameras. Meant as a
-        start: it does not weigh pixels by distance.
+        start: pixels are not weighted by distance.
 
     Examples:
         >>> import imgcal
@@ -80,7 +80,7 @@ def initial_pose(
     starts = torch.as_tensor(Rotation.create_group("I").as_matrix(), dtype=rays.dtype, device=rays.device)
     promising = _cost(form, starts.expand(len(rays), -1, -1, -1)).topk(STARTS, largest=False).indices
     minimized = _minimize_cpu if plain else _minimize_on_rotations
-    # A single light has no rotation to look for.
+    # A single light has no rotation.
     rotation = minimized(form, starts[promising], iterations if bool(centred.any()) else 0)  # (P, M, 3, 3)
 
     entries, cost = rotation.flatten(-2), _cost(form, rotation)
@@ -123,7 +123,7 @@ def _quadratic_form(rays: Tensor, origins: Tensor, seen: Tensor, points: Tensor)
     slope = torch.einsum("pnij,na->pija", across, points).flatten(-2)  # (P, 3, 9)
     matrix = torch.einsum("pnij,na,nb->piajb", across, points, points).flatten(-2).flatten(1, 2)
     linear = torch.einsum("pni,na->pia", pulled, points).flatten(-2)
-    # A single ray leaves the translation along it free; a trace of regularization keeps the solve finite.
+    # A single ray leaves the translation along it undetermined; slight regularization keeps the solution finite.
     total = total + 1e-9 * total.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * eye
     solved = torch.linalg.solve(total, torch.cat((slope, pulled.sum(1)[..., None]), dim=-1))
     translation_slope, constant = solved[..., :9], solved[..., 9]
@@ -136,7 +136,7 @@ def _quadratic_form(rays: Tensor, origins: Tensor, seen: Tensor, points: Tensor)
 
 
 def _cost(form: _QuadraticForm, rotation: Tensor) -> Tensor:
-    """Object-space error, up to a constant, of rotations (P, M, 3, 3): (P, M) mm^2."""
+    """Object-space error of rotations (P, M, 3, 3), up to a constant: (P, M) mm^2."""
     entries = rotation.flatten(-2)
     return (entries * (entries @ form.matrix + 2 * form.vector[:, None])).sum(-1)
 
@@ -171,7 +171,7 @@ def _minimize_cpu(form: _QuadraticForm, rotation: Tensor, iterations: int) -> Te
 
 @njit(fastmath=kernels.FAST)
 def _minimize_each(matrix, vector, rotation, iterations):
-    """Overwrite rotations (P, M, 3, 3) by what minimizes their form: (P, 9, 9), (P, 9)."""
+    """Replace rotations (P, M, 3, 3) by minimizers of their quadratic forms (P, 9, 9), (P, 9)."""
     tangent, pulled, right = np.zeros((3, 9)), np.empty((4, 9)), np.empty(3)
     square, turned, left, old = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     step = np.empty(3)
@@ -222,7 +222,7 @@ def _minimize_each(matrix, vector, rotation, iterations):
 
 @njit(fastmath=kernels.FAST)
 def _solve_three(matrix, right, solution):
-    """Solve a symmetric three-by-three system by cofactors; returns the solution's length."""
+    """Solve a symmetric three-by-three system by cofactors and return the norm of the solution."""
     determinant, length = 0.0, 0.0
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
@@ -238,7 +238,7 @@ def _solve_three(matrix, right, solution):
 
 
 def _solve_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solve three-by-three systems by cofactors: (*B, 3, 3), (*B, 3) -> (*B, 3); a library call a matrix is slower."""
+    """Solve three-by-three systems by cofactors, faster than library calls: (*B, 3, 3), (*B, 3) -> (*B, 3)."""
     first, second, third = matrix.unbind(-2)
     cofactors = torch.stack(
         (torch.linalg.cross(second, third), torch.linalg.cross(third, first), torch.linalg.cross(first, second)), dim=-2
@@ -248,7 +248,7 @@ def _solve_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
 
 
 def _generators(like: Tensor) -> Tensor:
-    """The three infinitesimal rotations: (3, 3, 3)."""
+    """The three infinitesimal generators of rotations: (3, 3, 3)."""
     generators = like.new_zeros(3, 3, 3)
     for axis in range(3):
         j, k = (axis + 1) % 3, (axis + 2) % 3

@@ -1,4 +1,4 @@
-"""Which snapshots show enough of the object to say where it is."""
+"""Snapshots whose labels determine the object's pose."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from imgcal.errors import RefusedError
 from imgcal.geometry import pose_rank
 
 LEAST_BREADTH = 0.05
-"""Breadth of what is left of an object, in parts of the whole object's: below, it turns about a line unseen."""
+"""Breadth of the visible part, relative to the whole object's: below, a rotation about a line is undetermined."""
 
-ON_A_LINE = "the labels that are left lie on one line, about which the object could be turned"
-TOO_FEW = "fewer than {} have labels in two cameras"
+ON_A_LINE = "the remaining labels lie on one line, which leaves the rotation about it undetermined"
+TOO_FEW = "two cameras share labels of fewer than {}"
 
 
 class UndeterminedPosesError(RefusedError):
-    """Raise where labels leave the object's pose open in some snapshots, which can be done without."""
+    """Raise when labels do not determine the object's pose in some snapshots; the caller can drop those."""
 
     def __init__(self, rows: Sequence[int], reason: str = ON_A_LINE) -> None:
-        """Keep the numbers of the snapshots, counted among those of the fit."""
+        """Keep the indices of the snapshots among those of the fit."""
         super().__init__(f"estimation: in {len(rows)} snapshots {reason}")
         self.rows = tuple(rows)
 
 
 def require_poses(seen: NDArray[np.bool_], points: Tensor, part_of: NDArray[np.int64] | None = None) -> None:
-    """Make sure that what is `seen` (S, C, N) of an object's points (N, 3) shows its pose in every snapshot.
+    """Require that the labels `seen` (S, C, N) of an object's points (N, 3) determine its pose in every snapshot.
 
-    That is more than a line; of a stick two points, of a light the one, each in two cameras.
+    A solid object needs points off a line; a stick needs two points and a light its one, each in two cameras.
 
     Args:
-        seen: labels.
+        seen: whether each point has a label.
         points: of the object, or of several.
-        part_of: (N,) the object to which each point belongs, where there are several; a row shows one of them.
+        part_of: (N,) the object to which each point belongs, for several objects; each row shows one of them.
 
     Raises:
-        UndeterminedPosesError: it is not; says in which.
+        UndeterminedPosesError: some poses are undetermined; it has their rows.
     """
     posed = has_poses(seen, points, part_of)
     if not posed.all():
@@ -50,14 +50,14 @@ def require_poses(seen: NDArray[np.bool_], points: Tensor, part_of: NDArray[np.i
 
 
 def _least_fiducials(rank: int) -> int | None:
-    """Fiducials that two cameras must see of a light or a stick; None = other objects."""
+    """Number of fiducials of a light or a stick that two cameras must see; None = other objects."""
     return None if rank == 6 else 2 if rank == 5 else 1
 
 
 def has_poses(seen: NDArray[np.bool_], points: Tensor, part_of: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
-    """Tell in which snapshots what is `seen` (S, C, N) of an object's points (N, 3) determines its pose: (S,).
+    """Find the snapshots in which labels `seen` (S, C, N) of an object's points (N, 3) determine its pose: (S,).
 
-    With several objects (`part_of`, as in `require_poses`) one of them must be determined.
+    With several objects (`part_of`, as in `require_poses`), at least one of them must be determined.
     """
     if part_of is not None:
         columns = [np.flatnonzero(part_of == part) for part in range(int(part_of.max()) + 1)]
@@ -70,14 +70,14 @@ def has_poses(seen: NDArray[np.bool_], points: Tensor, part_of: NDArray[np.int64
     whole = _breadth(where)
     if whole > 0 and shown.all():
         return np.ones(len(seen), dtype=bool)
-    # What is seen repeats itself: thousands of snapshots show few different parts of an object.
+    # Patterns repeat: thousands of snapshots show only a few different parts of an object.
     parts, which = np.unique(shown, axis=0, return_inverse=True)
     broad = np.array([_breadth(where[part]) > LEAST_BREADTH * whole for part in parts], dtype=bool)
     return broad[which.reshape(-1)]
 
 
 def _breadth(points: NDArray[np.float64]) -> float:
-    """Second largest extent of some points (M, 3): zero on a line."""
+    """Second largest extent of points (M, 3): zero on a line."""
     if len(points) < 3:
         return 0.0
     return float(np.linalg.svd(points - points.mean(0), compute_uv=False)[1])

@@ -1,4 +1,4 @@
-"""Where cameras are to each other, from the poses in which each sees one object: pairs, then a tree of pairs."""
+"""Relative poses of cameras from the poses in which each sees one object: pairs, then a tree of pairs."""
 
 from __future__ import annotations
 
@@ -16,36 +16,36 @@ from imgcal.geometry import RigidTransform
 Floats = NDArray[np.float64]
 
 TRIPLES = 150
-"""Of snapshots, from whose places a relative pose is guessed."""
+"""Triples of snapshots whose object positions give candidates for a relative pose."""
 DIRECT = 150
-"""Snapshots whose poses in both cameras give a relative pose at once."""
+"""Snapshots whose poses in both cameras give a candidate directly."""
 GENEROUS = 3.0
-"""Times the robust spread of the distances, within which a snapshot agrees."""
+"""Multiple of the distances' robust spread within which a snapshot agrees."""
 LEAST_SPREAD = 1e-4
-"""Of the distances, in parts of the distance from the camera: below, depths are as good as exact."""
+"""Smallest spread of the distances, relative to the distance from the camera: below, depths are as good as exact."""
 LEAST_AGREEING = 0.4
-"""Share of the snapshots of a pair that must agree on where its cameras are."""
+"""Smallest share of a pair's snapshots that must agree on its relative pose."""
 ROUNDS = 4
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Where one camera is to another."""
+    """Relative pose of two cameras."""
 
     first: int
     second: int
     second_from_first: tuple[Floats, Floats]  # rotation (3, 3), translation (3,) mm
     agreeing: int  # snapshots
-    spread: float  # of their distances, in parts of the object's distance from the cameras
+    spread: float  # of their distances, relative to the object's distance from the cameras
 
 
 def relate(
     cam_from_object: RigidTransform, known: NDArray[np.bool_], points: Floats, generator: np.random.Generator
 ) -> list[Pair]:
-    """Find the relative pose of every pair of cameras that see the object together.
+    """Estimate the relative pose of every pair of cameras that see the object together.
 
-    Poses may be wrong in some snapshots, turned the wrong way round, or all too far away, as a wrong focal length makes
-    them: places of the object count, its turns only where there are no three places.
+    Poses may be wrong in some snapshots, flipped, or all too far away because of a wrong focal length. So the object's
+    positions count, and its rotations only where there are fewer than three positions.
 
     Args:
         cam_from_object: (S, C).
@@ -66,11 +66,11 @@ def relate(
 
 
 def tree(pairs: Sequence[Pair], cameras: int) -> tuple[list[list[int]], list[tuple[Floats, Floats]]]:
-    """Chain pairs into one frame, from the camera that is nearest to all others, by the ways of least uncertainty.
+    """Chain pairs into one frame, from the camera nearest to all others, along paths of least uncertainty.
 
     Returns:
-        Groups of cameras that are connected, the largest first; and for each camera of the first group where it is:
-        rotation and translation of cam_from_root, the identity for the others.
+        Groups of connected cameras, the largest first; and the pose of each camera of the first group: rotation and
+        translation of cam_from_root. The others get the identity.
     """
     cost, between = np.zeros((cameras, cameras)), {}
     for pair in pairs:
@@ -93,7 +93,7 @@ def tree(pairs: Sequence[Pair], cameras: int) -> tuple[list[list[int]], list[tup
 
 
 def rigid_motion(source: Floats, destination: Floats, weight: Floats | None = None) -> tuple[Floats, Floats]:
-    """Rotations (*B, 3, 3) and translations (*B, 3) that take points (*B, M, 3) nearest to others, least squares.
+    """Least-squares rotations (*B, 3, 3) and translations (*B, 3) that align points (*B, M, 3) with others.
 
     Source: Kabsch 1976.
 
@@ -118,7 +118,7 @@ def _pair(first: int, second: int, a: Floats, b: Floats, generator: np.random.Ge
     places, there = a.mean(1), b.mean(1)
     depth = (np.linalg.norm(places, axis=-1) + np.linalg.norm(there, axis=-1)) / 2
     off = np.linalg.norm(places @ np.swapaxes(rotation, -1, -2) + translation[:, None] - there, axis=-1) / depth
-    if len(a) < 3:  # places alone do not say how the cameras are turned to each other
+    if len(a) < 3:  # fewer than three positions do not determine the relative rotation
         moved = np.einsum("hij,knj->hkni", rotation, a) + translation[:, None, None]
         off = np.linalg.norm(moved - b, axis=-1).mean(-1) / depth
     best = int(np.median(off, axis=1).argmin())
@@ -137,7 +137,7 @@ def _pair(first: int, second: int, a: Floats, b: Floats, generator: np.random.Ge
 
 
 def _guesses(a: Floats, b: Floats, generator: np.random.Generator) -> tuple[Floats, Floats]:
-    """Relative poses that some snapshots suggest: rotations (H, 3, 3) and translations (H, 3)."""
+    """Candidate relative poses from some snapshots: rotations (H, 3, 3) and translations (H, 3)."""
     count = len(a)
     some = generator.permutation(count)[:DIRECT]
     direct = rigid_motion(a[some], b[some])
@@ -153,7 +153,7 @@ def _compose(outer: tuple[Floats, Floats], inner: tuple[Floats, Floats]) -> tupl
 
 
 def as_transforms(chained: Sequence[tuple[Floats, Floats]]) -> RigidTransform:
-    """Make (C,) transforms of pairs of arrays."""
+    """Convert pairs of arrays to transforms (C,)."""
     return RigidTransform(
         torch.from_numpy(np.stack([rotation for rotation, _ in chained])),
         torch.from_numpy(np.stack([translation for _, translation in chained])),

@@ -1,10 +1,10 @@
-"""Errors of a rig in which a motion of the whole rig is the same direction, wherever the rig is.
+"""Errors of a rig in which a motion of the whole rig is the same direction for every state of the rig.
 
 A camera's error is a motion of the camera in the rig's frame, rig_from_camera = exp(w, v) rig_from_camera0, and
 differences of its other values. A motion of the whole rig, which no image can show, is then the same (w, v) for all
-cameras at every linearization point. Information that is summed up over time, each part linearized where the estimate
-was at that time, therefore never says anything about it. In the parameters of `CameraRig.retract` it would: the
-direction turns as the estimate moves, and a filter grows sure of what cannot be seen.
+cameras at every linearization point. Information summed over time, with each part linearized at the estimate of its
+time, therefore never includes this direction. In the parameters of `CameraRig.retract` it would: the direction changes
+as the estimate moves, and a filter becomes confident about what cannot be observed.
 
 Source: Barrau and Bonnabel, "The Invariant Extended Kalman Filter as a Stable Observer", 2017; Zhang et al.,
 "Convergence and Consistency Analysis for a 3-D Invariant-EKF SLAM", 2017.
@@ -65,12 +65,12 @@ def error_between(rig: CameraRig, reference: CameraRig) -> Tensor:
 
 
 def step_by_error(rig: CameraRig, turned: Tensor | None = None) -> Tensor:
-    """Derivative of `CameraRig.retract`'s step by the error, camera by camera.
+    """Derivative of `CameraRig.retract`'s step by the error, for each camera.
 
     Args:
         rig: (*B), where the error is zero.
-        turned: (*B, C, 3) rad, rotation vector of the step that took another rig to this one; None = the step is from
-            this rig itself.
+        turned: (*B, C, 3) rad, rotation vector of the step that took another rig to this one; None = the step starts
+            from this rig.
 
     Returns:
         (*B, C, K, K).

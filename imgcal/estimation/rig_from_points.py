@@ -1,8 +1,8 @@
-"""A first rig from one point that was moved before cameras of which only rough focal lengths are known.
+"""Initial rig from one point moved in front of cameras with only roughly known focal lengths.
 
-Two cameras that see the point together are related by an essential matrix, up to scale; all others are placed by the
-points that these two see, one after the other; a robust joint fit frees focal lengths first and the rest of the lens
-then. Nothing gives the scale: two cameras are put at a distance of choice.
+An essential matrix relates two cameras that see the point together, up to scale. All others are placed one after the
+other, by resection on the triangulated points. A robust joint fit frees focal lengths first and then the rest of the
+lens. Nothing determines the scale, so two cameras are put at a chosen distance.
 
 Source: Hartley and Zisserman, "Multiple View Geometry", chapters 9 and 18; for the order Snavely, Seitz and Szeliski,
 "Photo Tourism", 2006.
@@ -28,25 +28,25 @@ from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 Array = NDArray[np.float64]
 
 FOCALS = (1.0, 0.85, 1.18, 0.72, 1.4)
-"""Factors on the rough focal lengths that are tried."""
+"""Factors on the rough focal lengths to try."""
 CONSISTENT = 4.0
-"""px: what a blob may be off its epipolar line or its place while cameras are placed."""
+"""px: largest distance of a blob from its epipolar line or its reprojection while cameras are placed."""
 LEAST_COMMON = 16
-"""Points that two cameras must see together, and that a camera must see of those that are placed."""
+"""Smallest number of points that two cameras share, or that a new camera shares with those already placed."""
 LEAST_ANGLE = 0.06
-"""rad: angle between the rays of two cameras, usually, from which on they can begin."""
+"""rad: smallest median angle between the rays of the initial pair of cameras."""
 MOST_USED = 600
-"""Moments in the joint fits: those that most cameras see, evenly over the capture."""
-WIDE_ROTATION = 0.5  # rad, of the prior about a rig that was chained together
+"""Most snapshots in the joint fits: those that most cameras see, evenly over the capture."""
+WIDE_ROTATION = 0.5  # rad, standard deviation of the prior about a rig that was chained together
 APART = 1000.0
 """mm: distance of two cameras of a rig without scale."""
 
 
 @dataclass(frozen=True)
 class PointStart:
-    """A rig made from points alone, up to scale."""
+    """A rig computed from points alone, up to scale."""
 
-    rig: CameraRig  # in the frame that `move_to_pair_frame` says
+    rig: CameraRig  # in the frame of `move_to_pair_frame`
     pair: tuple[int, int]  # cameras that are 1000 mm apart
     spread: float  # px, robust spread of the residuals
 
@@ -54,16 +54,16 @@ class PointStart:
 def cold_start_from_points(
     observations: Observations, cameras: CameraRig, pair: tuple[int, int] | None = None
 ) -> PointStart:
-    """Find where cameras are, up to scale, and their lenses, with no other start than rough focal lengths.
+    """Estimate the cameras' poses, up to scale, and their lenses, starting only from rough focal lengths.
 
     Args:
-        observations: (S, C, 1) of one point; some may be of something else.
-        cameras: image sizes, lenses as far as they are known, and a prior that says how far, float64; where they are is
-            not looked at.
+        observations: (S, C, 1) of one point; some may be false.
+        cameras: image sizes, lenses as far as they are known, and a prior that says how far, float64; poses are
+            ignored.
         pair: the cameras that are put 1000 mm apart; None = the first, and the one that is farthest from it.
 
     Raises:
-        RefusedError: two cameras or fewer, or cameras that have too few points in common with the others.
+        RefusedError: two cameras or fewer, or cameras that share too few points with the others.
 
     Examples:
         >>> import imgcal
@@ -80,8 +80,8 @@ def cold_start_from_points(
     """
     if cameras.num_cameras < 3:
         raise RefusedError(
-            f"start without a factory calibration: found {cameras.num_cameras} cameras, expected at least 3: what two "
-            "see of points decides too little"
+            f"start without a factory calibration: found {cameras.num_cameras} cameras, expected at least 3: "
+            "points in two cameras do not determine a rig"
         )
     uv, seen = observations.uv[:, :, 0].double().numpy(), observations.seen[:, :, 0].numpy()
     best: PointStart | None = None
@@ -91,7 +91,7 @@ def cold_start_from_points(
         if placed is None:
             continue
         rig = replace(cameras, focal_length=factor * cameras.focal_length, cam_from_rig=placed)
-        found = _joint(observations, move_to_pair_frame(rig, pair), cameras)
+        found = _fit_jointly(observations, move_to_pair_frame(rig, pair), cameras)
         if found is not None and (best is None or found.spread < best.spread):
             best = found
         if best is not None and best.spread < FINE:
@@ -100,14 +100,14 @@ def cold_start_from_points(
         common = [int((seen[:, [c]] & np.delete(seen, c, 1)).any(1).sum()) for c in range(cameras.num_cameras)]
         require_connected([c for c, count in enumerate(common) if count < LEAST_COMMON], cameras)
         raise RefusedError(
-            "start without a factory calibration: no cameras see enough points together from different sides: carry "
-            "the light through all of what neighbouring cameras see"
+            "start without a factory calibration: no two cameras see enough common points from different directions: "
+            "carry the light through all that neighbouring cameras see"
         )
     return best
 
 
 def move_to_pair_frame(rig: CameraRig, pair: tuple[int, int] | None) -> tuple[CameraRig, tuple[int, int]]:
-    """Move and scale a rig so that one camera is in the origin, and another one 1000 mm away along x.
+    """Move and scale a rig so that one camera is at the origin, and another one 1000 mm away along x.
 
     Returns:
         The rig and the pair: as given, or the first camera and the one that is farthest from it.
@@ -116,7 +116,7 @@ def move_to_pair_frame(rig: CameraRig, pair: tuple[int, int] | None) -> tuple[Ca
     first, second = pair or (0, int((positions - positions[0]).norm(dim=-1).argmax()))
     way = positions[second] - positions[first]
     along = way / way.norm()
-    down = rig.cam_from_rig.rotation[first, 1]  # as far as possible, y is the first camera's
+    down = rig.cam_from_rig.rotation[first, 1]  # the new y is as close as possible to the first camera's
     across = torch.linalg.cross(along, down)
     across = across / across.norm()
     turn = torch.stack((along, torch.linalg.cross(across, along), across))  # new_from_rig
@@ -127,18 +127,18 @@ def move_to_pair_frame(rig: CameraRig, pair: tuple[int, int] | None) -> tuple[Ca
 
 
 def prior_of_pair(rig: CameraRig, pair: tuple[int, int], prior: RigPrior, rotation: float, position: float) -> Tensor:
-    """Spread (C, K) about a rig in the frame of its pair: the first camera's place and the distance are fixed.
+    """Prior standard deviations (C, K) in the frame of a pair: the first camera's pose and the distance are fixed.
 
     Args:
         rig: in the frame of the pair.
-        pair: which.
+        pair: the two cameras.
         prior: of the lenses.
         rotation: rad, of all other cameras.
-        position: mm, the same.
+        position: mm, of all other cameras.
     """
     std = ordinary_lens(replace(prior, rotation=rotation, position=position).std(rig))
     std[pair[0], :6] = 0.0
-    std[pair[1], 3] = 0.0  # to first order, that is the distance
+    std[pair[1], 3] = 0.0  # to first order, this fixes the distance
     return std
 
 
@@ -150,7 +150,7 @@ def _rays(uv: Array, seen: NDArray[np.bool_], cameras: CameraRig, factor: float)
 
 
 def _chain_cameras(rays: Array, seen: NDArray[np.bool_], focal: Array) -> RigidTransform | None:
-    """Place all cameras, one after the other; None = not all can be."""
+    """Place all cameras, one after the other; None = some cannot be placed."""
     cameras = len(focal)
     slack = CONSISTENT / float(focal.mean())
     start = _first_pair(rays, seen, slack)
@@ -178,7 +178,7 @@ def _chain_cameras(rays: Array, seen: NDArray[np.bool_], focal: Array) -> RigidT
 
 
 def _first_pair(rays: Array, seen: NDArray[np.bool_], slack: float) -> tuple[tuple[int, int], Array, Array] | None:
-    """Two cameras to begin with: many points in common, seen from different sides."""
+    """Choose an initial pair of cameras with many common points and a wide baseline."""
     best: tuple[tuple[int, int], Array, Array] | None = None
     worth, cameras = 0.0, seen.shape[1]
     for a in range(cameras):
@@ -208,7 +208,7 @@ def _first_pair(rays: Array, seen: NDArray[np.bool_], slack: float) -> tuple[tup
 def _triangulate(
     rays: Array, seen: NDArray[np.bool_], placed: dict[int, tuple[Array, Array]], slack: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Points (S, 3) where the rays of the placed cameras pass nearest, and which of them are known (S,)."""
+    """Triangulate points (S, 3) from the rays of the placed cameras; (S,) bool which are valid."""
     information, target = np.zeros((len(rays), 3, 3)), np.zeros((len(rays), 3))
     for camera, (rotation, translation) in placed.items():
         d = np.column_stack((rays[:, camera], np.ones(len(rays)))) @ rotation
@@ -227,22 +227,22 @@ def _triangulate(
     return points, known
 
 
-def _joint(
+def _fit_jointly(
     observations: Observations, start: tuple[CameraRig, tuple[int, int]], cameras: CameraRig
 ) -> PointStart | None:
-    """Fit all cameras and points together: focal lengths first, then all; None = no fit comes to rest."""
+    """Fit all cameras and points together, focal lengths first and then everything."""
     rig, pair = start
     rows = _select_moments(observations.seen[:, :, 0])
     some = Observations(observations.uv[rows], observations.sigma[rows], observations.seen[rows])
     light, fit = CalibrationObject(torch.zeros(1, 3).double(), torch.ones(1, 3).double(), name="light"), None
     position = 0.5 * float(torch.cdist(rig.positions, rig.positions).max())
     prior = cameras.prior or RigPrior()
-    given = replace(rig, focal_length=cameras.focal_length)  # about which the prior is
+    given = replace(rig, focal_length=cameras.focal_length)  # the centre of the prior
     std = prior_of_pair(given, pair, prior, WIDE_ROTATION, position)
-    held = std.clone()
-    held[:, 8:] = 0.0
+    lens_fixed = std.clone()
+    lens_fixed[:, 8:] = 0.0
     poses = None
-    for noise, spread in ((ROUGH, held), (ROUGH, std), (FINE, std)):
+    for noise, spread in ((ROUGH, lens_fixed), (ROUGH, std), (FINE, std)):
         part = replace(some, sigma=torch.full_like(some.sigma, noise))
         options = EstimationOptions(loss="cauchy", max_iterations=60)
         fit = estimate(part, given, light, poses, prior_std=spread, initial_rig=rig, options=options)
@@ -253,13 +253,13 @@ def _joint(
 
 
 def _spread(fit: Estimate) -> float:
-    """Robust spread of each component of the residuals, px."""
+    """Robust standard deviation of the residuals, per axis, px."""
     seen = fit.problem.root_weight[0] > 0
     return float(fit.residual.norm(dim=-1)[seen].median()) / 1.1774
 
 
 def _select_moments(seen: Tensor) -> Tensor:
-    """Moments (U,) that two cameras see at least; where there are many, those that most see, evenly over time."""
+    """Snapshots (U,) that at least two cameras see; if there are many, those that most see, evenly over time."""
     count = seen.sum(1)
     rows = (count >= 2).nonzero().flatten()
     if len(rows) <= MOST_USED:

@@ -1,8 +1,8 @@
-"""A first rig from nothing but labelled images of one object that was carried around: no factory calibration.
+"""Initial rig from nothing but labelled images of one object that was carried around: no factory calibration.
 
-Each camera sees the object in some pose; pairs of cameras that see it together are thereby related, a tree of pairs
-brings all into one frame, and a robust joint fit frees focal lengths first and the rest of the lens then. The object
-gives the scale.
+Each camera sees the object in some pose, which relates every pair of cameras that see it together. A tree of pairs
+brings all cameras into one frame. A robust joint fit frees focal lengths first and then the rest of the lens. The
+object gives the scale.
 """
 
 from __future__ import annotations
@@ -24,44 +24,43 @@ from imgcal.messages import list_names
 from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 
 LEAST_FIDUCIALS = 4
-"""In one image, for a pose from it alone."""
+"""Smallest number in one image for a pose from that image alone."""
 ROUGH = 3.0
 """Pixels: standard deviation of an observation while the lens is wrong."""
 FINE = 0.5
-"""Pixels: the same at the end."""
+"""Pixels: standard deviation of an observation in the final fit."""
 OUTLYING = 6.0
-"""Times the robust spread of the residuals: labels beyond are left out."""
+"""Multiple of the residuals' robust spread beyond which labels are excluded."""
 CAPPED = 30.0
-"""Pixels beyond which a fiducial is wrong anyway, where poses are compared."""
+"""Pixels at which reprojection errors are clipped when poses are compared."""
 K3 = 14
-"""Which parameter of a camera is the third radial coefficient."""
+"""Index of the third radial coefficient among a camera's parameters."""
 ORDINARY_K3 = 0.02
-"""One standard deviation of it about what is given, zero mostly."""
+"""Standard deviation of k3 about its given value, usually zero."""
 
 
 @dataclass(frozen=True)
 class ColdStart:
-    """A rig made from the data alone."""
+    """A rig computed from the data alone."""
 
     rig: CameraRig  # in the frame of its first camera
-    rig_from_object: RigidTransform  # (S,), of every snapshot that was given
-    posed: NDArray[np.bool_]  # (S,) where that is known
+    rig_from_object: RigidTransform  # (S,), of every given snapshot
+    posed: NDArray[np.bool_]  # (S,) whether the pose is known
     kept: NDArray[np.bool_]  # (S, C, N) labels that fit
     spread: float  # px, robust spread of the residuals
 
 
 def cold_start(observations: Observations, cameras: CameraRig, obj: CalibrationObject, seed: int = 0) -> ColdStart:
-    """Find where cameras are, and their lenses, with no other start than rough focal lengths.
+    """Estimate the cameras' poses and lenses, starting only from rough focal lengths.
 
     Args:
-        observations: (S, C, N); labels may be wrong here and there.
-        cameras: image sizes, lenses as far as they are known, and a prior that says how far; where they are, is not
-            looked at.
+        observations: (S, C, N); some labels may be wrong.
+        cameras: image sizes, lenses as far as they are known, and a prior that says how far; poses are ignored.
         obj: the calibration object.
-        seed: of the random choices.
+        seed: seed of the random choices.
 
     Raises:
-        RefusedError: cameras that share no snapshots with the others, or a fit that does not come to rest.
+        RefusedError: cameras share no snapshots with the others, or the fit does not converge.
 
     Examples:
         >>> import imgcal
@@ -84,8 +83,8 @@ def cold_start(observations: Observations, cameras: CameraRig, obj: CalibrationO
     rig = replace(cameras, cam_from_rig=as_transforms(chained))
     rows = np.flatnonzero(known.any(1))
     some = Observations(observations.uv[rows], observations.sigma[rows], observations.seen[rows])
-    some, turned = _alike(some, rig, cam_from_object[rows], known[rows], obj)
-    fit, kept = _joint(some, rig, turned, known[rows], obj)
+    some, turned = _unify_labels(some, rig, cam_from_object[rows], known[rows], obj)
+    fit, kept = _fit_jointly(some, rig, turned, known[rows], obj)
     count = len(observations.seen)
     posed, all_kept = np.zeros(count, dtype=bool), np.zeros(observations.seen.shape, dtype=bool)
     posed[rows], all_kept[rows] = True, kept
@@ -99,9 +98,9 @@ def cold_start(observations: Observations, cameras: CameraRig, obj: CalibrationO
 def single_camera_poses(
     observations: Observations, cameras: CameraRig, obj: CalibrationObject
 ) -> tuple[RigidTransform, NDArray[np.bool_]]:
-    """Find the object's pose in each image by itself: cam_from_object (S, C), and (S, C) where it is known."""
+    """Estimate the object's pose in each image separately: cam_from_object (S, C), and (S, C) bool where known."""
     snapshots, count = observations.seen.shape[:2]
-    known = _posable(observations.seen.numpy(), obj)
+    known = _find_posable(observations.seen.numpy(), obj)
     poses = _identities(snapshots, count)
     for camera in range(count):
         rows = torch.from_numpy(np.flatnonzero(known[:, camera]))
@@ -115,16 +114,16 @@ def single_camera_poses(
     return poses, known
 
 
-def _alike(
+def _unify_labels(
     observations: Observations,
     rig: CameraRig,
     cam_from_object: RigidTransform,
     known: NDArray[np.bool_],
     obj: CalibrationObject,
 ) -> tuple[Observations, RigidTransform]:
-    """Make all cameras use the same one of the labellings between which a symmetric object leaves the choice.
+    """Make all cameras use the same one of a symmetric object's equivalent labellings.
 
-    Each image is turned to what the first camera that knows the pose says.
+    Each image is turned to agree with the first camera that knows the pose.
     """
     motions = obj.symmetries
     if len(motions) == 1:
@@ -137,7 +136,7 @@ def _alike(
     in_rig = rig.cam_from_rig.rotation.mT[None, :, None] @ several.rotation
     first = torch.from_numpy(known.argmax(1))
     leader = in_rig[torch.arange(len(first)), first, 0]  # (S, 3, 3)
-    choice = (in_rig * leader[:, None, None]).sum((-1, -2)).argmax(-1)  # (S, C): the nearest turn
+    choice = (in_rig * leader[:, None, None]).sum((-1, -2)).argmax(-1)  # (S, C): the nearest symmetry
     order = torch.from_numpy(np.stack([m.permutation for m in motions]))[choice]  # (S, C, N)
     uv = observations.uv.gather(2, order[..., None].expand_as(observations.uv))
     s, c = torch.meshgrid(torch.arange(choice.shape[0]), torch.arange(choice.shape[1]), indexing="ij")
@@ -147,17 +146,17 @@ def _alike(
 
 
 def require_connected(alone: Sequence[int], cameras: CameraRig) -> None:
-    """Raise `RefusedError` where cameras have nothing in common with the others."""
+    """Raise `RefusedError` if some cameras have nothing in common with the others."""
     if alone:
         raise RefusedError(
             f"start without a factory calibration: camera {list_names(cameras.camera_names[c] for c in alone)} "
-            "cannot be "
-            "placed beside the others: carry the whole object through what it sees together with other cameras"
+            "cannot be placed relative to the others: carry the whole object through the view that it shares with "
+            "other cameras"
         )
 
 
-def _posable(seen: NDArray[np.bool_], obj: CalibrationObject) -> NDArray[np.bool_]:
-    """Images (S, C) that show enough of the object for a pose: four fiducials that are not on one line."""
+def _find_posable(seen: NDArray[np.bool_], obj: CalibrationObject) -> NDArray[np.bool_]:
+    """Find images (S, C) with enough labels for a pose: four fiducials that are not collinear."""
     points = obj.points.double().numpy()
     parts, which = np.unique(seen.reshape(-1, seen.shape[-1]), axis=0, return_inverse=True)
     good = [part.sum() >= LEAST_FIDUCIALS and _breadth(points[part]) > 0.05 * _breadth(points) for part in parts]
@@ -168,29 +167,29 @@ def _breadth(points: NDArray[np.float64]) -> float:
     return float(np.linalg.svd(points - points.mean(0), compute_uv=False)[1])
 
 
-def _joint(
+def _fit_jointly(
     observations: Observations,
     rig: CameraRig,
     cam_from_object: RigidTransform,
     known: NDArray[np.bool_],
     obj: CalibrationObject,
 ) -> tuple[Estimate, NDArray[np.bool_]]:
-    """Fit all cameras and poses together: focal lengths first, then all; labels (S, C, N) that do not fit are left out.
+    """Fit all cameras and poses together, focal lengths first; also return the labels (S, C, N) of the fit.
 
-    The cameras' places are as good as free, but for one; that one is where it is.
+    The cameras' poses are practically free. Only the camera nearest to the origin stays fixed.
     """
     std = (rig.prior or RigPrior()).std(rig)
     apart = float(torch.cdist(rig.positions, rig.positions).max()) + float(
         cam_from_object.translation.norm(dim=-1).max()
     )
     std[:, 0:3], std[:, 3:6] = 1.0, apart
-    held = int(rig.cam_from_rig.translation.norm(dim=-1).argmin())
-    std[held, :6] = 0.0
+    fixed_camera = int(rig.cam_from_rig.translation.norm(dim=-1).argmin())
+    std[fixed_camera, :6] = 0.0
     std = ordinary_lens(std)
-    lens_held = std.clone()
-    lens_held[:, 8:] = 0.0
+    lens_fixed = std.clone()
+    lens_fixed[:, 8:] = 0.0
     seen, start, fit = observations.seen, rig, None
-    for noise, spread in ((ROUGH, lens_held), (ROUGH, std), (FINE, std)):
+    for noise, spread in ((ROUGH, lens_fixed), (ROUGH, std), (FINE, std)):
         poses = best_poses(observations, seen, start, cam_from_object, known, obj, fit)
         part = Observations(observations.uv, torch.full_like(observations.sigma, noise), seen)
         options = EstimationOptions(loss="cauchy", max_iterations=60)
@@ -209,7 +208,7 @@ def best_poses(
     obj: CalibrationObject,
     latest: Estimate | None,
 ) -> RigidTransform:
-    """Choose for each snapshot, among what single cameras, all together and the latest fit say, what fits all best."""
+    """Choose the best pose of each snapshot among single cameras' poses, a joint one, and the latest fit."""
     rig_from_cam = rig.cam_from_rig.inverse()
     guesses = RigidTransform(rig_from_cam.rotation[None], rig_from_cam.translation[None]) @ cam_from_object  # (S, C)
     together = initial_pose(observations, rig, obj)
@@ -227,12 +226,12 @@ def best_poses(
 
 
 def _identities(*batch: int) -> RigidTransform:
-    """Transforms to be filled in."""
+    """Identity transforms, to be overwritten."""
     return RigidTransform(torch.eye(3, dtype=torch.float64).repeat(*batch, 1, 1), torch.zeros(*batch, 3).double())
 
 
 def ordinary_lens(std: Tensor) -> Tensor:
-    """Narrow the spread of k3: views of a carried object say little of it, and it ruins the image's corners.
+    """Narrow the prior of k3: views of a carried object hardly constrain it, and it ruins the image's corners.
 
     Args:
         std: (C, K) of the parameters.
@@ -243,5 +242,5 @@ def ordinary_lens(std: Tensor) -> Tensor:
 
 
 def _spread(lengths: Tensor) -> float:
-    """Robust spread of each component of residuals of these lengths."""
+    """Robust standard deviation per axis from residuals' lengths."""
     return float(lengths.median()) / 1.1774

@@ -1,8 +1,8 @@
-"""What the covariance of a rig means at a point: error of its pixel (px), and of its triangulation (mm), gauge-free.
+"""Errors that a rig's covariance predicts at a point: of its pixel (px) and of its triangulation (mm), without gauge.
 
-A motion of the whole rig changes nothing that anyone can see, and does not count: errors are those that are left after
-the rigid motion that makes them smallest over a set of points, the working volume. To first order that is a projection
-of the parameters' covariance, see `aligned_covariance`; docs/method.md has the equations.
+A motion of the whole rig changes no image and does not count. The errors are those that remain after the rigid motion
+that minimizes them over a set of points, the working volume. To first order this is a projection of the parameters'
+covariance, see `aligned_covariance`; docs/method.md has the equations.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from imgcal.geometry import cross_matrix, distort_by_coefficients, distort_with_
 from imgcal.types import CameraRig
 
 ROUNDS = 3
-"""Of weighing the points of the alignment by the error that the alignment before leaves at them."""
+"""Alignments in all; after the first, points are weighted by the errors that the previous one leaves."""
 
 
 @dataclass(frozen=True)
 class RigUncertainty:
-    """A rig, and what is not known of it once it is laid upon the true one as well as a rigid motion can.
+    """A rig and its uncertainty after the best rigid alignment with the true rig.
 
-    Both alignments are over the same points, one in pixels (what cameras show), one in mm (what is triangulated).
-    Weights let what is known worse than the median count less, so that one bad camera or a far corner does not push
-    the rest aside: the median's variance over its own.
+    Both alignments use the same points, one in pixels (what cameras show), one in mm (triangulation). The weight of an
+    error above the median is the ratio of the median's variance to its own, so that one bad camera or a far corner
+    does not distort the rest.
     """
 
     rig: CameraRig  # C cameras, no batch axes
     covariance: Tensor  # (K C, K C) before any alignment
-    points: Tensor  # (P, 3) mm, over which is aligned
+    points: Tensor  # (P, 3) mm, points of the alignment
     px_weight: Tensor  # (C, P) of each pixel in the alignment, 0 where the camera does not see the point
     mm_weight: Tensor  # (P,) of each triangulated point, 0 where fewer than two cameras see it
     px_covariance: Tensor  # (K C, K C) after the alignment in pixels; nan where too little is seen for one
     mm_covariance: Tensor  # (K C, K C) after the alignment in mm; nan where cameras share too little for one
 
     def drop_cameras(self, cameras: Collection[int]) -> RigUncertainty:
-        """Leave cameras out, and align the others anew."""
+        """Remove cameras and align the others again."""
         kept = [i for i in range(self.rig.num_cameras) if i not in cameras]
         width = self.rig.num_parameters
         rows = torch.tensor([width * i + j for i in kept for j in range(width)], device=self.points.device)
@@ -49,8 +49,8 @@ class RigUncertainty:
         """Predicted error of each camera's pixel of points: (C, P) px, expected (RMS) length of the difference.
 
         Args:
-            points: (P, 3) mm in the rig frame, or (C, P, 3), own points for each camera. What a camera does not see has
-                an error, too, which means nothing.
+            points: (P, 3) mm in the rig frame, or (C, P, 3), separate points for each camera. Errors are also computed
+                for points that a camera does not see; those are meaningless.
         """
         return _pixel_error(pixel_jacobian(self.rig, points), self.px_covariance)
 
@@ -59,18 +59,18 @@ class RigUncertainty:
 
         Args:
             points: (P, 3) mm in the rig frame.
-            seen: (C, P) bool, the cameras that take part; each counts alike.
+            seen: (C, P) bool, the cameras that take part, with equal weight.
             noise: px, standard deviation of each axis of one measured pixel; 0 = error of the calibration alone.
 
         Returns:
-            nan where fewer than two cameras take part.
+            The error; nan where fewer than two cameras take part.
         """
         triangulation, by_noise = _triangulation(pixel_jacobian(self.rig, points), seen)
         variance = _point_variance(triangulation, self.mm_covariance)
         return _length(variance + noise**2 * by_noise if noise else variance, seen)
 
     def errors(self, points: Tensor, seen: Tensor, noise: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Predict what `pixel_error` and `point_error`, without noise and with, say of the same points, in one pass.
+        """Compute `pixel_error` and `point_error`, the latter without and with noise, for the same points in one pass.
 
         Args:
             points: (P, 3) mm in the rig frame.
@@ -88,7 +88,7 @@ class RigUncertainty:
 
 
 def _pixel_error(pixels: Tensor, covariance: Tensor) -> Tensor:
-    """Expected length (C, P) px of the errors of pixels whose Jacobian is (C, P, 2, K)."""
+    """Expected length (C, P) px of the errors of pixels with Jacobian (C, P, 2, K)."""
     rows, cameras = pixels.flatten(1, 2), len(pixels)
     blocks = covariance.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
     own = blocks.diagonal(dim1=0, dim2=2).permute(2, 0, 1)  # (C, K, K)
@@ -97,7 +97,7 @@ def _pixel_error(pixels: Tensor, covariance: Tensor) -> Tensor:
 
 
 def _point_variance(triangulation: Tensor, covariance: Tensor) -> Tensor:
-    """Expected squared error (P,) mm^2 of points whose Jacobian is (P, 3, K C)."""
+    """Expected squared error (P,) mm^2 of points with Jacobian (P, 3, K C)."""
     rows = triangulation.flatten(0, 1)
     return (rows @ covariance).mul_(rows).sum(-1).unflatten(0, (-1, 3)).sum(-1)
 
@@ -113,7 +113,7 @@ def uncertainty_over(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigU
     Args:
         rig: C cameras, no batch axes.
         covariance: (K C, K C) of all cameras' parameters, as `estimation.camera_covariance`.
-        points: (P, 3) mm over which estimated and true rig are laid upon one another.
+        points: (P, 3) mm on which the estimated and the true rig are aligned.
     """
     seen = rig.project(points).visible
     motion = rigid_motion(rig, points.mean(0))
@@ -126,29 +126,29 @@ def uncertainty_over(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigU
     px_moved, mm_moved = px_rows @ by_motion, mm_rows @ motion
     mm_spread = mm_rows @ covariance
 
-    def aligned() -> tuple[Tensor, Tensor]:
-        """Covariance after the alignment in pixels, and what measures the motion of the one in mm."""
+    def align() -> tuple[Tensor, Tensor]:
+        """Covariance after the alignment in pixels, and the map from errors to the motion of the one in mm."""
         weighted = px_weight.repeat_interleave(2, dim=1)[..., None] * px_moved
         px_best = _best_if_possible(motion, (px_rows.mT @ weighted).flatten(0, 1))
         mm_best = _best_if_possible(motion, mm_rows.mT @ (mm_weight.repeat_interleave(3)[:, None] * mm_moved))
         return _remove_motion(covariance, motion, px_best), mm_best
 
-    px_covariance, mm_best = aligned()
+    px_covariance, mm_best = align()
     for _ in range(ROUNDS - 1):
-        # Of the points no more is asked than how far the alignment before leaves them off.
+        # The weights only need the error that remains after the previous alignment.
         px_weight = _weight(_pixel_error(pixels, px_covariance), seen)
         variance = _aligned_variance(mm_rows, mm_spread, mm_moved, mm_best, covariance)
         mm_weight = _weight(_length(variance.unflatten(0, (-1, 3)).sum(-1), seen), shared)
-        px_covariance, mm_best = aligned()
+        px_covariance, mm_best = align()
     mm_covariance = _remove_motion(covariance, motion, mm_best)
     return RigUncertainty(rig, covariance, points, px_weight, mm_weight, px_covariance, mm_covariance)
 
 
 def _aligned_variance(rows: Tensor, spread: Tensor, moved: Tensor, best: Tensor, covariance: Tensor) -> Tensor:
-    """Variance (R,) of what rows (R, K C) say of the parameters, once a motion is taken out that `best` measures.
+    """Variance (R,) of linear functions (R, K C) of the parameters after removing the motion that `best` extracts.
 
     Args:
-        rows: derivatives by the parameters.
+        rows: derivatives with respect to the parameters.
         spread: (R, K C) rows times the covariance.
         moved: (R, 6) rows times the motion.
         best: (6, K C), see `_best_motion`.
@@ -159,7 +159,7 @@ def _aligned_variance(rows: Tensor, spread: Tensor, moved: Tensor, best: Tensor,
 
 
 def _weight(error: Tensor, valid: Tensor) -> Tensor:
-    """Median variance over own variance, one at most; zero where not valid."""
+    """Median variance over own variance, at most one; zero where not valid."""
     valid = valid & error.isfinite()
     if not bool(valid.any()):
         return torch.zeros_like(error)
@@ -173,8 +173,8 @@ def aligned_covariance(covariance: Tensor, motion: Tensor, metric: Tensor) -> Te
 
     Args:
         covariance: (K, K) of all parameters.
-        motion: (K, 6) change of the parameters with a rigid motion of all cameras.
-        metric: (K, K) matrix of the squared error that the motion shall make smallest.
+        motion: (K, 6) derivative of the parameters with respect to a rigid motion of all cameras.
+        metric: (K, K) matrix of the squared error that the motion minimizes.
 
     Returns:
         (K, K), P covariance P^T with P = I - G (G^T H G)^-1 G^T H.
@@ -186,13 +186,13 @@ def aligned_covariance(covariance: Tensor, motion: Tensor, metric: Tensor) -> Te
 
 
 def _remove_motion(covariance: Tensor, motion: Tensor, best: Tensor) -> Tensor:
-    """Covariance (K, K) of what is left of the parameters once the motion that `best` (6, K) measures is taken out."""
+    """Covariance (K, K) of the parameters after removing the motion that `best` (6, K) extracts."""
     left = covariance - motion @ (best @ covariance)
     return left - (left @ best.mT) @ motion.mT
 
 
 def _best_motion(motion: Tensor, weighted: Tensor) -> Tensor:
-    """How the motion that fits parameters best follows from them: (6, K), (G^T H G)^-1 G^T H.
+    """Linear map from parameters to their best-fitting motion: (6, K), (G^T H G)^-1 G^T H.
 
     Args:
         motion: (K, 6), G.
@@ -205,7 +205,7 @@ def _best_motion(motion: Tensor, weighted: Tensor) -> Tensor:
     scale = normal.diagonal().clamp_min(torch.finfo(normal.dtype).tiny).rsqrt()
     factor, failed = torch.linalg.cholesky_ex(scale[:, None] * normal * scale)
     if bool(failed):
-        raise RefusedError("predicted error: too little of the working volume is seen by the cameras to compare rigs")
+        raise RefusedError("predicted error: the cameras see too little of the working volume")
     return scale[:, None] * torch.cholesky_solve(scale[:, None] * weighted.mT, factor)
 
 
@@ -217,10 +217,10 @@ def _best_if_possible(motion: Tensor, weighted: Tensor) -> Tensor:
 
 
 def rigid_motion(rig: CameraRig, centre: Tensor) -> Tensor:
-    """Change of all parameters with a motion of the whole rig: (K C, 6), turn about `centre` (rad), then shift (mm).
+    """Derivative of all parameters by a motion of the whole rig: (K C, 6), rotation about `centre` (rad), shift (mm).
 
-    A camera's position moves by w x (position - centre) + t, its left rotation is -R w. A point that moves along
-    keeps its pixels.
+    A camera's position changes by w x (position - centre) + t, its left rotation by -R w. A point that moves with the
+    rig keeps its pixels.
     """
     turn = rig.cam_from_rig.rotation
     motion = turn.new_zeros(rig.num_cameras, rig.num_parameters, 6)
@@ -231,7 +231,7 @@ def rigid_motion(rig: CameraRig, centre: Tensor) -> Tensor:
 
 
 def pixel_jacobian(rig: CameraRig, points: Tensor) -> Tensor:
-    """Derivative of the pixels of points by the parameters of their camera: (C, P, 2, K).
+    """Derivative of the pixels of points with respect to the parameters of their camera: (C, P, 2, K).
 
     Args:
         rig: C cameras, no batch axes.
@@ -258,31 +258,31 @@ def pixel_jacobian(rig: CameraRig, points: Tensor) -> Tensor:
 
 
 def _triangulation(pixels: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-    """How triangulated points follow the rig, and how well pixels determine them.
+    """Derivative of triangulated points by the rig's parameters, and their variance from pixel noise.
 
-    With exact pixels, the point that fits them best moves by -(sum K^T K)^-1 sum K^T J dp, where J is the derivative of
-    the pixels by the parameters, and K by the point.
+    With exact pixels, the best-fitting point moves by -(sum K^T K)^-1 sum K^T J dp, where J is the derivative of the
+    pixels by the parameters, and K by the point.
 
     Args:
         pixels: (C, P, 2, K) the J of every camera.
         seen: (C, P) bool, the cameras that take part.
 
     Returns:
-        (P, 3, K C) mm by parameter, without the sign; (P,) variance of the point, mm^2, for pixels of unit variance.
+        (P, 3, K C) mm per parameter, with opposite sign; (P,) variance of the point, mm^2, for unit pixel variance.
     """
     by_point = pixels[..., 3:6] * -seen.to(pixels)[..., None, None]  # (C, P, 2, 3)
     stacked = by_point.transpose(0, 1).flatten(1, 2)  # (P, 2 C, 3)
     inverse = inverse_or_zero(stacked.mT @ stacked)
     first, second = (inverse @ by_point.mT).unsqueeze(-2).unbind(-1)  # (C, P, 3, 1): mm by pixel
     along, across = pixels.unsqueeze(-3).unbind(-2)  # (C, P, 1, K)
-    response = pixels.new_empty(len(stacked), 3, len(pixels), pixels.shape[-1])  # as its rows are multiplied later
+    response = pixels.new_empty(len(stacked), 3, len(pixels), pixels.shape[-1])  # laid out for later products
     torch.mul(first, along, out=response.permute(2, 0, 1, 3)).addcmul_(second, across)
     variance = inverse.diagonal(dim1=-2, dim2=-1).sum(-1)
     return response.flatten(-2), variance
 
 
 def inverse_or_zero(information: Tensor) -> Tensor:
-    """Inverse of (P, 3, 3); zero where there is none."""
+    """Inverse of (P, 3, 3); zero where singular."""
     factor, failed = torch.linalg.cholesky_ex(information)
     eye = torch.eye(3, dtype=information.dtype, device=information.device)
     good = (failed == 0)[:, None, None]
@@ -290,5 +290,5 @@ def inverse_or_zero(information: Tensor) -> Tensor:
 
 
 def detach_double(rig: CameraRig) -> CameraRig:
-    """The same values, double precision, without a graph."""
+    """Copy a rig in double precision, detached from the graph."""
     return replace(rig.map_tensors(lambda tensor, _: tensor.detach()), image_size=rig.image_size).to(torch.float64)

@@ -25,7 +25,7 @@ def huber(d2: Tensor, threshold: float = 3.0) -> tuple[Tensor, Tensor]:
 
 
 def cauchy(d2: Tensor, threshold: float = 3.0) -> tuple[Tensor, Tensor]:
-    """Logarithmic beyond about `threshold` standard deviations: gross outliers lose their pull."""
+    """Logarithmic beyond about `threshold` standard deviations: gross outliers lose their influence."""
     ratio = d2 / threshold**2
     return threshold**2 * torch.log1p(ratio), 1 / (1 + ratio)
 
@@ -41,12 +41,12 @@ LOSSES: dict[str, RobustKernel] = {"squared": squared, "huber": huber, "cauchy":
 
 @dataclass(frozen=True)
 class NamedLoss:
-    """A robust loss as options name it, for tensors and for compiled loops."""
+    """A robust loss by name, for tensors and for compiled loops."""
 
     name: Literal["squared", "huber", "cauchy", "geman_mcclure"]
     threshold: float = 3.0  # standard deviations, where it stops being quadratic
 
     def __call__(self, d2: Tensor) -> tuple[Tensor, Tensor]:
-        """Loss and derivative."""
+        """Return the loss and its derivative."""
         loss = LOSSES[self.name]
         return loss(d2) if self.name == "squared" else loss(d2, self.threshold)  # type: ignore[call-arg]

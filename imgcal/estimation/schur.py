@@ -1,12 +1,12 @@
 """Block-arrow linear systems: many cameras, many snapshots, every camera coupled to every snapshot.
 
     [ A_1            W_11 ... W_1S ]
-    [      ...                     ]      A: one block a camera, D: one block a snapshot, W: their couplings.
+    [      ...                     ]      A: one block per camera, D: one block per snapshot, W: their couplings.
     [          A_C   W_C1 ... W_CS ]
     [                D_1           ]      One kind of block is eliminated (Schur complement), the other solved densely.
     [ W^T                ...  D_S  ]
 
-A few more unknowns that couple to everything (the object's) are kept, behind the others: the border.
+A few more unknowns that couple to everything (the object's) are kept, after the others: the border.
 
 Source: Triggs et al., "Bundle Adjustment - A Modern Synthesis", section 6.
 """
@@ -30,16 +30,16 @@ class Border:
 
 @dataclass(frozen=True)
 class Reduced:
-    """A Cholesky factorization of the arrow with one kind of block eliminated."""
+    """Cholesky factorization of the block-arrow matrix with one kind of block eliminated."""
 
     eliminated: Tensor  # (B, P, p, p) lower factors of the eliminated blocks
-    whitened: Tensor  # (B, P, p, Q q + M) those factors' inverses times the couplings
+    whitened: Tensor  # (B, P, p, Q q + M) inverses of those factors times the couplings
     kept: Tensor  # (B, Q q + M, Q q + M) lower factor of the Schur complement
     failed: Tensor  # (B,) bool: not positive definite
 
 
 def reduce(blocks: Tensor, coupling: Tensor, kept: Tensor, border: Border | None = None) -> Reduced:
-    """Eliminate `blocks` from the arrow.
+    """Eliminate `blocks` from the system.
 
     Args:
         blocks: (B, P, p, p) symmetric blocks to eliminate.
@@ -70,7 +70,7 @@ def reduce(blocks: Tensor, coupling: Tensor, kept: Tensor, border: Border | None
 def solve(
     reduced: Reduced, right_eliminated: Tensor, right_kept: Tensor, right_border: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Solve the arrow for one right-hand side.
+    """Solve the system for one right-hand side.
 
     Args:
         reduced: from `reduce`.
@@ -89,7 +89,7 @@ def solve(
 def solve_columns(
     reduced: Reduced, right_eliminated: Tensor, right_kept: Tensor, right_border: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Solve the arrow for R right-hand sides at once.
+    """Solve the system for R right-hand sides at once.
 
     Args:
         reduced: from `reduce`.

@@ -1,8 +1,8 @@
 """The modes of an object's shape: a few displacements of all fiducials together, such as the bend of a printed board.
 
-They are few, and every fiducial follows them, so that they are not unknowns of the normal equations: `points` of the
-problem have as much of each as is known so far. A fit says what it leaves of their gradient and of their information
-when rig, poses and tolerances have adapted; a Gauss-Newton step of the modes alone, and the next fit, follow from that.
+The modes are few and affect every fiducial, so they are not unknowns of the normal equations. Instead, the `points` of
+the problem include the current estimate of each. A fit gives the gradient and the information of the modes with rig,
+poses and tolerances marginalized. A Gauss-Newton step of the modes alone follows from that, and then the next fit.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ from imgcal.estimation.linearization import (
 from imgcal.estimation.robust_losses import NamedLoss
 
 POINTS_AT_ONCE = 2**16
-"""Pixels whose derivatives are held in memory together."""
+"""Pixels whose derivatives are in memory at the same time."""
 AT_REST = 0.02
-"""Standard deviations that a step of the modes may still be long."""
+"""Largest step of a converged mode, in its posterior standard deviations."""
 
 
 @dataclass(frozen=True)
 class DirectionEvidence:
-    """What a fit says about displacements of all fiducials together, along K directions."""
+    """Information of a fit about common displacements of all fiducials along K directions."""
 
     information: Tensor  # (K, K), rig, poses and tolerances marginalized
-    pull: Tensor  # (K,) information times the displacement that the data ask for
-    follow: Tensor  # (K, C, K) change of the cameras' whitened offsets by a unit of each direction
+    pull: Tensor  # (K,) information times the best-fitting displacement
+    follow: Tensor  # (K, C, K) change of the cameras' whitened offsets per unit of each direction
     alone: float  # largest information of one coordinate of a fiducial, nothing marginalized, mm^-2
 
 
 def direction_evidence(
     problem: Problem, solution: Solution, loss: NamedLoss, directions: Tensor
 ) -> DirectionEvidence | None:
-    """Ask a fit of one rig (B = 1) about directions (K, N, 3) mm, in a time that grows with the fiducials.
+    """Compute a fit's evidence on directions (K, N, 3) mm, one rig (B = 1), in time linear in the fiducials.
 
     Returns:
-        None where rig and poses are undetermined.
+        The evidence; None where rig and poses are undetermined.
     """
     factorization, state = solution.factorization, solution.state
     if bool(factorization.reduced.failed.any()):
@@ -96,21 +96,21 @@ def _solve(factorization: Factorization, right: Step) -> Step:
 
 @dataclass(frozen=True)
 class ModeEvidence:
-    """How well the modes are known at a fit, in units of their prior standard deviations."""
+    """Estimate and uncertainty of the modes at a fit, in units of their prior standard deviations."""
 
     offset: NDArray[np.float64]  # (K,) as estimated
     covariance: NDArray[np.float64]  # (K, K)
-    step: NDArray[np.float64]  # (K,) what the data still ask for
-    follow: Tensor  # (K, C, K) change of the cameras' whitened offsets by a unit of each mode
+    step: NDArray[np.float64]  # (K,) remaining Gauss-Newton step
+    follow: Tensor  # (K, C, K) change of the cameras' whitened offsets per unit of each mode
 
     @property
     def at_rest(self) -> bool:
-        """The data ask for nothing more."""
+        """Whether the remaining step is negligible."""
         return bool((np.abs(self.step) <= AT_REST * np.sqrt(self.covariance.diagonal())).all())
 
 
 def mode_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ModeEvidence | None:
-    """Ask a fit about the object's modes; None where it has none, or rig and poses are undetermined."""
+    """Compute a fit's evidence on the object's modes; None without modes, or where rig or poses are undetermined."""
     if problem.modes is None:
         return None
     found = direction_evidence(problem, solution, loss, problem.modes)
@@ -123,7 +123,7 @@ def mode_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Mode
 
 
 def bend_object(problem: Problem, evidence: ModeEvidence) -> Problem:
-    """The problem with the step that the evidence asks for in its points."""
+    """Apply the step of the modes to the problem's points."""
     assert problem.modes is not None
     step = torch.from_numpy(evidence.step).to(problem.points)
     points = problem.points + torch.einsum("k,kni->ni", step, problem.modes)

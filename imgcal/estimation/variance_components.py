@@ -1,4 +1,4 @@
-"""The fit of labelled snapshots together with what it depends on: noise, outliers, and how wide the prior must be."""
+"""The fit of labelled snapshots, together with its noise, its outliers, and the width of the prior."""
 
 from __future__ import annotations
 
@@ -26,29 +26,23 @@ from imgcal.estimation.object_shape import (
 )
 from imgcal.estimation.pose_support import require_poses
 from imgcal.estimation.shape_modes import ModeEvidence, bend_object, mode_evidence
+from imgcal.types import PARAMETER_KINDS
 
-KINDS = {
-    "rotation": slice(0, 3),
-    "position": slice(3, 6),
-    "focal_length": slice(6, 8),
-    "principal_point": slice(8, 10),
-    "distortion": slice(10, None),
-}
 ROUNDS = 40
-"""Of fits at most: noise, outliers, object and prior follow each other, and most captures need three to six."""
+"""Most fits: noise, outliers, object and prior depend on each other, and most captures need three to six."""
 BENT = 5.0
-"""Standard deviations from which the object is not what its file says."""
+"""Standard deviations from which the object does not match its file."""
 WRONG_SCALE = 4.0
-"""Standard deviations of the cameras' positions, all moved together, from which the object's scale is wrong."""
+"""Standard deviations of a common change of the cameras' positions from which the object's scale is wrong."""
 
 GROSS_SCALE = 0.05
-"""Relative error of the scale that is named at once: it spoils noise and labels of any fit."""
+"""Relative error of the scale that is reported at once: it spoils noise and labels of any fit."""
 MOST_SCALE = 0.5
-"""Relative error of the scale above which something else is wrong: exchanged cameras, for one."""
+"""Relative error of the scale above which something else is wrong, for example exchanged cameras."""
 
 
 class FitOptions(Protocol):
-    """What of the pipeline's options decides when a fit has come to rest."""
+    """The pipeline options that decide when a fit has converged."""
 
     @property
     def estimation(self) -> EstimationOptions:
@@ -56,48 +50,48 @@ class FitOptions(Protocol):
 
     @property
     def outlier(self) -> float:
-        """Standard deviations beyond which a label is left out."""
+        """Standard deviations beyond which a label is an outlier."""
 
     @property
     def widest_prior(self) -> float:
-        """Factor by which a kind of factory values may have drifted more than the prior says."""
+        """Largest factor by which the prior of a kind of factory values may be widened."""
 
 
 @dataclass(frozen=True)
 class VarianceComponents:
-    """A fit whose noise, outliers, object and prior agree with its residuals."""
+    """A fit whose noise, outliers, object and prior are consistent with its residuals."""
 
     problem: Problem
     solution: Solution
     sigma: NDArray[np.floating]  # (S, C, N) px, with the additive noise
-    seen: NDArray[np.bool_]  # (S, C, N) labels that fit
+    seen: NDArray[np.bool_]  # (S, C, N) inliers
     additive_noise: float  # px
     prior_scale: Mapping[str, float]
-    shape: ShapeEvidence | ScaleEvidence | None = None  # what the residuals say about the object; None = not asked
-    modes: ModeEvidence | None = None  # the same about its modes
+    shape: ShapeEvidence | ScaleEvidence | None = None  # evidence on the object's shape; None = not tested
+    modes: ModeEvidence | None = None  # evidence on its modes
 
 
 class ObjectQuestion(Enum):
-    """What a fit is asked about the object."""
+    """What to test about the object."""
 
-    NONE = "it is taken as it is"
-    SHAPE = "is it what its file says? fiducials that are not in their places are freed"
-    SHAPE_OF_TURNS = "the same, but snapshots may have labels of different turns: nobody can say which are not"
+    NONE = "nothing"
+    SHAPE = "its shape; misplaced fiducials are freed"
+    SHAPE_OF_TURNS = "its shape, but labels may differ by a symmetry: misplaced fiducials cannot be identified"
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where to begin."""
+    """A start for the fit."""
 
     state: State
     additive_noise: float  # px
-    solution: Solution | None = None  # to which that leads with all labels, where it is known
-    nearer: State | None = None  # what a fit with the noise of these residuals has found already
+    solution: Solution | None = None  # minimum from this start with all labels, if known
+    nearer: State | None = None  # state of an earlier fit with the noise of these residuals
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """A solution with some noise, of some labels."""
+    """A solution for given noise and labels."""
 
     problem: Problem
     solution: Solution
@@ -112,22 +106,22 @@ class _Fit:
 
     @cached_property
     def remaining(self) -> NDArray[np.float64]:
-        """Part of each factory value's prior variance that the observations leave: (C, K)."""
+        """Share of each factory value's prior variance that remains after the observations: (C, K)."""
         return np.asarray(remaining_variance(self.solution)[0])
 
     @cached_property
     def additive_noise(self) -> float:
-        """What the residuals hold beyond the blobs' own sigma, px; see `_additive_noise`."""
+        """Noise in the residuals beyond the blobs' own sigma, px; see `_additive_noise`."""
         taken = float(self.problem.pose_freedom) + float((1 - self.remaining).sum())
         return _additive_noise(self.squared[self.seen], self.variance[self.seen], taken)
 
     @property
     def converged(self) -> bool:
-        """A minimum was found."""
+        """Whether a minimum was found."""
         return bool(self.solution.converged)
 
     def is_clean(self, outlier: float) -> bool:
-        """Tell whether all labels fit as well as their own sigma says, but for `outlier` standard deviations."""
+        """Check that all labels fit within `outlier` of their own sigma, without additive noise."""
         within = self.squared[self.seen] <= outlier**2 * self.variance[self.seen]
         return self.converged and bool(within.all()) and self.additive_noise == 0
 
@@ -140,19 +134,19 @@ def estimate_variance_components(
     options: FitOptions,
     question: ObjectQuestion = ObjectQuestion.SHAPE,
 ) -> VarianceComponents:
-    """Fit, ask the residuals for noise, outliers, the object and the prior's width, and fit again until they stay.
+    """Fit; re-estimate noise, outliers, object and prior width from the residuals; repeat until nothing changes.
 
     Args:
-        problem: with the prior to begin with.
-        starts: where to begin. One by which some label does not fit gives way to the next; the last one stays.
+        problem: with the initial prior.
+        starts: starts in order. One that leaves any label out gives way to the next; the last one is final.
         variance: (S, C, N) px^2, the blobs' own.
-        labels: (S, C, N) bool, what was labelled, and says in every snapshot where the object is.
-        options: how sure the result must be.
-        question: what to ask about the object.
+        labels: (S, C, N) bool, the labelled fiducials, which determine the pose in every snapshot.
+        options: thresholds and the solver's options.
+        question: what to test about the object.
 
     Raises:
-        RefusedError: no minimum was found, or noise, outliers, object and prior do not come to rest.
-        UndeterminedPosesError: without outliers some snapshots do not say where the object is.
+        RefusedError: no minimum was found, or noise, outliers, object and prior do not converge.
+        UndeterminedPosesError: without outliers, some snapshots do not determine the object's pose.
     """
     start, *later = starts
     state, additive_noise, known = start.state, start.additive_noise, start.solution
@@ -163,7 +157,7 @@ def estimate_variance_components(
         fit, known = _fit(problem, state, additive_noise, variance, kept, options, known), None
         problem, solution, seen = fit.problem, fit.solution, fit.seen
         if unexamined and not later and fit.converged and not fit.is_clean(options.outlier):
-            # Before outliers are left out: all labels of a fiducial that is off its place may be among them.
+            # Test before removing outliers, because they may include all labels of a misplaced fiducial.
             unexamined = False
             if (softer := _bend(fit, options)) is not None:
                 problem, state, kept, unexamined = softer, solution.state, labels, True
@@ -172,8 +166,8 @@ def estimate_variance_components(
             if free is not None:
                 (problem, state), kept = free, labels
                 continue
-        # Judged by the sigma of this fit: what a coarse fit leaves says little about fine outliers. Where a fiducial
-        # was left out there is no residual: it stays out.
+        # Use the sigma of this fit, because a coarse fit cannot detect fine outliers. A removed fiducial has no
+        # residual, so it stays out.
         kept = seen & (fit.squared <= options.outlier**2 * fit.noise)
         if (kept != seen).any():
             require_poses(kept, problem.points)
@@ -188,7 +182,7 @@ def estimate_variance_components(
             raise RefusedError(f"estimation: no minimum after {solution.iterations} iterations (RMS {rms:.3g} px)")
         state, nearer = nearer or solution.state, None
         previous, additive_noise = additive_noise, fit.additive_noise
-        # Noise that is barely significant is needed where none is allowed, and not where it is: it stays.
+        # Barely significant noise appears when none is assumed, and vanishes when it is: keep it.
         if previous == 0:
             needed = additive_noise
         if additive_noise == 0 and (kept == seen).all():
@@ -213,15 +207,15 @@ def estimate_variance_components(
         prior_scale |= {kind: prior_scale.get(kind, 1.0) * factor for kind, factor in too_narrow.items()}
         problem, state = _widen(problem, state, too_narrow)
     raise RefusedError(
-        f"estimation: noise, outliers and prior have not come to rest after {ROUNDS} fits: the rig has changed far "
+        f"estimation: noise, outliers and prior do not converge in {ROUNDS} fits: the rig has changed far "
         "more than its prior allows, or many labels are wrong",
-        python="give the rig a wider prior where it may have changed so much: replace(rig, prior=RigPrior(...))",
-        command="write larger values under `prior` in the rig file where the rig may have changed so much",
+        python="if the rig may have changed that much, give it a wider prior: replace(rig, prior=RigPrior(...))",
+        command="if the rig may have changed that much, write larger values under `prior` in the rig file",
     )
 
 
 def _bend(fit: _Fit, options: FitOptions) -> Problem | None:
-    """The problem with the object's modes as the fit asks for them; None = they are."""
+    """Apply the step of the object's modes; None = they have converged."""
     asked = mode_evidence(fit.problem, fit.solution, make_loss(options.estimation))
     return None if asked is None or asked.at_rest else bend_object(fit.problem, asked)
 
@@ -229,14 +223,14 @@ def _bend(fit: _Fit, options: FitOptions) -> Problem | None:
 def _examine(
     fit: _Fit, options: FitOptions, least_scale: float, question: ObjectQuestion
 ) -> tuple[ShapeEvidence | ScaleEvidence | None, tuple[Problem, State] | None]:
-    """Ask a fit about the object; errors of its scale count from `least_scale`, relative.
+    """Test a fit's object; errors of its scale count from `least_scale`, relative.
 
     Returns:
-        What it says, and a problem in which fiducials that are not in their places have tolerances, with a state to go
-        on from; None = they are where they should be, as far as the fit can tell.
+        The evidence, and a problem in which misplaced fiducials have tolerances, with a state to continue from; None =
+        no fiducial is significantly misplaced.
 
     Raises:
-        RefusedError: the object has another scale; or it is bent, and symmetric.
+        RefusedError: the object has another scale, or it is bent and symmetric.
     """
     shape = object_evidence(fit.problem, fit.solution, make_loss(options.estimation))
     if shape is None:
@@ -244,10 +238,10 @@ def _examine(
     bent = shape.bent_sigma() >= BENT
     if bent and question is ObjectQuestion.SHAPE_OF_TURNS:
         raise RefusedError(
-            "object: its fiducials are not where its file says, and because it can be turned into itself, nobody can "
-            "say which: each snapshot may have the labels of another turn",
-            python="measure it anew, give labels (Detections.fiducial), or use an object without symmetry",
-            command="measure it anew, give labels (a column `fiducial`), or use an object without symmetry",
+            "object: some fiducials are not where its file says, but the object is symmetric: snapshots may be "
+            "labelled in different orientations, so the displaced fiducials cannot be identified",
+            python="measure it again, give labels (Detections.fiducial), or use an object without symmetry",
+            command="measure it again, give labels (a column `fiducial`), or use an object without symmetry",
         )
     free = None
     if bent and isinstance(shape, ShapeEvidence):
@@ -266,13 +260,13 @@ def _free_object(
     before = problem.object_prior_std
     scale = problem.points.new_zeros(1) if before is None else before[0, -1:]
     free = torch.cat((torch.from_numpy(prior_std).to(problem.uv).repeat_interleave(3), scale))
-    # The displacements stay, in new units; where a tolerance is still zero there was none.
+    # Keep the displacements in the new units; a fiducial whose tolerance is still zero has none.
     displaced = (points_at(problem, solution.state)[0] - problem.points).flatten()
     whitened = torch.where(free > 0, torch.cat((displaced, torch.zeros_like(scale))) / free.clamp_min(1e-30), 0.0)
     problem = replace(problem, object_prior_std=free[None])
     state = replace(solution.state, object_offset=whitened[None])
     found = minimize(problem, state, options.estimation)
-    # Where snapshots disagree about the fiducials, something else than the object is behind it.
+    # If snapshots disagree about the fiducials, the cause is not the object.
     loss = make_loss(options.estimation)
     if not bool(found.converged) or shape.bent_sigma(pull_scatter(problem, found.state, loss)) < BENT:
         return None
@@ -280,11 +274,11 @@ def _free_object(
 
 
 def _require_scale(shape: ShapeEvidence | ScaleEvidence, fit: _Fit, least: float) -> None:
-    """Refuse where the cameras have moved together as a wrong scale of the object would make them.
+    """Refuse if the cameras have moved together as a wrong scale of the object would make them.
 
-    How far they have moved otherwise says how far the prior can be trusted to know them.
+    Their other motion shows how far the prior of their positions can be trusted.
     """
-    position, problem = KINDS["position"], fit.problem
+    position, problem = PARAMETER_KINDS["position"], fit.problem
     offset, prior_std = (tensor[0, :, position].numpy() for tensor in (fit.solution.state.offset, problem.prior_std))
     places = problem.factory.positions[0].numpy() + offset * prior_std
     direction = np.where(prior_std > 0, (places - places.mean(0)) / np.maximum(prior_std, 1e-30), 0.0).ravel()
@@ -299,9 +293,9 @@ def _require_scale(shape: ShapeEvidence | ScaleEvidence, fit: _Fit, least: float
         raise RefusedError(
             f"object: all cameras have moved together, as if it were {100 * abs(error):.2g} +- {100 * deviation:.1g} % "
             f"{size} than its file says",
-            python=f"measure it anew, look at its unit, or grant its scale a tolerance (now {granted:g}): "
+            python=f"measure it again, check its unit, or give its scale a tolerance (now {granted:g}): "
             "replace(obj, scale_tolerance=...)",
-            command=f"measure it anew, look at its unit, or grant its scale a tolerance (now {granted:g}): "
+            command=f"measure it again, check its unit, or give its scale a tolerance (now {granted:g}): "
             "--object-scale-tolerance",
         )
 
@@ -315,7 +309,7 @@ def _fit(
     options: FitOptions,
     known: Solution | None,
 ) -> _Fit:
-    """Fit what is seen (S, C, N) with the blobs' own variance (px^2) and more (px), unless the solution is known."""
+    """Fit labels `seen` (S, C, N) with the blobs' variance (px^2) plus noise (px), unless the solution is known."""
     noise = variance + additive_noise**2
     root_weight = torch.from_numpy(np.where(seen, noise**-0.5, 0.0)).to(problem.uv)
     problem = replace(problem, root_weight=root_weight[None])
@@ -323,16 +317,16 @@ def _fit(
 
 
 def _additive_noise(squared: NDArray[np.floating], variance: NDArray[np.floating], taken: float) -> float:
-    """Standard deviation (px, each axis) that residuals hold beyond the blobs' own sigma; 0 = insignificant.
+    """Standard deviation (px, each axis) of the residuals beyond the blobs' own sigma; 0 = insignificant.
 
-    The median of squared distances over two axes is 1.386 for unit noise, whatever a minority of outliers does.
-    Residuals are smaller than the noise by what the parameters took: each takes the share of one observation that its
-    prior left.
+    The median of squared distances over two axes is 1.386 for unit noise, whatever a minority of outliers does. The
+    residuals are smaller than the noise by the degrees of freedom of the parameters: each counts as one observation
+    times the share of its information that comes from the data.
 
     Args:
         squared: (M,) px^2, squared lengths of the residuals.
         variance: (M,) px^2 of each axis, the blobs' own.
-        taken: degrees of freedom that the parameters took.
+        taken: effective degrees of freedom of the parameters.
     """
     count = 2 * len(squared)
     free = max(count - taken, 1.0)
@@ -342,7 +336,7 @@ def _additive_noise(squared: NDArray[np.floating], variance: NDArray[np.floating
     def excess(error: float) -> float:
         return float(np.partition(squared / (variance + error**2), middle)[middle]) / 1.386
 
-    # Six standard deviations of a chi-squared mean: below, the residuals fit the sigmas that the blobs have.
+    # Six standard deviations of a chi-squared mean: below, the residuals agree with the blobs' sigmas.
     if excess(0.0) <= 1 + 6 * (2 / free) ** 0.5:
         return 0.0
     low, high = 0.0, float(np.sqrt(squared.max()))
@@ -353,13 +347,13 @@ def _additive_noise(squared: NDArray[np.floating], variance: NDArray[np.floating
 
 
 def _too_narrow(offset: NDArray[np.floating], remaining: NDArray[np.float64]) -> dict[str, float]:
-    """Kinds of values that have drifted more than their prior allows: factor by which the prior is too narrow.
+    """Find kinds of values that have drifted more than their prior allows, and the factor that the prior needs.
 
-    The whitened offsets (C, K) of a kind should have a mean square of one, over as many values as the data determine:
-    those of which they leave little (C, K) of the prior's variance.
+    The whitened offsets (C, K) of a kind should have a mean square of one over the values that the data determine:
+    those with a small remaining share (C, K) of the prior's variance.
     """
     factors = {}
-    for kind, part in KINDS.items():
+    for kind, part in PARAMETER_KINDS.items():
         freedom = float((1 - remaining[:, part]).sum())
         if freedom > 1:
             excess = float(np.square(offset[:, part]).sum()) / freedom
@@ -369,8 +363,8 @@ def _too_narrow(offset: NDArray[np.floating], remaining: NDArray[np.float64]) ->
 
 
 def _widen(problem: Problem, state: State, factors: Mapping[str, float]) -> tuple[Problem, State]:
-    """Widen the prior; the state, counted in prior standard deviations, stays where it is."""
+    """Widen the prior; the state, in prior standard deviations, keeps its physical values."""
     scale = torch.ones_like(problem.prior_std[0, 0])
     for kind, factor in factors.items():
-        scale[KINDS[kind]] = factor
+        scale[PARAMETER_KINDS[kind]] = factor
     return replace(problem, prior_std=problem.prior_std * scale), replace(state, offset=state.offset / scale)

@@ -5,9 +5,8 @@ from .metrics import Errors, cramer_rao, errors, held_out_points, reprojection_e
 from .models import Model, load_models
 from .outcome_tables import detector_tables, detector_values
 from .protocol import REFERENCE, Conditions, Evaluation, Progress, Protocol, Row, Scores, evaluate
-from .summary import Facts, Summary
 from .sweeps import AXES, Sweep, sweep
-from .tables import PLOTS, RESULT, TABLES, as_tables, describe, markdown, write
+from .tables import PLOTS, RESULT, TABLES, Facts, Summary, as_tables, describe, markdown, write
 from .timing import Latency, latency
 
 __all__ = [

@@ -37,7 +37,7 @@ Status = Literal["calibrated", "refused", "wrong"]
 
 @dataclass(frozen=True)
 class Scene:
-    """What captures are drawn from; the seed of a capture decides the rest."""
+    """What captures are drawn from; the seed of a capture determines the rest."""
 
     rig: CameraRig  # factory, float64, without batch axes
     obj: CalibrationObject
@@ -93,10 +93,10 @@ def compare_detectors(
         contenders: who takes part.
         scene: what captures are drawn from; all its difficulties are tried.
         count: captures a difficulty.
-        seed: the same seed gives the same captures, whoever takes part.
+        seed: the same seed gives the same captures, whichever detectors take part.
         progress: called with the number of captures that have been done.
-        mapped: called as `map` is, gives results in the order of captures, which depend on nobody: the numbers are the
-            same, whoever measures (`imgcal.fleet.workers`).
+        mapped: called like `map`; gives results in the order of captures. They do not depend on who measures
+            (`imgcal.fleet.workers`).
     """
     cases = [(difficulty, seed * 100_000 + number) for difficulty in scene.models for number in range(count)]
     found: list[Outcome] = []

@@ -104,7 +104,7 @@ def _zero(output: Tensor, rigs: int) -> Tensor:
 
 @contextmanager
 def _replace_output(encoder: nn.Module, spoil: Spoil | None) -> Iterator[Callable[[int], None]]:
-    """Replace what an encoder returns; yields a function that is told how many rigs come next."""
+    """Replace what an encoder returns; yields a function to call with the number of rigs that come next."""
     rigs = [1]
 
     def announce(count: int) -> None:

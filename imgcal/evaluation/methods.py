@@ -78,7 +78,7 @@ Passes = Callable[[Given], tuple[Prediction, ...]]
 
 @dataclass(frozen=True)
 class Refined:
-    """What a refinement came to, and where it has to be said that it failed."""
+    """The result of a refinement, and where it failed."""
 
     prediction: Prediction  # (B,)
     found: Tensor  # (B,) bool; False: what was seen contradicts the rig, or no minimum was found
@@ -107,7 +107,7 @@ class Method:
 def keep_factory_rig(given: Given) -> Prediction:
     """Keep the factory rig and fit only the object's pose: what a tracking system does that is not recalibrated.
 
-    With the true pose RE would be larger, and nobody knows it. Least squares over all cameras, Huber's loss beyond what
+    With the true pose, which is not known, RE would be larger. Least squares over all cameras, Huber's loss beyond what
     a drifted rig misses by.
     """
     observations = make_observations(given.uv, given.seen, max(given.sigma, DRIFTED_SIGMA))
@@ -128,9 +128,9 @@ def factory_from_pnp(given: Given) -> Prediction:
 
 
 def steps_from_factory(count: int) -> Predict:
-    """Make so many Levenberg-Marquardt steps of MAP estimation from the factory rig and a pose by PnP.
+    """Make a method of `count` Levenberg-Marquardt steps of MAP estimation from the factory rig and a pose by PnP.
 
-    The same compiled steps, loss and prior as in `map_from_pnp`, which goes on until it has converged. What a network
+    The same compiled steps, loss and prior as in `map_from_pnp`, which continues until it has converged. What a network
     alone must be measured by: it, too, is given labelled points, the factory rig and the spread of its drift.
     """
     return partial(map_from_pnp, options=EstimationOptions(max_iterations=count))
@@ -143,7 +143,7 @@ def robust_from_pnp(given: Given) -> Prediction:
 
 
 def refine_by_points(prediction: Prediction, given: Given) -> Refined:
-    """`refine_robustly` with what is given; it has failed where most points are outliers to the rig that it found."""
+    """Refine robustly; it has failed where most points are outliers to the rig that it found."""
     options = RobustOptions()
     known, sigma = (given.factory, given.obj, given.prior_std), given.sigma
     result = refine_robustly(prediction, given.views, *known, sigma=sigma, options=options)

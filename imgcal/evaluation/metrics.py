@@ -45,7 +45,7 @@ class Errors:
         return Errors(**{name: getattr(self, name)[rows] for name in KINDS})
 
     def where(self, found: Tensor) -> Errors:
-        """Leave no number where nothing was found, (B,) bool, or where it is none: nan in every kind."""
+        """Set every kind to nan where nothing was found, (B,) bool, or where RE is not finite."""
         there = found & self.re.isfinite()
         return Errors(**{name: torch.where(there, getattr(self, name), torch.nan) for name in KINDS})
 

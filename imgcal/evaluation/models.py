@@ -12,7 +12,7 @@ import torch
 from imgcal.errors import InputError
 from imgcal.evaluation.methods import Method, network_method
 from imgcal.evaluation.protocol import Conditions
-from imgcal.evaluation.summary import Facts
+from imgcal.evaluation.tables import Facts
 from imgcal.io import MODEL, model_file, read_metrics
 from imgcal.networks import Checkpoint, check_says_rigs, load_checkpoint
 from imgcal.types import CalibrationObject, CameraRig
@@ -42,7 +42,7 @@ class Model:
 
     @property
     def facts(self) -> Facts:
-        """What reports say about it."""
+        """What reports show about it."""
         spec = self.checkpoint.experiment.model_dump()  # with what networks do not know of it
         seed = (spec.get("training") or {}).get("seed", 0)
         return Facts(self.parameters, self.size, self.history, spec.get("name"), int(seed))

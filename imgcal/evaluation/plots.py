@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from imgcal.evaluation.protocol import REFERENCE, Scores
-from imgcal.evaluation.summary import Summary
 from imgcal.evaluation.sweeps import AXES, Sweep
+from imgcal.evaluation.tables import Summary
 from imgcal.io import write_bytes
 
 SIZE = (7.2, 4.4)  # inches

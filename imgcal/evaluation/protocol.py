@@ -50,7 +50,7 @@ class Conditions:
 
     @property
     def sigma(self) -> float:
-        """What methods are told about the noise: pixels."""
+        """The noise that methods are given: pixels."""
         return max(self.corruption.noise, LEAST_SIGMA)
 
 
@@ -105,7 +105,7 @@ class Scores:
         return torch.cat([trial.re for trial in self.trials])
 
     def statistics(self, kind: Literal["re", "held_out"] = "re") -> Statistics:
-        """Sum up RE, on the object's own points or on those that took no part."""
+        """Summarize RE, on the object's own points or on held-out ones."""
         values = [getattr(trial, kind) for trial in self.trials]
         means = [float(trial.nanmean()) for trial in values]
         re = torch.cat(values).double()
@@ -172,7 +172,7 @@ class _Collected:
     passes: int = 1
 
     def add(self, found: Mapping[str, Any]) -> None:
-        """Take what a batch came to."""
+        """Add the errors of a batch."""
         for name in STAGES:
             if found[name]:
                 getattr(self, name).append(Errors(**found[name]))
@@ -193,8 +193,8 @@ def evaluate(
         conditions: what rigs are drawn from, and how their views are corrupted.
         protocol: how many rigs; the same seed gives the same rigs, whatever the methods are.
         progress: called after each batch.
-        mapped: who measures batches; called as `map` is. Rigs are drawn here and travel, so that their random numbers
-            depend on nobody: the numbers are the same, whoever measures (`imgcal.fleet.workers`).
+        mapped: measures batches; called like `map`. Rigs are drawn here and sent along, so that the results do not
+            depend on who measures (`imgcal.fleet.workers`).
 
     Raises:
         RefusedError: too few random rigs see the whole object.
@@ -238,7 +238,7 @@ class Sample:
         return len(self.corrupted.views)
 
     def given(self, rows: slice = slice(None)) -> Given:
-        """What methods may use, of some of the rigs."""
+        """What methods may use of some of the rigs."""
         views, known = self.corrupted.views, self.conditions
         assert views.uv is not None and views.seen is not None  # points are what is corrupted
         some = Views(uv=views.uv[rows], seen=views.seen[rows])
@@ -278,7 +278,7 @@ class _Batch:
 
     @property
     def key(self) -> str:
-        """Digest of all that results depend on, beside what the methods are."""
+        """Digest of all that results depend on, apart from the methods."""
         known, given, truth = self.sample.conditions, self.sample.given(), self.sample.truth
         said = (self.trial, self.first, self.bounded, self.methods, given.seed, known.corruption, known.degradation)
         digest = hashlib.blake2b(f"{said}\n{known.obj.radius}\n{rig_text(known.rig)}".encode(), digest_size=16)

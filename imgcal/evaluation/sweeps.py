@@ -62,9 +62,9 @@ def sweep(
     progress: Progress = lambda rigs: None,
     mapped: Callable[..., Iterator[Any]] = map,
 ) -> Sweep:
-    """Evaluate along an axis, everything else as it stands, from equal random numbers.
+    """Evaluate along one axis, with everything else, and the random numbers, the same.
 
-    The spread that refinement is told is that of the drift at each point; networks stay what they were trained for.
+    Refinement gets the spread of the drift at each point; networks stay what they were trained for.
 
     Args:
         methods: by name.

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.estimation import Estimate, whitened_covariance
-from imgcal.types import CameraRig, RigPrior
+from imgcal.types import PARAMETER_KINDS, CameraRig, RigPrior
 
-KINDS = ("rotation", "position", "focal_length", "principal_point", "distortion")
+KINDS = tuple(PARAMETER_KINDS)
 """Kinds of value as a rig file's `prior:` names them, and in the order in which a camera's parameters stand."""
 
 

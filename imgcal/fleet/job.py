@@ -54,7 +54,7 @@ STATM = Path("/proc/self/statm")  # Linux tells there how much memory a process 
 
 @dataclass(frozen=True)
 class Settings:
-    """How every capture is treated."""
+    """Settings for every capture."""
 
     blind_cameras: bool = False
     detector: DetectorName = "classical"
@@ -63,7 +63,7 @@ class Settings:
     keep_rig: bool = False  # the text of its rig file, too
 
     def key(self) -> str:
-        """What results depend on, as text."""
+        """The settings that results depend on, as text."""
         decides = {"blind_cameras": self.blind_cameras, "detector": self.detector, "version": imgcal.__version__}
         return json.dumps(decides, sort_keys=True)
 
@@ -240,7 +240,7 @@ def _recalibrate(path: Path, rig: CameraRig, obj: CalibrationObject, settings: S
 
 
 def result_columns(result: Calibration) -> dict[str, Any]:
-    """What a row keeps of a calibration; `information_factor` is R of R^T R = 1 + information / prior, row by row."""
+    """The columns of a calibration; `information_factor` is R of R^T R = 1 + information / prior, row by row."""
     estimate, solution = result.estimate, result.estimate.solution
     whitened = torch.linalg.inv(whitened_covariance(solution))[0]
     factor = torch.linalg.cholesky(0.5 * (whitened + whitened.mT), upper=True)
@@ -279,7 +279,7 @@ def _fault(error: Exception, settings: Settings) -> tuple[Status, str]:
 
 @contextlib.contextmanager
 def _limit(settings: Settings) -> Iterator[None]:
-    """Hold what runs in the block to its time (not on Windows) and its memory (on Linux)."""
+    """Limit the time (not on Windows) and the memory (on Linux) of the block."""
 
     def over(number: int, frame: FrameType | None) -> None:
         raise TooLongError

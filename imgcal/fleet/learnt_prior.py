@@ -10,7 +10,6 @@ out. Estimates of the devices themselves would be shrunk towards the old prior; 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -22,10 +21,10 @@ from torch import Tensor
 
 from imgcal.errors import InputError, RefusedError
 from imgcal.fleet.drift_information import KINDS, DriftInformation
-from imgcal.types import RigPrior
+from imgcal.types import PARAMETER_KINDS, RigPrior
 
 SIGMAS = 5.0
-"""How surely a camera must be out of the fleet's spread to be called an outlier (two sides of a Gaussian)."""
+"""Standard deviations (two-sided) outside the fleet's spread from which a camera is an outlier."""
 LEAST_KNOWN = 0.01
 """Part of a direction's prior variance that the images must take away for the direction to be tested."""
 LEAST_DEVICES = 8
@@ -38,8 +37,6 @@ FREED = 1e6
 BOUNDS = 1e-12, 1e6
 MEAN = "mean"
 """Of the trends: the offset that all devices have at the covariates' means."""
-ENDS = {"rotation": 3, "position": 6, "focal_length": 8, "principal_point": 10}
-"""Where each kind of value ends among the parameters of a camera; what follows is distortion."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +53,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Trend:
-    """How a value follows something that was measured, temperature for example."""
+    """How a value depends on something that was measured, such as temperature."""
 
     covariate: str
     camera: str
@@ -92,7 +89,7 @@ class LearntPrior:
 
 @dataclass(frozen=True)
 class _Model:
-    """Which variances there are: rows of a matrix whose sum, weighted with them, is each parameter's variance."""
+    """The variances to find; masks weighted with them add up to each parameter's variance."""
 
     masks: Tensor  # (K, P) of zeros and ones
     features: Tensor  # (K, D) factor of each device: 1, or hours
@@ -185,7 +182,7 @@ def standardized_offsets(drift: DriftInformation, learnt: LearntPrior) -> Tensor
     Standard normal over the fleet; nan where the images say next to nothing.
     """
     variance = torch.zeros(len(drift.camera_names), drift.parameters, dtype=torch.float64)
-    for kind, part in _parts(drift.parameters).items():
+    for kind, part in PARAMETER_KINDS.items():
         for spread in (spread for spread in learnt.spreads if spread.kind == kind):
             rows = slice(None) if spread.camera is None else drift.camera_names.index(spread.camera)
             variance[rows, part] = spread.value**2
@@ -196,12 +193,6 @@ def standardized_offsets(drift: DriftInformation, learnt: LearntPrior) -> Tensor
         scaled = variance.flatten().sqrt() * seen.place / known.clamp_min(1e-12).sqrt()
         parts.append(torch.where(known > LEAST_KNOWN, scaled, torch.nan))
     return torch.cat(parts)
-
-
-def _parts(parameters: int) -> dict[str, slice]:
-    """Which parameters of a camera each kind of value has."""
-    bounds = itertools.pairwise([0, *ENDS.values(), parameters])
-    return {kind: slice(*ends) for kind, ends in zip(KINDS, bounds, strict=True)}
 
 
 def _column(name: str, values: Sequence[float] | NDArray[np.float64] | None, count: int) -> Tensor | None:
@@ -218,7 +209,7 @@ def _model(drift: DriftInformation, hours: Tensor | None, by_camera: bool) -> _M
     masks, names, features = [], [], []
     for grows in (False,) if hours is None else (False, True):
         feature = torch.ones(len(drift), dtype=torch.float64) if hours is None or not grows else hours.clamp_min(0)
-        for kind, part in _parts(drift.parameters).items():
+        for kind, part in PARAMETER_KINDS.items():
             for camera in range(cameras) if by_camera else (None,):
                 mask = torch.zeros(cameras, drift.parameters, dtype=torch.float64)
                 mask[slice(None) if camera is None else camera, part] = 1.0
@@ -326,8 +317,8 @@ def _outliers(drift: DriftInformation, model: _Model, theta: Tensor) -> list[Out
 def _surprise(drift: DriftInformation, variance: Tensor, freed: Tensor) -> tuple[Tensor, Tensor]:
     """How many standard deviations (D, C) each camera is out of the spread, and the kind that says most (D, C).
 
-    Each kind of value is tested by itself and all of a camera together; what is said is of the least probable, paid
-    for by the number of tests.
+    Each kind of value is tested by itself and all of a camera together; the least probable one counts, corrected
+    for the number of tests.
     """
     cameras = freed.shape[1]
     variance = variance * _freeing(freed, drift.parameters)
@@ -336,7 +327,7 @@ def _surprise(drift: DriftInformation, variance: Tensor, freed: Tensor) -> tuple
     place = (seen.place * std).reshape(blocks)
     whole = (seen.precision * std[:, :, None] * std[:, None, :]).reshape(*blocks, cameras, drift.parameters)
     known = whole.diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)  # (D, C, 15, 15)
-    tested = (*_parts(drift.parameters).values(), slice(None))
+    tested = (*PARAMETER_KINDS.values(), slice(None))
     log_p = np.stack([_log_p(place[..., part], known[..., part, part]) for part in tested], -1)
     least = np.minimum(log_p.min(-1) + np.log(log_p.shape[-1]), 0.0)
     sigmas = torch.from_numpy(stats.norm.isf(np.exp(np.maximum(least, -700.0)) / 2))

@@ -21,7 +21,7 @@ BATCH = 32
 
 @dataclass
 class FleetCount:
-    """How far a run is."""
+    """Progress of a run."""
 
     total: int | None = None  # rows of the manifest, where that is known
     read: int = 0  # rows of the manifest that came back

@@ -30,10 +30,10 @@ Result = TypeVar("Result")
 
 
 class Mapper(Protocol):
-    """What `workers` gives: called as `map` is."""
+    """The function that `workers` yields, called like `map`."""
 
     def __call__(self, function: Callable[[Item], Result], items: Iterable[Item], /) -> Iterator[Result]:
-        """Do items, results in their order."""
+        """Call the function for each item; results come in the order of the items."""
         ...
 
 
@@ -100,7 +100,7 @@ def workers(
         kept: what has been done before, and where to keep what is done now.
 
     Yields:
-        What takes a function and items, as `map` does.
+        A function that takes a function and items, like `map`.
 
     Raises:
         InputError: the engine is not installed, or there is no cluster at the address.

@@ -1,14 +1,21 @@
-from .conversion import Held, describe_lens, fill_image_sizes, fit_to_target, from_camera_rig, to_camera_rig
+from .conversion import (
+    Held,
+    describe_lens,
+    fill_image_sizes,
+    fit_to_target,
+    from_camera_rig,
+    in_millimetres,
+    millimetres,
+    to_camera_rig,
+)
 from .documents import Element, parse_xml
 from .fitting import Fit, Holds
-from .foreign_rig import ForeignCamera, ForeignRig
+from .foreign_rig import ForeignCamera, ForeignRig, known_points, worst_difference
 from .format import Files, Format
 from .lens import Lens
 from .limits import LIMIT
 from .loading import load_cameras, load_rig
 from .registry import FORMATS, find_format, is_foreign, read_foreign_rig
-from .units import in_millimetres, millimetres
-from .verification import known_points, worst_difference
 from .write_back import Updated, write_into
 from .writing import OURS, Written, convert_rig, select_cameras
 

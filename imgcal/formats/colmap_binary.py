@@ -19,12 +19,12 @@ from imgcal.formats.colmap_model import (
     rig_from_model,
     seven,
 )
-from imgcal.formats.documents import read_bytes
 from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignRig, FormatError
 from imgcal.formats.format import Files, Format
 from imgcal.formats.source import Source
 from imgcal.formats.values import number
+from imgcal.io import read_bytes
 
 TITLE = "COLMAP model (binary)"
 CAMERA = 0  # the type of a sensor

@@ -27,7 +27,6 @@ MODELS = (
 """In the order of their numbers in binary files."""
 
 COUNTS = dict(zip(MODELS, (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16), strict=True))
-STEADY_PX = 0.5  # how far images of cameras that are fixed to each other may disagree about it
 ROTATION_STEADY, PLACE_STEADY = 1e-3, 1e-2  # rad; of the cameras' distances to each other
 
 

@@ -1,7 +1,8 @@
-"""From another tool's rig to a `CameraRig`, and back; lenses are exact where the other side can say them."""
+"""From another tool's rig to a `CameraRig` and back: units, image sizes, and lenses, exact where they can be."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,16 +18,20 @@ from imgcal.formats.limits import LIMIT
 from imgcal.formats.values import name_cameras
 from imgcal.geometry import LENS_MODELS, RigidTransform, lens_label, lens_width
 from imgcal.io import RigCovariance
+from imgcal.messages import shorten
 from imgcal.types import CameraRig, check_rig
 
 BROWN, RATIONAL, FISHEYE = "brown_conrady", "rational", "equidistant"
 NATIVE = Holds(tuple(len(LENS_MODELS[name].coefficients) for name in (BROWN, RATIONAL)), fisheye=True)
 """Lenses of a `CameraRig`."""
 
+UNITS = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0, "inch": 25.4, "in": 25.4}
+LENGTH = re.compile(r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)?\s*([a-z]+)")
+
 
 @dataclass(frozen=True)
 class Held:
-    """A rig whose lenses a target format can express."""
+    """A rig whose lenses a target format can store."""
 
     rig: ForeignRig
     fits: tuple[Fit, ...]  # one a camera
@@ -35,6 +40,69 @@ class Held:
     def worst(self) -> float:
         """The largest residual of a lens in pixels; 0 where all are exact."""
         return max(fit.worst for fit in self.fits)
+
+
+def millimetres(unit: str, what: str = "--unit") -> float:
+    """Read a unit, or the length of one unit of a file (`417.2mm`).
+
+    Raises:
+        InputError: it is neither.
+
+    Examples:
+        >>> millimetres("m"), millimetres("12.5 mm")
+        (1000.0, 12.5)
+    """
+    match = LENGTH.fullmatch(unit.strip())
+    if match is None or match[2] not in UNITS:
+        expected = f"{', '.join(UNITS)}, or the length of one unit of the file, such as 417.2mm"
+        raise InputError(f"{what}: found {shorten(unit)!r}, expected {expected}")
+    factor = float(match[1] or 1.0) * UNITS[match[2]]
+    if not 1e-9 <= factor <= 1e9:
+        raise InputError(f"{what}: found {shorten(unit)!r}, expected a length between 1e-9 and 1e9 mm")
+    return factor
+
+
+def in_millimetres(
+    rig: ForeignRig, where: str, unit: str | None = None, distance: tuple[str, str, float] | None = None
+) -> ForeignRig:
+    """Convert a rig's lengths to millimetres.
+
+    Args:
+        rig: as it was read.
+        where: what errors begin with.
+        unit: of the file, which counts before what the format says; None = what the format says.
+        distance: two cameras and how many millimetres they are apart, instead of a unit.
+
+    Raises:
+        InputError: neither the file nor the caller says what the unit is: it is never guessed.
+    """
+    if distance is not None:
+        if unit is not None:
+            raise InputError("--distance: found --unit, too; expected one of them")
+        return rig.scale(_factor(rig, distance), "mm")
+    stated = unit if unit is not None else rig.unit
+    if stated is None and len(rig.cameras) > 1:
+        raise InputError(
+            f"{where}: the file does not state its unit of length: give it with --unit mm, cm, m, inch, or the length "
+            "of one unit (--unit 417.2mm), or give a known distance of two cameras (--distance NAME NAME MM), to "
+            'imgcal convert; in Python load_rig(..., unit="mm")'
+        )
+    return rig.scale(millimetres(stated or "mm"), "mm")
+
+
+def _factor(rig: ForeignRig, distance: tuple[str, str, float]) -> float:
+    *names, length = distance
+    by_name = {camera.name: camera for camera in rig.cameras}
+    unknown = [name for name in names if name not in by_name]
+    if unknown or names[0] == names[1] or not 1e-3 <= length <= 1e7:
+        raise InputError(
+            f"--distance: found {' '.join(map(shorten, names))} {length:g}, expected two of the "
+            f"{name_cameras(list(by_name))} and millimetres"
+        )
+    apart = float(np.linalg.norm(by_name[names[0]].centre - by_name[names[1]].centre))
+    if apart < 1e-12:
+        raise InputError(f"--distance: {names[0]} and {names[1]} stand at the same place in the file")
+    return length / apart
 
 
 def fill_image_sizes(rig: ForeignRig, where: str, sizes: Mapping[str, tuple[int, int]]) -> ForeignRig:
@@ -73,7 +141,7 @@ def fill_image_sizes(rig: ForeignRig, where: str, sizes: Mapping[str, tuple[int,
 
 
 def fit_to_target(rig: ForeignRig, holds: Holds, title: str, limit: float = LIMIT) -> Held:
-    """Say every lens in a model of the target.
+    """Express every lens in a model of the target.
 
     Raises:
         RefusedError: the target's models are farther than `limit` pixels from a lens, somewhere in its image.
@@ -95,15 +163,32 @@ def fit_to_target(rig: ForeignRig, holds: Holds, title: str, limit: float = LIMI
     return Held(replace(rig, cameras=cameras), tuple(fits))
 
 
+def lens_refusal(camera: ForeignCamera, fit: Fit, title: str, nearest: str, limit: float) -> str:
+    """Explain that no lens of the target comes near enough; `nearest` names the one that comes nearest."""
+    off = f"by {fit.worst:.3g} px" if np.isfinite(fit.worst) else "by any amount in a part of the image"
+    return (
+        f"camera {camera.name}: {title} cannot say its lens ({describe_lens(camera.lens)}): {nearest} is off {off}, "
+        f"more than the limit of {limit:g} px"
+    )
+
+
+def fit_note(camera: ForeignCamera, fit: Fit) -> str:
+    """Describe how well a fitted lens replaces the camera's own."""
+    return (
+        f"camera {camera.name}: {describe_lens(camera.lens)} -> {describe_lens(fit.lens)}, fitted over the image: "
+        f"worst {fit.worst:.2g} px, RMS {fit.rms:.2g} px"
+    )
+
+
 def describe_lens(lens: Lens) -> str:
-    """Say in a few words what a lens is."""
+    """Describe a lens in a few words."""
     kinds = {"opencv": "OpenCV", "fisheye": "fisheye, equidistant", "to_ideal": "image to ideal"}
     skew = ", skewed" if lens.skew else ""
     return f"{kinds[lens.model]}, {lens.length} coefficient{'s' if lens.length != 1 else ''}{skew}"
 
 
 def to_camera_rig(rig: ForeignRig, name: str) -> CameraRig:
-    """Make a `CameraRig` of a rig in millimetres whose lenses it can say (`fit_to_target`); `name` is for one without.
+    """Make a `CameraRig` of a rig in millimetres whose lenses it can store (`fit_to_target`); `name` is the default.
 
     Raises:
         InputError: a value that no rig has.

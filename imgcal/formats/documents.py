@@ -15,10 +15,9 @@ from typing import Any
 from xml.parsers import expat
 
 from imgcal.errors import InputError
-from imgcal.io import is_prose, looks_like, parse_foreign_yaml, read_json
+from imgcal.io import is_prose, looks_like, parse_foreign_yaml, read_bytes, read_json
 from imgcal.messages import quote
 
-MOST_BYTES = 2**26
 MOST_TOML = 2**20  # the parser needs a square of what a hostile one nests; a camera has half a kilobyte
 MOST_DEPTH = 32
 MOST_ELEMENTS = 300_000
@@ -71,21 +70,9 @@ def read_document(path: Path) -> Document:
     return parse_document(read_bytes(path), path)
 
 
-def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
-    """Read a regular file of a bounded size."""
-    if path.exists() and not path.is_file():
-        raise InputError(f"{path}: found a folder, device or pipe, expected a file")
-    try:
-        if path.stat().st_size > most:
-            raise InputError(f"{path}: found {path.stat().st_size:,} bytes, expected at most {most:,}")
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-
-
 def parse_document(content: bytes, path: Path) -> Document:
     """Do the work of `read_document` on what a file holds."""
-    text = _decode_text(content, path)
+    text, _, _ = decode(content, path)
     try:
         return _parse(text, path)
     except InputError:
@@ -162,10 +149,6 @@ class _Builder:
 
     def entity(self, *_: Any) -> None:
         raise InputError(f"{self.where}: found an XML entity, expected plain elements")
-
-
-def _decode_text(content: bytes, path: Path) -> str:
-    return decode(content, path)[0]
 
 
 def decode(content: bytes, path: Path) -> tuple[str, str, bytes]:

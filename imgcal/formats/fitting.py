@@ -1,4 +1,4 @@
-"""A lens in the words of another model: exactly where that can say it, else by a fit over the image."""
+"""A lens in another model: exactly where that can express it, else by a fit over the image."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ GRID = 33  # pixels along each side of the image, border included
 
 @dataclass(frozen=True)
 class Holds:
-    """Which lenses a format can say: how many of OpenCV's coefficients, and whether a fisheye."""
+    """Which lenses a format can store: how many of OpenCV's coefficients, and whether a fisheye."""
 
     opencv: tuple[int, ...] = (5,)  # counts that a file may have, ascending
     fisheye: bool = False
 
     def exactly(self, lens: Lens) -> bool:
-        """Tell whether the lens can be said as it is."""
+        """Tell whether the lens can be stored as it is."""
         if lens.skew or lens.model == "to_ideal":
             return lens.length == 0 and not lens.skew
         return self.fisheye if lens.model == "fisheye" else lens.length <= self.opencv[-1]
@@ -27,7 +27,7 @@ class Holds:
 
 @dataclass(frozen=True)
 class Fit:
-    """A lens of another model, and how well it takes the first one's place over the image."""
+    """A lens of another model, and how well it replaces the first one over the image."""
 
     lens: Lens
     worst: float  # pixels, anywhere in the image; infinite where the other model has no answer
@@ -36,15 +36,15 @@ class Fit:
 
 
 def fit_lens(lens: Lens, image_size: tuple[int, int], holds: Holds) -> Fit:
-    """Say a lens in another model.
+    """Express a lens in another model.
 
     Args:
         lens: what a file states.
         image_size: pixels: width, height, over which the two are to agree.
-        holds: what may be said.
+        holds: which lenses the other side can store.
 
     Returns:
-        The lens itself where it can be said, else that of the model that comes nearest.
+        The lens itself where the model can express it, else the fit of the model that comes nearest.
     """
     if holds.exactly(lens):
         return Fit(replace(lens, model="opencv") if lens.model == "to_ideal" else lens, 0.0, 0.0, True)
@@ -78,17 +78,17 @@ def _judge(lens: Lens, candidate: Lens, image_size: tuple[int, int]) -> Fit:
 def fit_lens_like(
     lens: Lens, image_size: tuple[int, int], like: Lens, one_focal_length: bool = False, limit: float = np.inf
 ) -> Fit:
-    """Say a lens in the model, and with as many coefficients, that another one has.
+    """Express a lens in the model of another one, with as many coefficients.
 
     Args:
-        lens: what is to be said.
+        lens: the lens to express.
         image_size: pixels: width, height, over which the two are to agree.
         like: a lens of the model.
         one_focal_length: fx and fy are one number there.
         limit: pixels; a distortion `to_ideal` keeps its centre at the principal point if that is enough.
 
     Returns:
-        The lens itself where the model can say it, else the nearest one.
+        The lens itself where the model can express it, else the nearest one.
     """
     count = len(like.coefficients)
     sayable = not one_focal_length or lens.focal_length[0] == lens.focal_length[1]

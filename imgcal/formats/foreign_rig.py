@@ -1,4 +1,4 @@
-"""`ForeignRig`: what another tool's file says of a rig, before it is a `CameraRig`."""
+"""`ForeignRig`: what another tool's file says of a rig, before it is a `CameraRig`; and how far two are apart."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from imgcal.errors import InputError
+from imgcal.formats.fitting import pixel_grid
 from imgcal.formats.lens import Array, Lens
 from imgcal.io import RigCovariance
 from imgcal.types import CameraRig
 
+SIDE = 7  # points along each side of an image, its border included
+DEPTHS = (0.5, 1.0, 4.0)  # in units of the rig's size
+
 
 class FormatError(InputError):
-    """Why a file that was recognized holds no calibration; who reads it puts the file and the format before it."""
+    """A recognized file holds no calibration. The reader prepends the file and the format."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +35,7 @@ class Place:
 
 @dataclass(frozen=True)
 class ForeignCamera:
-    """One camera of a file that knows where it stands."""
+    """One camera of a file, with its pose."""
 
     name: str
     lens: Lens
@@ -67,7 +71,7 @@ def unplaced_camera(name: str, lens: Lens, image_size: tuple[int, int] | None) -
 
 @dataclass(frozen=True)
 class ForeignRig:
-    """Cameras in a common frame, as a file of another tool has them."""
+    """Cameras in a common frame, as in another tool's file."""
 
     format: str  # name, as `--from` and `--to` have it
     cameras: tuple[ForeignCamera, ...]
@@ -76,7 +80,7 @@ class ForeignRig:
     notes: tuple[str, ...] = ()  # what was assumed, and what was left out
     covariance: RigCovariance | None = None
     root: int | None = None  # the camera whose frame is the rig's by definition; None = the frame is a world
-    own: CameraRig | None = None  # that it was made of: what other tools have no words for (prior, volume, ...)
+    own: CameraRig | None = None  # what this was made from, for values that other tools lack (prior, volume, ...)
 
     @property
     def names(self) -> list[str]:
@@ -94,3 +98,39 @@ class ForeignRig:
         cameras = [camera.in_frame_of(first) for camera in self.cameras]
         cameras[root] = replace(first, rotation=np.eye(3), translation=np.zeros(3))
         return replace(self, cameras=tuple(cameras), frame=f"camera {first.name}")
+
+
+def known_points(rig: ForeignRig) -> list[Array]:
+    """Points in front of each camera, all over its image at three depths: (N, 3) in the rig's frame, one array each.
+
+    Pixels that a lens has no ray for (beyond its fold) give none.
+    """
+    centres = np.array([camera.centre for camera in rig.cameras])
+    size = float(np.linalg.norm(centres - centres.mean(axis=0), axis=-1).max()) or 1000.0
+    found = []
+    for camera in rig.cameras:
+        assert camera.image_size is not None
+        rays = camera.lens.rays(pixel_grid(camera.image_size, SIDE))
+        rays = rays[np.isfinite(rays).all(axis=-1)]
+        points_cam = np.concatenate([rays * depth * size for depth in DEPTHS])
+        found.append((points_cam - camera.translation) @ camera.rotation)
+    return found
+
+
+def worst_difference(rig: ForeignRig, other: ForeignRig) -> tuple[float, int]:
+    """Compare two rigs in the same unit, with cameras in the same order, by the pixels of known points.
+
+    The rig's frame is free: points are taken from one to the other through the first camera.
+
+    Returns:
+        The largest distance in pixels over all known points and cameras, and the number of points.
+    """
+    first, same = rig.cameras[0], other.cameras[0]
+    worst, count = 0.0, 0
+    for camera, counterpart, points in zip(rig.cameras, other.cameras, known_points(rig), strict=True):
+        in_first = first.in_camera(points)
+        there = (in_first - same.translation) @ same.rotation
+        away = np.linalg.norm(counterpart.project(there) - camera.project(points), axis=-1)
+        worst = max(worst, float(np.where(np.isfinite(away), away, np.inf).max(initial=0.0)))
+        count += len(points)
+    return worst, count

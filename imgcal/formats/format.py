@@ -1,4 +1,4 @@
-"""What a format is to the rest of the room."""
+"""`Format`: what each module of a format provides."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ Files = dict[str, bytes]
 
 @dataclass(frozen=True)
 class Format:
-    """A way of another tool to write a rig down."""
+    """A file format of another tool."""
 
     name: str  # as in `--from` and `--to`
     title: str  # as people call it
     recognizes: Callable[[Source], bool]
     read: Callable[[Source], ForeignRig]
     write: Callable[[ForeignRig], Files] | None = None  # in `unit`; None = read only
-    holds: Holds = Holds()  # which lenses it can say
-    accepts: Callable[[Source], bool] | None = None  # who may be one when the user says so; None = who is recognized
+    holds: Holds = Holds()  # which lenses it can store
+    accepts: Callable[[Source], bool] | None = None  # what to read if the user names the format; None = `recognizes`
     unit: str = "m"  # of what is written
     states_unit: bool = False  # the file, or the tool's custom, says what its unit is
     from_first: bool = False  # its rig frame is its first camera's

@@ -7,11 +7,10 @@ from pathlib import Path
 
 from imgcal import io
 from imgcal.errors import InputError
-from imgcal.formats.conversion import NATIVE, fill_image_sizes, fit_to_target, to_camera_rig
+from imgcal.formats.conversion import NATIVE, fill_image_sizes, fit_to_target, in_millimetres, to_camera_rig
 from imgcal.formats.foreign_rig import ForeignRig
 from imgcal.formats.limits import LIMIT
 from imgcal.formats.registry import is_foreign, read_foreign_lenses, read_foreign_rig
-from imgcal.formats.units import in_millimetres
 from imgcal.types import CameraRig
 
 Size = tuple[int, int]
@@ -27,7 +26,7 @@ def load_rig(
 ) -> CameraRig:
     """Read a rig: a YAML file of our own, the bare name of a shipped rig, or a calibration of another tool.
 
-    What kind a file is, its content says: OpenCV, Kalibr, ROS, anipose, caliscope, FreeMoCap, Pose2Sim, COLMAP,
+    The format is recognized by content: OpenCV, Kalibr, ROS, anipose, caliscope, FreeMoCap, Pose2Sim, COLMAP,
     multical, mrcal, EasyMocap, PyMVG, Qualisys, Motive and Vicon are known (docs/formats.md).
 
     Args:
@@ -97,7 +96,7 @@ def load_cameras(
 def _convert_lenses(
     rig: ForeignRig, path: Path, image_size: Size | Mapping[str, Size] | None, fit_limit: float
 ) -> CameraRig:
-    """Say a rig in lenses of ours, its image sizes filled in."""
+    """Express a rig in our lens models, with its image sizes filled in."""
     sizes = image_size if isinstance(image_size, Mapping) else {} if image_size is None else {"": image_size}
     held = fit_to_target(fill_image_sizes(rig, str(path), sizes), NATIVE, "a rig of ours", fit_limit)
     return to_camera_rig(held.rig, io.title_from_name(path if path.is_file() else path.resolve()))

@@ -16,7 +16,7 @@ from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, P
 from imgcal.formats.format import Format
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
-from imgcal.formats.values import focal_length, image_size, name_cameras, nearest_rotation, number
+from imgcal.formats.values import attribute, focal_length, image_size, name_cameras, nearest_rotation, number
 
 TITLE = "OptiTrack Motive calibration (.mcal)"
 COEFFICIENTS = ("k1", "k2", "TangentialX", "TangentialY", "k3")  # in OpenCV's order
@@ -55,9 +55,7 @@ def _read(source: Source) -> ForeignRig:
 
 def _camera(name: str, element: Element, pose: Element, model: Element, path: Path) -> ForeignCamera:
     def get(of: Element, key: str) -> float:
-        if key not in of.attributes:
-            raise FormatError(f"{name}: no {key}")
-        return number(of.attributes[key], f"{name}: {key}")
+        return number(attribute(of, key, name), f"{name}: {key}")
 
     focal = focal_length(get(model, "HorizontalFocalLength"), get(model, "VerticalFocalLength"), name)
     ks = [get(model, key) for key in COEFFICIENTS]
@@ -74,17 +72,14 @@ def _camera(name: str, element: Element, pose: Element, model: Element, path: Pa
 
 
 def _places(path: Path, pose: Element, model: Element) -> tuple[Place, ...]:
-    def entry(values: places.Numbers, place: int) -> places.Numbers:
-        return lambda camera: [values(camera)[place]]
-
     def orientation(camera: ForeignCamera) -> list[float]:
-        return [float(value) for value in (UPWARD @ camera.rotation).T.ravel()]
+        return (UPWARD @ camera.rotation).T.ravel().tolist()
 
     keys = ("HorizontalFocalLength", "VerticalFocalLength", "LensCenterX", "LensCenterY")
-    inside = {key: entry(places.focal_and_centre, place) for place, key in enumerate(keys)}
-    inside |= {key: entry(places.coefficients(5), place) for place, key in enumerate(COEFFICIENTS)}
-    outside = {axis: entry(places.centre, place) for place, axis in enumerate("XYZ")}
-    outside |= {f"OrientMatrix{place}": entry(orientation, place) for place in range(9)}
+    inside = {key: places.entry(places.focal_and_centre, place) for place, key in enumerate(keys)}
+    inside |= {key: places.entry(places.coefficients(5), place) for place, key in enumerate(COEFFICIENTS)}
+    outside = {axis: places.entry(places.centre, place) for place, axis in enumerate("XYZ")}
+    outside |= {f"OrientMatrix{place}": places.entry(orientation, place) for place in range(9)}
     return (*places.attributes(path, pose, outside), *places.attributes(path, model, inside))
 
 

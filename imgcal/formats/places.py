@@ -26,12 +26,17 @@ def attributes(path: Path, element: Element | None, numbers: Mapping[str, Number
 
 def camera_matrix(camera: ForeignCamera) -> list[float]:
     """K, row by row."""
-    return [float(value) for value in camera.lens.matrix.ravel()]
+    return camera.lens.matrix.ravel().tolist()
 
 
 def focal_and_centre(camera: ForeignCamera) -> list[float]:
     """Fx, fy, cx, cy."""
     return [*camera.lens.focal_length, *camera.lens.principal_point]
+
+
+def entry(numbers: Numbers, place: int, factor: float = 1.0, shift: float = 0.0) -> Numbers:
+    """One of several numbers, shifted and then scaled."""
+    return lambda camera: [(numbers(camera)[place] + shift) * factor]
 
 
 def coefficients(count: int) -> Numbers:
@@ -41,17 +46,17 @@ def coefficients(count: int) -> Numbers:
 
 def translation(camera: ForeignCamera) -> list[float]:
     """Of cam_from_rig."""
-    return [float(value) for value in camera.translation]
+    return camera.translation.tolist()
 
 
 def centre(camera: ForeignCamera) -> list[float]:
     """Where the camera stands."""
-    return [float(value) for value in camera.centre]
+    return camera.centre.tolist()
 
 
 def rotation_matrix(camera: ForeignCamera) -> list[float]:
     """Of cam_from_rig, row by row."""
-    return [float(value) for value in camera.rotation.ravel()]
+    return camera.rotation.ravel().tolist()
 
 
 def rotation_like(found: Sequence[float]) -> Numbers:
@@ -63,7 +68,7 @@ def rotation_like(found: Sequence[float]) -> Numbers:
         made = vector_from_rotation(camera.rotation)
         angle = float(np.linalg.norm(made))
         turns = [made * (1 + 2 * np.pi * n / angle) for n in (-1, 0, 1)] if angle > 1e-9 else [made]
-        return [float(value) for value in min(turns, key=lambda one: float(np.linalg.norm(one - np.array(found))))]
+        return min(turns, key=lambda one: float(np.linalg.norm(one - np.array(found)))).tolist()
 
     return vector
 
@@ -76,12 +81,12 @@ def seven(camera: ForeignCamera) -> list[float]:
 def near_quaternion(rotation: Array, wxyz: Sequence[float]) -> list[float]:
     """A rotation's quaternion w, x, y, z with the sign of the one in the file."""
     made = quaternion_from_rotation(rotation)
-    return [float(value) for value in (made if made @ np.array(wxyz) >= 0 else -made)]
+    return (made if made @ np.array(wxyz) >= 0 else -made).tolist()
 
 
 def matrix_rows(camera: ForeignCamera) -> list[float]:
     """Of cam_from_rig: rotation and translation, (3, 4) row by row."""
-    return [float(value) for value in np.column_stack((camera.rotation, camera.translation)).ravel()]
+    return np.column_stack((camera.rotation, camera.translation)).ravel().tolist()
 
 
 def carry_pose(before: Pose, pose: Pose, numbers: Numbers) -> Numbers:
@@ -103,5 +108,4 @@ def carry_pose(before: Pose, pose: Pose, numbers: Numbers) -> Numbers:
 
 def inverse_rows(camera: ForeignCamera) -> list[float]:
     """Of rig_from_cam: rotation and translation, (3, 4) row by row."""
-    turned, moved = inverse((camera.rotation, camera.translation))
-    return [float(value) for value in np.column_stack((turned, moved)).ravel()]
+    return np.column_stack(inverse((camera.rotation, camera.translation))).ravel().tolist()

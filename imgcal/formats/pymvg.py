@@ -62,13 +62,13 @@ def _camera(entry: dict[str, Any], place: int, path: Path) -> ForeignCamera:
     size = image_size([entry.get("width") or 0, entry.get("height") or 0], f"{name}: width, height")
 
     def projection(camera: ForeignCamera) -> list[float]:
-        return [float(v) for v in np.column_stack((camera.lens.matrix, camera.lens.matrix @ shift)).ravel()]
+        return np.column_stack((camera.lens.matrix, camera.lens.matrix @ shift)).ravel().tolist()
 
     values: dict[str, places.Numbers] = {
         "K": places.camera_matrix,
         "D": places.coefficients(len(lens.coefficients)),
-        "Q": lambda camera: [float(value) for value in (rectified @ camera.rotation).ravel()],
-        "translation": lambda camera: [float(value) for value in rectified @ camera.translation - shift],
+        "Q": lambda camera: (rectified @ camera.rotation).ravel().tolist(),
+        "translation": lambda camera: (rectified @ camera.translation - shift).tolist(),
     }
     if p is not None and np.allclose(p[:, :3], lens.matrix, rtol=1e-9):
         values["P"] = projection

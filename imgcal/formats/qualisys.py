@@ -16,7 +16,7 @@ from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
 from imgcal.formats.format import Format
 from imgcal.formats.lens import Array, Lens
 from imgcal.formats.source import Source
-from imgcal.formats.values import focal_length, name_cameras, nearest_rotation, number
+from imgcal.formats.values import attribute, focal_length, name_cameras, nearest_rotation, number
 
 TITLE = "Qualisys calibration"
 FRACTION = 64.0
@@ -57,9 +57,8 @@ def _read(source: Source) -> ForeignRig:
         notes.append(f"{name_cameras(lost)}: left out, not active or not calibrated")
     if turned:
         notes.append(
-            f"{name_cameras(turned)}: mounted turned (viewrotation): the numbers are those of the sensor's own "
-            "image, before "
-            "a video is turned upright"
+            f"{name_cameras(turned)}: mounted turned (viewrotation): the numbers are those of the sensor's own image, "
+            "before a video is turned upright"
         )
     return ForeignRig(FORMAT.name, tuple(cameras), "mm", "QTM's world (z up)", tuple(notes))
 
@@ -68,9 +67,7 @@ def _camera(
     name: str, element: Element, transform: Element, intrinsic: Element, path: Path
 ) -> tuple[ForeignCamera, bool]:
     def get(key: str, of: Element = intrinsic) -> float:
-        if key not in of.attributes:
-            raise FormatError(f"{name}: no {key}")
-        return number(of.attributes[key], f"{name}: {key}")
+        return number(attribute(of, key, name), f"{name}: {key}")
 
     view = element.find("fov_video") or element.find("fov_marker") or element.find("fov_video_max")
     span = get("sensorMaxU") - get("sensorMinU"), get("sensorMaxV") - get("sensorMinV")
@@ -93,25 +90,22 @@ def _camera(
     axes = nearest_rotation(axes, f"{name}: transform")
     rotation, translation = (axes, place) if plain else (UPWARD @ axes, -UPWARD @ axes @ place)
 
-    def number_of(values: places.Numbers, place: int, factor: float = 1.0, shift: float = 0.0) -> places.Numbers:
-        return lambda camera: [(values(camera)[place] + shift) * factor]
-
     def axes_of(camera: ForeignCamera) -> list[float]:
-        return [float(value) for value in (camera.rotation if plain else UPWARD @ camera.rotation).ravel()]
+        return (camera.rotation if plain else UPWARD @ camera.rotation).ravel().tolist()
 
-    inside = {key: number_of(places.coefficients(5), which) for which, key in enumerate(keys)}
+    inside = {key: places.entry(places.coefficients(5), which) for which, key in enumerate(keys)}
     for which, (key, shift) in enumerate(
         (("focalLengthU", 0.0), ("focalLengthV", 0.0), ("centerPointU", left), ("centerPointV", top))
     ):
-        inside[key] = number_of(places.focal_and_centre, which, fraction, shift)
+        inside[key] = places.entry(places.focal_and_centre, which, fraction, shift)
     inside["skew"] = lambda camera: [camera.lens.skew * fraction]
     if "focallength" in intrinsic.attributes:
         millimetres = get("focallength") / focal[0]
-        inside["focallength"] = number_of(places.focal_and_centre, 0, millimetres)
+        inside["focallength"] = places.entry(places.focal_and_centre, 0, millimetres)
     outside = {
-        axis: number_of(places.translation if plain else places.centre, which) for which, axis in enumerate("xyz")
+        axis: places.entry(places.translation if plain else places.centre, which) for which, axis in enumerate("xyz")
     }
-    outside |= {f"r{which // 3 + 1}{which % 3 + 1}": number_of(axes_of, which) for which in range(9)}
+    outside |= {f"r{which // 3 + 1}{which % 3 + 1}": places.entry(axes_of, which) for which in range(9)}
     found = (*places.attributes(path, transform, outside), *places.attributes(path, intrinsic, inside))
     return ForeignCamera(name, lens, (round(width), round(height)), rotation, translation, found), plain
 

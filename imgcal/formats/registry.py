@@ -3,33 +3,31 @@
 from __future__ import annotations
 
 import re
+import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from imgcal.errors import InputError
 from imgcal.formats import (
-    anipose,
-    caliscope,
     colmap_binary,
     colmap_text,
     easymocap,
-    freemocap,
     kalibr,
     motive,
     mrcal,
     multical,
     opencv_multiview,
     opencv_stereo,
-    pose2sim,
     pymvg,
     qualisys,
     ros_camera_info,
+    toml_cameras,
     vicon,
 )
 from imgcal.formats.file_storage import is_matrix, merge_storages
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
-from imgcal.formats.format import Format
+from imgcal.formats.format import Files, Format
 from imgcal.formats.source import Source
 from imgcal.io import is_file_name
 from imgcal.types import limits
@@ -46,11 +44,11 @@ FORMATS = (  # asked in this order: who knows a file by more comes before who kn
     multical.FORMAT,
     mrcal.FORMAT,
     colmap_text.CONFIG,
-    freemocap.FORMAT,
-    caliscope.FORMAT,
-    caliscope.OLD_FORMAT,
-    pose2sim.FORMAT,
-    anipose.FORMAT,
+    toml_cameras.FREEMOCAP,
+    toml_cameras.CALISCOPE,
+    toml_cameras.OLD_CALISCOPE,
+    toml_cameras.POSE2SIM,
+    toml_cameras.ANIPOSE,
     qualisys.FORMAT,
     motive.FORMAT,
     vicon.FORMAT,
@@ -97,6 +95,22 @@ def read_foreign_lenses(path: str | Path, name: str | None = None) -> ForeignRig
     return _read(source, replace(one, read=lambda found: ForeignRig(one.name, tuple(read(found)), None, "unknown")))
 
 
+def read_back(files: Files, name: str, rig: str | None = None) -> ForeignRig:
+    """Read files that are not written yet; arguments as for `read_foreign_rig`.
+
+    Raises:
+        FormatError: they cannot be read.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(folder) / (file or "calibration.txt") for file in files]
+        for path, content in zip(paths, files.values(), strict=True):
+            path.write_bytes(content)
+        try:
+            return read_foreign_rig(paths[0] if len(paths) == 1 else folder, name, rig)
+        except InputError as error:
+            raise FormatError(f"what was written cannot be read back: {str(error).replace(folder, '')}") from error
+
+
 def find_format(name: str) -> Format:
     """Find a format by its name.
 
@@ -126,7 +140,7 @@ def recognize_format(source: Source) -> Format:
 
 
 def _check_requested(source: Source, one: Format) -> Format:
-    """A format that the user names instead of the content: the file must be able to be one."""
+    """Check that a file can be of the format that the user names."""
     try:
         if (one.accepts or one.recognizes)(source):
             return one
@@ -136,7 +150,7 @@ def _check_requested(source: Source, one: Format) -> Format:
 
 
 def _other(source: Source) -> str:
-    """Which format it is instead, in words; empty where it is none."""
+    """Name the format that it is instead; empty if none."""
     try:
         found = recognize_format(source)
     except InputError:
@@ -156,7 +170,7 @@ def is_foreign(path: Path) -> bool:
 
 
 def _instead(source: Source) -> str:
-    """What a source without a rig is, as far as can be told."""
+    """Explain what a source without a rig is, as far as it can be recognized."""
     values = merge_storages(source)
     if is_matrix(values.get("camera_matrix")) or is_matrix(values.get("cameraMatrix")) or is_matrix(values.get("K")):
         return (

@@ -16,7 +16,7 @@ SUFFIXES = frozenset(
     (".yaml", ".yml", ".toml", ".json", ".xml", ".txt", ".mcal", ".xcp", ".cameramodel", ".calib", ".qca")
 )
 PARTNERS = (("intrinsics", "extrinsics"), ("intri", "extri"))
-"""Two files that are one calibration: who gives one means both."""
+"""Two files that make up one calibration: if one is given, the other is read, too."""
 
 COLMAP_FILES = frozenset(
     f"{stem}.{suffix}" for stem in ("cameras", "images", "rigs", "frames") for suffix in ("txt", "bin")
@@ -38,7 +38,7 @@ class Source:
         """
         self.rig = rig
         self.where = quote(", ".join(map(str, paths)))
-        self.alone = False  # one file, whose faults are the user's to know
+        self.alone = False  # one file, whose faults the user must hear about
         self.files: list[Path] = []
         for number, path in enumerate(paths):
             if path in paths[:number]:

@@ -1,4 +1,12 @@
-"""What anipose, Pose2Sim, FreeMoCap and caliscope have in common: a TOML table for each camera. X_cam = R X + t."""
+"""anipose, Pose2Sim, FreeMoCap and caliscope: a TOML table for each camera. X_cam = R X + t.
+
+anipose's `calibration.toml` has [cam_N] in the unit of the board's squares, which the file does not say. Pose2Sim's
+`Calib*.toml` has exactly four coefficients, in metres. FreeMoCap's `*_camera_calibration.toml` has anipose's tables in
+millimetres, with the cameras' places written out, too; FreeMoCap reads four coefficients and drops the fifth, so none
+is written. caliscope's `camera_array.toml` has [cameras.N], its older `config.toml` has [cam_N]; metres. Its rotations
+are matrices in the older files and rotation vectors in the newer ones, and poses that were never calibrated are absent
+or the text "null".
+"""
 
 from __future__ import annotations
 
@@ -9,13 +17,27 @@ from typing import Any
 import numpy as np
 
 from imgcal.formats import places
-from imgcal.formats.foreign_rig import ForeignCamera, FormatError, Place, unplaced_camera
+from imgcal.formats.fitting import Holds
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place, unplaced_camera
+from imgcal.formats.format import Files, Format
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
-from imgcal.formats.values import array, camera_matrix, coefficients, image_size, name_cameras, numbers, rotation, text
+from imgcal.formats.values import (
+    array,
+    camera_matrix,
+    coefficients,
+    image_size,
+    name_cameras,
+    number,
+    numbers,
+    rotation,
+    text,
+    vector_from_rotation,
+)
 from imgcal.messages import list_names
 
 Table = dict[str, Any]
+WORLD = ("world_position", "world_orientation")  # what FreeMoCap adds to a pose
 AT = ""  # the key of a table under which it is kept where it stands: path and keys
 
 
@@ -54,6 +76,13 @@ def find_tables(source: Source) -> Tables | None:
 def has_tables(source: Source) -> bool:
     """Tell whether there are tables of cameras: whose they are is then a question of details."""
     return find_tables(source) is not None
+
+
+def _tables(source: Source) -> Tables:
+    """The tables of a source that has some."""
+    tables = find_tables(source)
+    assert tables is not None
+    return tables
 
 
 def is_camera(value: Any) -> bool:
@@ -108,6 +137,10 @@ def camera_name(key: str, table: Table) -> str:
     return text(name, key)
 
 
+def _read_lenses(source: Source) -> list[ForeignCamera]:
+    return read_all_lenses(_tables(source).cameras)
+
+
 def read_all_lenses(tables: Mapping[str, Table]) -> list[ForeignCamera]:
     """Read all cameras as if none had a pose: all are at the origin.
 
@@ -145,7 +178,7 @@ def _places(camera: ForeignCamera, table: Table) -> tuple[Place, ...]:
     }
     copies: dict[str, places.Numbers] = {
         "world_position": places.centre,
-        "world_orientation": lambda one: [float(value) for value in one.rotation.T.ravel()],
+        "world_orientation": lambda one: one.rotation.T.ravel().tolist(),
     }
     for key, of in copies.items():
         found = numbers(table[key], key) if isinstance(table.get(key), list) else []
@@ -188,3 +221,160 @@ def _value(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_value, value))}]"
     return repr(value)
+
+
+def camera_table(camera: ForeignCamera, coefficients: int = 5) -> Table:
+    """One camera as anipose and its kin write it."""
+    fisheye = camera.lens.model == "fisheye"
+    return {
+        "name": camera.name,
+        "size": list(camera.image_size or ()),
+        "matrix": camera.lens.matrix.tolist(),
+        "distortions": camera.lens.pad(4 if fisheye else coefficients),
+        "rotation": vector_from_rotation(camera.rotation).tolist(),
+        "translation": camera.translation.tolist(),
+        "fisheye": fisheye,
+    }
+
+
+def _read_anipose(source: Source) -> ForeignRig:
+    notes: list[str] = []
+    cameras = read_cameras(_tables(source).cameras, notes)
+    return ForeignRig(ANIPOSE.name, cameras, None, "the file's world (anipose: near the first camera)", tuple(notes))
+
+
+def _write_anipose(rig: ForeignRig) -> Files:
+    tables = {f"cam_{number}": camera_table(camera) for number, camera in enumerate(rig.cameras)}
+    return {"": toml_text({**tables, "metadata": {"adjusted": False, "error": 0.0}})}
+
+
+def _is_pose2sim(source: Source) -> bool:
+    tables = find_tables(source)
+    if tables is None or any("rotation_count" in table for table in tables.cameras.values()):
+        return False
+    # Anipose writes five, of a fisheye four as well.
+    counts = {len(numbers(table.get("distortions", []), "distortions")) for table in tables.cameras.values()}
+    fisheyes = [table.get("fisheye") is True for table in tables.cameras.values()]
+    return counts == {4} and not all(fisheyes)
+
+
+def _read_pose2sim(source: Source) -> ForeignRig:
+    notes = ["four coefficients in each camera: Pose2Sim's, in metres, z up"]
+    cameras = read_cameras(_tables(source).cameras, notes)
+    return ForeignRig(POSE2SIM.name, cameras, "m", "the file's world (z up)", tuple(notes))
+
+
+def _write_pose2sim(rig: ForeignRig) -> Files:
+    tables = {toml_key(camera.name): camera_table(camera, coefficients=4) for camera in rig.cameras}
+    return {"": toml_text({**tables, "metadata": {"adjusted": False, "error": 0.0}})}
+
+
+def _is_freemocap(source: Source) -> bool:
+    tables = find_tables(source)
+    return tables is not None and any(key in table for table in tables.cameras.values() for key in WORLD)
+
+
+def _read_freemocap(source: Source) -> ForeignRig:
+    tables = _tables(source)
+    notes = ["millimetres, as FreeMoCap's boards are measured"]
+    cameras = read_cameras(tables.cameras, notes)
+    plane = tables.metadata.get("groundplane_applied") or "groundplane_calibration" in tables.metadata
+    if plane:
+        notes.append("the world is the board that lay on the ground")
+    frame = "the board on the ground" if plane else "the file's world (near the first camera, or the board)"
+    if any(camera.lens.length == 5 for camera in cameras):
+        notes.append("FreeMoCap itself drops k3 when it reads this file; here it counts")
+    return ForeignRig(FREEMOCAP.name, cameras, "mm", frame, tuple(notes))
+
+
+def _write_freemocap(rig: ForeignRig) -> Files:
+    tables = {}
+    for place, camera in enumerate(rig.cameras):
+        world = dict(zip(WORLD, (camera.centre.tolist(), camera.rotation.T.tolist()), strict=True))
+        tables[toml_key(camera.name)] = camera_table(camera) | {"id": camera.name, "index": place} | world
+    return {"": toml_text({**tables, "metadata": {"groundplane_applied": False}})}
+
+
+def _is_caliscope(source: Source) -> bool:
+    tables = find_tables(source)
+    return tables is not None and any("rotation_count" in table for table in tables.cameras.values())
+
+
+def _read_caliscope(source: Source) -> ForeignRig:
+    tables = _caliscope_tables(source)
+    ignored = [name for name, table in tables.items() if table.get("ignore") is True]
+    notes = ["metres"]
+    cameras = read_cameras(tables, notes)
+    if kept := [name for name in ignored if name in [camera.name for camera in cameras]]:
+        notes.append(f"{name_cameras(kept)}: marked `ignore` in the file; used all the same, with the pose it has")
+    return ForeignRig(CALISCOPE.name, cameras, "m", "the file's world (as set in caliscope)", tuple(notes))
+
+
+def _read_caliscope_lenses(source: Source) -> list[ForeignCamera]:
+    return read_all_lenses(_caliscope_tables(source))
+
+
+def _caliscope_tables(source: Source) -> dict[str, Table]:
+    """The tables by the names of the cameras.
+
+    Raises:
+        FormatError: images were turned.
+    """
+    found: dict[str, Table] = {}
+    turned = []
+    for key, table in _tables(source).cameras.items():
+        name = text(table.get("cam_id", table.get("port", key.removeprefix("cam_"))), key)
+        found[name] = {**table, "name": name}
+        if number(table.get("rotation_count", 0), f"{name}: rotation_count") % 4:
+            turned.append(name)
+    if turned:
+        raise FormatError(
+            f"{name_cameras(turned)}: rotation_count is not 0: the images were turned before they were used, and the "
+            "file does not say what K then refers to; turn the videos, and calibrate again"
+        )
+    return found
+
+
+def _write_caliscope(rig: ForeignRig) -> Files:
+    tables = _numbered_tables(rig)
+    return {"": toml_text({f"cameras.{key}": table for key, table in tables.items()})}
+
+
+def _write_old_caliscope(rig: ForeignRig) -> Files:
+    tables = zip(_numbered_tables(rig).items(), rig.cameras, strict=True)
+    matrices = {f"cam_{key}": table | {"rotation": camera.rotation.tolist()} for (key, table), camera in tables}
+    return {"": toml_text(matrices)}
+
+
+def _numbered_tables(rig: ForeignRig) -> dict[int, Table]:
+    """Caliscope's cameras are numbers: those of the names where all are, else 0, 1, 2, ..."""
+    plain = all(name.isascii() and name.isdigit() and str(int(name)) == name for name in rig.names)
+    own = {"rotation_count": 0, "error": 0.0, "grid_count": 0, "ignore": False}
+    names = ("size", "matrix", "distortions", "fisheye", "translation", "rotation")
+    tables: dict[int, Table] = {}
+    for place, camera in enumerate(rig.cameras):
+        key, table = int(camera.name) if plain else place, camera_table(camera)
+        tables[key] = {"cam_id": key, **own, **{name: table[name] for name in names}}
+    return tables
+
+
+ANIPOSE = Format(
+    "anipose", "anipose calibration.toml", has_tables, _read_anipose, _write_anipose, Holds((5,), fisheye=True),
+    unit="mm", read_lenses=_read_lenses,
+)  # fmt: skip
+POSE2SIM = Format(
+    "pose2sim", "Pose2Sim Calib.toml", _is_pose2sim, _read_pose2sim, _write_pose2sim, Holds((4,), fisheye=True),
+    accepts=has_tables, states_unit=True, read_lenses=_read_lenses,
+)  # fmt: skip
+FREEMOCAP = Format(
+    "freemocap", "FreeMoCap camera calibration", _is_freemocap, _read_freemocap, _write_freemocap, Holds((4,)),
+    unit="mm", accepts=has_tables, states_unit=True, read_lenses=_read_lenses,
+)  # fmt: skip
+CALISCOPE = Format(
+    "caliscope", "caliscope camera array", _is_caliscope, _read_caliscope, _write_caliscope,
+    Holds((5,), fisheye=True), accepts=has_tables, states_unit=True, read_lenses=_read_caliscope_lenses,
+)  # fmt: skip
+OLD_CALISCOPE = Format(
+    "caliscope-config", "caliscope config.toml (older)", lambda source: False, _read_caliscope, _write_old_caliscope,
+    Holds((5,), fisheye=True), accepts=has_tables, states_unit=True, read_lenses=_read_caliscope_lenses,
+)  # fmt: skip

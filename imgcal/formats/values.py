@@ -8,16 +8,16 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from imgcal.formats.documents import Element
 from imgcal.formats.foreign_rig import FormatError
 from imgcal.formats.lens import Array
 from imgcal.messages import shorten
 from imgcal.types import limits
 
 LARGEST = 1e12
-MOST_COEFFICIENTS = 14
 LOOSEST = 5e-3  # how far the columns of a rotation may be from orthonormal: three digits
-EXACT = 1e-6  # beyond, the file's rotation has been rounded, and that is said
 
 
 def number(value: Any, what: str) -> float:
@@ -124,60 +124,33 @@ def rotation(value: Any, what: str) -> Array:
 
 def rotation_from_vector(vector: Array) -> Array:
     """The rotation matrix of a rotation vector in rad."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3) + cross(vector)
-    axis = vector / angle
-    return np.asarray(
-        np.cos(angle) * np.eye(3) + np.sin(angle) * cross(axis) + (1 - np.cos(angle)) * np.outer(axis, axis)
-    )
+    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 
 def vector_from_rotation(matrix: Array) -> Array:
     """The rotation vector in rad of a rotation matrix; of a half turn, too."""
-    w, x, y, z = quaternion_from_rotation(matrix)
-    axis = np.array([x, y, z])
-    sine = float(np.linalg.norm(axis))
-    if sine < 1e-15:
-        return 2 * axis
-    return axis * (2 * math.atan2(sine, w) / sine)
+    return np.asarray(Rotation.from_matrix(matrix).as_rotvec())
 
 
 def rotation_from_quaternion(value: Any, what: str) -> Array:
     """The rotation matrix of a Hamilton quaternion w, x, y, z, which is normalized first."""
-    q = array(value, (4,), what)
-    length = float(np.linalg.norm(q))
+    w, *xyz = array(value, (4,), what).tolist()
+    length = math.hypot(w, *xyz)
     if not 0.5 < length < 2:
         raise FormatError(f"{what}: found a quaternion of length {length:g}, expected 1")
-    w, x, y, z = q / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.asarray(Rotation.from_quat([*xyz, w]).as_matrix())
 
 
 def quaternion_from_rotation(matrix: Array) -> Array:
-    """The Hamilton quaternion w, x, y, z with w >= 0: the eigenvector that is stable at every angle."""
-    (a, b, c), (d, e, f), (g, h, i) = matrix
-    symmetric = np.array(
-        [
-            [a + e + i, h - f, c - g, d - b],
-            [h - f, a - e - i, b + d, c + g],
-            [c - g, b + d, e - a - i, f + h],
-            [d - b, c + g, f + h, i - a - e],
-        ]
-    )
-    q = np.linalg.eigh(symmetric)[1][:, -1]
-    return np.asarray(q if q[0] >= 0 else -q)
+    """The Hamilton quaternion w, x, y, z with w >= 0."""
+    return np.roll(Rotation.from_matrix(matrix).as_quat(canonical=True), 1)
 
 
-def cross(vector: Array) -> Array:
-    """The matrix that multiplies from the left as the cross product does."""
-    x, y, z = vector
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+def attribute(element: Element, key: str, name: str) -> str:
+    """The text of an attribute that a camera of a name must have."""
+    if key not in element.attributes:
+        raise FormatError(f"{name}: no {key}")
+    return element.attributes[key]
 
 
 def mapping(value: Any, what: str) -> dict[str, Any]:

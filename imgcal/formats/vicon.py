@@ -18,6 +18,7 @@ from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
 from imgcal.formats.values import (
     array,
+    attribute,
     focal_length,
     image_size,
     name_cameras,
@@ -64,9 +65,7 @@ def _read(source: Source) -> ForeignRig:
 
 def _camera(name: str, element: Element, frame: Element, path: Path) -> ForeignCamera:
     def get(key: str) -> str:
-        if key not in frame.attributes:
-            raise FormatError(f"{name}: no {key}")
-        return frame.attributes[key]
+        return attribute(frame, key, name)
 
     aspect = number(element.attributes.get("PIXEL_ASPECT_RATIO", "1"), f"{name}: PIXEL_ASPECT_RATIO")
     if not 0.1 <= aspect <= 10:

@@ -1,8 +1,7 @@
-"""A recalibrated rig in the user's own file: its numbers replaced, and read back before anybody gets it."""
+"""Write a recalibrated rig into the user's own file: replace its numbers, and read them back before writing."""
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -11,17 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.formats.conversion import describe_lens
-from imgcal.formats.documents import read_bytes
+from imgcal.formats.conversion import fit_note, lens_refusal, millimetres
 from imgcal.formats.fitting import Fit, fit_lens_like
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, worst_difference
 from imgcal.formats.limits import LIMIT
 from imgcal.formats.patching import Change, TextFile, patch_bytes
-from imgcal.formats.registry import find_format, is_foreign, read_foreign_rig
+from imgcal.formats.registry import find_format, is_foreign, read_back, read_foreign_rig
 from imgcal.formats.source import SUFFIXES, Source
-from imgcal.formats.units import millimetres
 from imgcal.formats.values import name_cameras
-from imgcal.formats.verification import worst_difference
+from imgcal.io import read_bytes
 
 DIGITS = (0, 9, 12, 17)  # tried in this order: those of the file first
 ROUNDING = 1e-3  # px that the digits of a file may cost: a hundredth of how well markers are measured
@@ -31,7 +28,7 @@ STAYED = 1e-6  # px: a camera that is off by less from what the file says has no
 
 @dataclass(frozen=True)
 class Updated:
-    """The files of a calibration with other numbers, and how well they say the rig."""
+    """The files of a calibration with new numbers, and how well they represent the rig."""
 
     files: dict[str, bytes]
     title: str  # of the format
@@ -39,7 +36,7 @@ class Updated:
     changed: tuple[str, ...]  # cameras
     kept: tuple[str, ...]  # cameras that stayed as they were
     reread: float  # px, of what is read back against what was to be written
-    loss: Fit | None  # of the lens that is said worst; None = all are exact
+    loss: Fit | None  # of the lens that fits worst; None = all are exact
     points: int  # known points that were compared
 
 
@@ -66,7 +63,7 @@ def write_into(
 
     Raises:
         InputError: one line: the files cannot be read or are our own, have other cameras, or cannot be followed.
-        RefusedError: the file's lens model comes not near enough.
+        RefusedError: the file's lens model does not come near enough.
     """
     where = ", ".join(map(str, original))
     for path in original:
@@ -123,7 +120,9 @@ def _written(
     sized = _fill_sizes(wanted, rig)
     for digits in DIGITS:
         files, stamps = _patch(contents, changes, digits, now)
-        back = _read_back(files, old, original_rig)
+        back = read_back(files, old.format, original_rig)
+        if back.names != old.names:
+            raise FormatError("what was written is read back with other cameras")
         reread, points = worst_difference(sized, _fill_sizes(back, rig))
         if reread <= ROUNDING:
             break
@@ -135,12 +134,7 @@ def _written(
     kept = tuple(camera.name for camera in old.cameras if camera.name not in fits)
     inexact = [fit for fit in fits.values() if not fit.exact]
     worst = max(inexact, key=lambda fit: fit.worst, default=None)
-    for camera_name, fit in fits.items():
-        if not fit.exact:
-            notes.append(
-                f"camera {camera_name}: {describe_lens(found[camera_name].lens)} -> {describe_lens(fit.lens)}, fitted "
-                f"over the image: worst {fit.worst:.2g} px, RMS {fit.rms:.2g} px"
-            )
+    notes += [fit_note(found[camera], fit) for camera, fit in fits.items() if not fit.exact]
     return Updated(files, title, tuple(notes), tuple(fits), kept, reread, worst, points)
 
 
@@ -158,18 +152,16 @@ def _check_fits(
     lenses = {camera.name: camera.lens for camera in old.cameras}
     for camera, fit in fits.items():
         if not fit.worst <= limit:
-            off = f"by {fit.worst:.3g} px" if np.isfinite(fit.worst) else "by any amount in a part of the image"
+            nearest = f"the nearest with the file's {len(lenses[camera].coefficients)} coefficients"
             raise RefusedError(
-                f"camera {camera}: {title} cannot say its lens ({describe_lens(found[camera].lens)}): the nearest with "
-                f"the file's {len(lenses[camera].coefficients)} coefficients is off {off}, more than the limit of "
-                f"{limit:g} px",
+                lens_refusal(found[camera], fit, title, nearest, limit),
                 command="--fit-limit allows more; or convert the file with --hold-distortion and calibrate again",
                 python="`limit` allows more",
             )
 
 
 def _is_unchanged(camera: ForeignCamera, new: ForeignCamera) -> bool:
-    """Tell whether the file says a camera as it is now."""
+    """Tell whether the file already has a camera as it is now."""
     one, other = (ForeignRig("", (replace(c, image_size=new.image_size),), None, "") for c in (camera, new))
     near = np.allclose(camera.centre, new.centre, rtol=1e-9, atol=1e-9)
     turned = np.allclose(camera.rotation, new.rotation, rtol=0, atol=1e-10)
@@ -177,7 +169,7 @@ def _is_unchanged(camera: ForeignCamera, new: ForeignCamera) -> bool:
 
 
 def _frame_notes(where: str, old: ForeignRig, wanted: ForeignRig, found: Mapping[str, ForeignCamera]) -> list[str]:
-    """Say where the frame of the rig is not that of the file: cameras that are not in the rig would stay behind.
+    """Report a rig whose frame is not the file's: cameras that are not in the rig would stay behind.
 
     Raises:
         FormatError: there are some.
@@ -227,11 +219,11 @@ def _list_files(original: Sequence[Path]) -> list[Path]:
 
 
 def _changes(old: ForeignRig, wanted: ForeignRig) -> dict[Path, list[Change]]:
-    """What is to stand where: the numbers of the same places, of the cameras before and after."""
+    """Collect the numbers to replace: for each place in the files, those of the camera before and after."""
     changes: dict[Path, list[Change]] = {}
     for camera, new in zip(old.cameras, wanted.cameras, strict=True):
         if not camera.places:
-            raise FormatError(f"camera {camera.name}: where its numbers stand is not known: it is only read")
+            raise FormatError(f"camera {camera.name}: this format can only be read, not written back")
         for place in camera.places:
             base = place.relative_to
             before = camera if base is None else camera.in_frame_of(old.cameras[base])
@@ -246,7 +238,7 @@ def _changes(old: ForeignRig, wanted: ForeignRig) -> dict[Path, list[Change]]:
 def _patch(
     contents: Mapping[Path, bytes], changes: Mapping[Path, list[Change]], digits: int, now: datetime
 ) -> tuple[dict[str, bytes], list[str]]:
-    """The files of a calibration by name, and what is to be said of their times."""
+    """Patch the files of a calibration, by name; also returns notes about their time stamps."""
     files: dict[str, bytes] = {}
     notes: list[str] = []
     for path, content in contents.items():
@@ -263,20 +255,6 @@ def _patch(
                     notes.append(f"{path.name}: {', '.join(left)} left as it is: a time in no known form")
         files[path.name] = made
     return files, notes
-
-
-def _read_back(files: Mapping[str, bytes], old: ForeignRig, rig: str | None) -> ForeignRig:
-    with tempfile.TemporaryDirectory() as folder:
-        paths = [Path(folder) / name for name in files]
-        for path in paths:
-            path.write_bytes(files[path.name])
-        try:
-            back = read_foreign_rig(paths[0] if len(paths) == 1 else Path(folder), old.format, rig)
-        except InputError as error:
-            raise FormatError(f"what was written cannot be read back: {str(error).replace(folder, '')}") from error
-    if back.names != old.names:
-        raise FormatError("what was written is read back with other cameras")
-    return back
 
 
 def _fill_sizes(one: ForeignRig, rig: ForeignRig) -> ForeignRig:

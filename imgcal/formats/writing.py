@@ -1,19 +1,24 @@
-"""A rig in the files of a tool, read back and compared before anybody gets them."""
+"""Write a rig as another tool's files; they are read back and compared before they are written."""
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from imgcal.errors import InputError
-from imgcal.formats.conversion import NATIVE, Held, describe_lens, fit_to_target, from_camera_rig, to_camera_rig
-from imgcal.formats.foreign_rig import ForeignRig, FormatError
-from imgcal.formats.format import Files, Format
+from imgcal.formats.conversion import (
+    NATIVE,
+    Held,
+    fit_note,
+    fit_to_target,
+    from_camera_rig,
+    in_millimetres,
+    millimetres,
+    to_camera_rig,
+)
+from imgcal.formats.foreign_rig import ForeignRig, FormatError, worst_difference
+from imgcal.formats.format import Files
 from imgcal.formats.limits import HELD_DISTORTION, LIMIT
-from imgcal.formats.registry import FORMATS, find_format, read_foreign_rig
-from imgcal.formats.units import in_millimetres, millimetres
-from imgcal.formats.verification import worst_difference
+from imgcal.formats.registry import FORMATS, find_format, read_back
 from imgcal.io import RigCovariance, rig_from_text, rig_text
 from imgcal.types import RigPrior
 
@@ -23,7 +28,7 @@ MOST_PX = 1e-6  # that a file may be off when it is read back: the digits of a d
 
 @dataclass(frozen=True)
 class Written:
-    """Files that say a rig, and how well they say it."""
+    """The files of a rig, and how well they represent it."""
 
     files: Files
     notes: tuple[str, ...]  # what the target has no place for, and which lenses were fitted
@@ -53,7 +58,7 @@ def convert_rig(
 
     Raises:
         InputError: the format is only read, or it cannot hold so many cameras.
-        RefusedError: a lens cannot be said within `limit`.
+        RefusedError: a lens cannot be expressed within `limit`.
     """
     if to == OURS:
         held = fit_to_target(rig, NATIVE, "a rig file of ours", limit)
@@ -89,7 +94,7 @@ def convert_rig(
         files = target.write(placed.scale(1.0 / length, files_unit))
     except FormatError as error:
         raise InputError(f"--to {to}: {error}") from error
-    back = _read_back(files, target, files_unit)
+    back = in_millimetres(read_back(files, to), target.name, None if target.states_unit else files_unit)
     if sorted(back.names) == sorted(rig.names):  # files of a folder come in the order of their names
         back = select_cameras(back, tuple(rig.names))
     else:
@@ -98,16 +103,8 @@ def convert_rig(
 
 
 def _valid_covariance(held: Held) -> RigCovariance | None:
-    """The uncertainty is that of the parameters as they were: with fitted ones it is another."""
+    """The uncertainty of the rig, where no lens was fitted: fitted parameters have another one."""
     return held.rig.covariance if all(fit.exact for fit in held.fits) else None
-
-
-def _read_back(files: Files, target: Format, unit: str) -> ForeignRig:
-    with tempfile.TemporaryDirectory() as folder:
-        for name, content in files.items():
-            (Path(folder) / (name or "calibration.txt")).write_bytes(content)
-        where = Path(folder) if "" not in files else Path(folder) / "calibration.txt"
-        return in_millimetres(read_foreign_rig(where, target.name), target.name, None if target.states_unit else unit)
 
 
 def _compare(rig: ForeignRig, held: Held, back: ForeignRig, files: Files, notes: list[str]) -> Written:
@@ -116,12 +113,7 @@ def _compare(rig: ForeignRig, held: Held, back: ForeignRig, files: Files, notes:
     between, points = worst_difference(rig, back)
     if not exact <= MOST_PX:
         raise RuntimeError(f"what was written is read back {exact:.3g} px off")
-    for camera, fit in zip(rig.cameras, held.fits, strict=True):
-        if not fit.exact:
-            notes.append(
-                f"camera {camera.name}: {describe_lens(camera.lens)} -> {describe_lens(fit.lens)}, fitted over the "
-                f"image: worst {fit.worst:.2g} px, RMS {fit.rms:.2g} px"
-            )
+    notes += [fit_note(camera, fit) for camera, fit in zip(rig.cameras, held.fits, strict=True) if not fit.exact]
     return Written(files, tuple(notes), exact, between, points)
 
 

@@ -1,17 +1,27 @@
-from .atomic import replacing, write_bytes, write_text
+from .atomic import PREVIOUS, keep_previous, publishing, replacing, write_bytes, write_text
 from .cameras_yaml import drop_poses, load_cameras, save_cameras
 from .capture import Capture, check_times, open_capture, open_input, save_capture_settings
 from .detections_csv import DEFAULT_SIGMA, MARGIN, load_detections, save_detections
 from .frames import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Frame, Video, grey_frame, read_frame, write_frame, write_image
-from .json_text import read_json
+from .json_text import read_json, read_metrics
 from .key_table import Key, list_keys
-from .metrics import read_metrics
-from .names import MODEL, find_file, is_file_name, model_file, model_name, natural_key, nearest, title_from_name
+from .names import (
+    MODEL,
+    data_path,
+    find_file,
+    is_file_name,
+    model_file,
+    model_name,
+    natural_key,
+    nearest,
+    read_bytes,
+    sample_path,
+    shipped_names,
+    title_from_name,
+)
 from .object_csv import load_object, load_objects, object_from_text, object_text, save_object
 from .own_folder import holding
 from .posterior_file import read_posterior, write_posterior
-from .publication import PREVIOUS, keep_previous, publishing
-from .resources import data_path, sample_path, shipped_names
 from .rig_yaml import RigCovariance, load_rig, load_rig_covariance, rig_from_text, rig_text, save_rig
 from .safetensors_file import read_tensors, read_texts, write_tensors
 from .validation import StrictModel, StrictRecord, validate
@@ -69,6 +79,7 @@ __all__ = [
     "parse_foreign_yaml",
     "parse_yaml",
     "publishing",
+    "read_bytes",
     "read_frame",
     "read_json",
     "read_metrics",

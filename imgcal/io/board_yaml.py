@@ -33,7 +33,7 @@ class _Printed(StrictModel):
     warp: Annotated[float, Field(ge=0, le=limits.TOLERANCE.high, allow_inf_nan=False)] | None = None
 
     def shared(self) -> dict[str, Any]:
-        """What all boards have."""
+        """Values that all boards have."""
         bend = (self.bend[0], self.bend[1])
         return {"columns": self.columns, "rows": self.rows, "inverted": self.inverted, "bend": bend, "warp": self.warp}
 
@@ -47,7 +47,7 @@ class _Charuco(_Printed):
     legacy: bool = False
 
     def board(self) -> Board:
-        """Make the value."""
+        """Make the board."""
         own: dict[str, Any] = {"dictionary": self.dictionary, "first_id": self.first_id, "legacy": self.legacy}
         return Board("charuco", pitch=self.square, marker=self.marker, **own, **self.shared())
 
@@ -62,7 +62,7 @@ class _AprilGrid(_Printed):
     numbered_from: Literal["top", "bottom"] = "bottom"
 
     def board(self) -> Board:
-        """Make the value."""
+        """Make the board."""
         own: dict[str, Any] = {"dictionary": self.dictionary, "first_id": self.first_id, "border": self.border}
         size: dict[str, Any] = {"pitch": self.tag + self.gap, "marker": self.tag}
         return Board("aprilgrid", **size, **own, from_bottom=self.numbered_from == "bottom", **self.shared())
@@ -73,7 +73,7 @@ class _Checkerboard(_Printed):
     square: Length
 
     def board(self) -> Board:
-        """Make the value."""
+        """Make the board."""
         return Board("checkerboard", pitch=self.square, **self.shared())
 
 
@@ -83,7 +83,7 @@ class _Circles(_Printed):
     asymmetric: bool = False
 
     def board(self) -> Board:
-        """Make the value."""
+        """Make the board."""
         return Board("circles", pitch=self.spacing, asymmetric=self.asymmetric, **self.shared())
 
 
@@ -96,7 +96,7 @@ _TYPES: dict[str, type[_Charuco] | type[_AprilGrid] | type[_Checkerboard] | type
 
 
 def board_from_yaml(content: bytes, path: Path) -> CalibrationObject:
-    """Make an object of what the file of a board holds.
+    """Make an object from the file of a board.
 
     Raises:
         InputError: one line with the file, the key, what was found and what was expected.
@@ -119,7 +119,7 @@ def board_from_yaml(content: bytes, path: Path) -> CalibrationObject:
 
 
 def board_text(obj: CalibrationObject) -> str:
-    """Make what the file of a board holds; `board_from_yaml` reads it."""
+    """Make the text of a board's file, which `board_from_yaml` reads."""
     board = obj.board
     assert board is not None
     content: dict[str, Any] = {"format": FORMAT, "type": board.kind, "name": obj.name}

@@ -16,12 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.errors import InputError
-from imgcal.io.atomic import write_text
+from imgcal.io.atomic import is_unfinished, write_text
 from imgcal.io.detections_csv import Fiducials, load_detections
 from imgcal.io.frames import IMAGE_SUFFIXES, TIFF_SUFFIXES, VIDEO_SUFFIXES, Frame, Video, count_frames, read_frame
-from imgcal.io.names import is_file_name, natural_key, nearest
-from imgcal.io.publication import is_unfinished
-from imgcal.io.resources import sample_path
+from imgcal.io.names import is_file_name, natural_key, nearest, sample_path
 from imgcal.io.validation import StrictModel, validate
 from imgcal.io.yaml_file import read_yaml, yaml_text
 from imgcal.messages import list_names

@@ -142,7 +142,7 @@ class _Text:
             yield line
 
     def _check_size(self, lines: int) -> None:
-        """Stop before a file fills the memory, or the day: `lines` have been read of it, blank ones included."""
+        """Refuse a file that is too long or unpacks to too much; `lines` have been read, blank ones included."""
         if lines > MOST_ROWS:
             raise InputError(f"{self.path}: found more than {MOST_ROWS:,} rows, expected fewer: split the file")
         packed, unpacked = max(self.file.tell(), 1), self.binary.tell()

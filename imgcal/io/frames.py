@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
 import struct
+import threading
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,24 +19,52 @@ from numpy.typing import NDArray
 from imgcal.errors import InputError
 from imgcal.io.atomic import write_bytes
 from imgcal.io.image_headers import PNG_SIGNATURE, Size, check_pixels, has_kind, image_size, tiff_pages
-from imgcal.io.names import check_regular
-from imgcal.io.silence import silence_stderr
+from imgcal.io.names import check_regular, read_bytes
 
+_lock = threading.Lock()
+_within = 0  # decodings that are under way, in any thread
+_kept = -1  # standard error meanwhile
 Frame = NDArray[np.uint8] | NDArray[np.uint16]  # (H, W) grey
-
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 IMAGE_SUFFIXES = frozenset({".png", ".bmp", ".pgm", ".jpg", ".jpeg"}) | TIFF_SUFFIXES
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov"})
 VIDEO_PROPERTIES = (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
-
 JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
 JPEG_END, END_OF_JPEG = b"\xff\xd9", 2**16  # some cameras write a few bytes behind it
 LOSSY_SUFFIXES = JPEG_SUFFIXES | VIDEO_SUFFIXES
 LOSSY_TOLERANCE = 4  # grey levels by which lossy compression may tear the channels of a grey frame apart
-
 LARGEST_IMAGE_FILE = 2**30  # bytes
 LEAST_OF_A_FRAME = 4  # bytes that a frame takes in a video, at least
 USUAL_RATE = 30.0  # frames a second of a video that does not say
+
+
+@contextlib.contextmanager
+def silence_stderr() -> Iterator[None]:
+    """Redirect file descriptor 2 to nowhere: libpng, libjpeg and FFmpeg write there regardless of settings."""
+    global _within, _kept
+    with _lock:
+        if _within == 0:
+            _kept = _lead_away()
+        _within += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _within -= 1
+            if _within == 0 and _kept >= 0:
+                os.dup2(_kept, 2)
+                os.close(_kept)
+
+
+def _lead_away() -> int:
+    try:
+        kept = os.dup(2)
+    except OSError:  # a service without standard error
+        return -1
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    os.close(nowhere)
+    return kept
 
 
 def count_frames(path: Path) -> int:
@@ -230,10 +262,7 @@ def _grey(image: Any, path: Path) -> Frame:
 
 def _content(path: Path) -> bytes:
     """Read an image file of the kind that its suffix names."""
-    check_regular(path)
-    if path.stat().st_size > LARGEST_IMAGE_FILE:
-        raise InputError(f"{path}: found {path.stat().st_size:,} bytes, expected at most {LARGEST_IMAGE_FILE:,}")
-    content = path.read_bytes()
+    content = read_bytes(path, LARGEST_IMAGE_FILE)
     suffix = path.suffix.lower()
     if not content:
         raise InputError(f"{path}: found an empty file, expected an image")

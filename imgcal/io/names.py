@@ -1,4 +1,4 @@
-"""Names that a user typed: near misses, sorting, and the bare names of shipped files."""
+"""Names that a user typed: near misses, sorting, and the shipped rigs, objects, models and sample captures."""
 
 from __future__ import annotations
 
@@ -8,22 +8,67 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from imgcal.errors import InputError
-from imgcal.io.resources import data_path, sample_path, shipped_names
 
+SAMPLE = "sample"
+"""What the names of shipped captures begin with, before a colon."""
 MOST_NAMES = 8  # that a message lists
 MODEL, SUFFIX = "model.safetensors", ".safetensors"  # what `imgcal train` calls a network in the folder of a run
 IN_SAMPLE = {"rigs": "rig.yaml", "objects": "object.csv"}
 """Files of a sample capture, by the kind of shipped data that each of them is."""
+MOST_BYTES = 2**26  # of a file of values
 LONGEST_NAME = 200  # bytes: file systems end at 255, and something is put behind
 
 
+def data_path(*parts: str) -> Path:
+    """Find a file or folder of the shipped data, for example `data_path("rigs", "O10.yaml")`.
+
+    Convention: an installed wheel carries the data as `imgcal/data`; a checkout has `data/` beside the package. The
+    returned path need not exist.
+    """
+    package = Path(__file__).resolve().parents[1]
+    inside = package / "data"
+    return (inside if inside.is_dir() else package.parent / "data").joinpath(*parts)
+
+
+def shipped_names(kind: str, suffix: str) -> tuple[str, ...]:
+    """List the bare names of what is shipped: `shipped_names("rigs", ".yaml")` holds "O10".
+
+    Examples:
+        >>> shipped_names("rigs", ".yaml")
+        ('O10', 'O6', 'T4', 'U7', 'room10')
+    """
+    return tuple(sorted(path.stem for path in data_path(kind).glob(f"*{suffix}")))
+
+
+def sample_path(path: str | Path) -> Path:
+    """Replace the name of a shipped sample capture by its folder; other paths stay as they are.
+
+    Args:
+        path: `sample:NAME`, or a path.
+
+    Examples:
+        >>> sample_path("sample:O10").name, str(sample_path("my_capture"))
+        ('O10', 'my_capture')
+
+    Raises:
+        InputError: there is no sample of this name.
+    """
+    prefix, colon, name = str(path).partition(":")
+    if prefix != SAMPLE or not colon:
+        return Path(path)
+    names = sorted(folder.name for folder in data_path("samples").glob("*"))
+    if name not in names:
+        raise InputError(f"{path}: no such sample, expected {' or '.join(f'{SAMPLE}:{known}' for known in names)}")
+    return data_path("samples", name)
+
+
 def natural_key(name: str) -> tuple[list[str | int], str]:
-    """Sort key that counts: "2" before "10"; equal numbers ("1", "01") stay apart."""
+    """Make a sort key in which "2" comes before "10"; equal numbers ("1", "01") stay apart."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)], name
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Name the known name that was probably meant: `, nearest: cam01`, or nothing if none is near."""
+    """Suggest the known name that was probably meant: `, nearest: cam01`, or nothing if none is near."""
     names = {candidate.lower(): candidate for candidate in known}
     matches = difflib.get_close_matches(name.lower(), names, n=1)
     return f", nearest: {names[matches[0]]}" if matches else ""
@@ -47,11 +92,26 @@ def check_regular(path: Path) -> None:
         raise InputError(f"{path}: found a folder, device or pipe, expected a file")
 
 
+def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
+    """Read a regular file of a bounded size.
+
+    Raises:
+        InputError: it is none, cannot be read, or is larger.
+    """
+    check_regular(path)
+    try:
+        if path.stat().st_size > most:
+            raise InputError(f"{path}: found {path.stat().st_size:,} bytes, expected at most {most:,}")
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
 def model_file(path: str | Path) -> Path:
     """Find a trained network: a file, the folder of a training run, or the bare name of a shipped one.
 
     Returns:
-        A path that may not exist: who reads it says so.
+        A path that may not exist; reading it reports that.
 
     Raises:
         InputError: a folder without a trained network.

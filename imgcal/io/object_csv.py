@@ -20,8 +20,15 @@ from imgcal.errors import InputError
 from imgcal.io.atomic import write_text
 from imgcal.io.board_yaml import board_from_yaml, board_text
 from imgcal.io.csv_file import Chunk, read_chunks
-from imgcal.io.names import LONGEST_NAME, check_regular, find_file, title_from_name
-from imgcal.io.resources import data_path, shipped_names
+from imgcal.io.names import (
+    LONGEST_NAME,
+    check_regular,
+    data_path,
+    find_file,
+    read_bytes,
+    shipped_names,
+    title_from_name,
+)
 from imgcal.messages import shorten
 from imgcal.types import CalibrationObject, limits
 from renderers.palette import palette
@@ -62,7 +69,7 @@ def load_object(path: str | Path) -> CalibrationObject:
         check_regular(path)
         if not path.is_file():
             raise InputError(f"{path}: no such file, expected that of a printed board")
-        return board_from_yaml(path.read_bytes(), path)
+        return board_from_yaml(read_bytes(path), path)
     return _read(find_file(path, "objects", ".csv", other=LIGHTS))
 
 

@@ -182,7 +182,7 @@ class _Covariance(StrictModel):
 
 
 class RigFile(StrictModel):
-    """A whole rig file; without `name` the rig is called as the file."""
+    """A whole rig file; a rig without `name` is named after its file."""
 
     format: Literal["imgcal-rig/1"]
     name: Name | None = None

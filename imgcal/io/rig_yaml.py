@@ -1,4 +1,4 @@
-"""Reading and writing rig files: YAML, `format: imgcal-rig/1`; what one may hold is said in `rig_schema.py`."""
+"""Reading and writing rig files: YAML, `format: imgcal-rig/1`; `rig_schema.py` defines what they may hold."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def rig_from_text(text: str, where: str) -> CameraRig:
 
 
 def load_rig_covariance(path: str | Path) -> RigCovariance | None:
-    """Read the uncertainty that stands in a rig file; None when it has none. Arguments and errors as for `load_rig`."""
+    """Read the uncertainty in a rig file; None if it has none. Arguments and errors as for `load_rig`."""
     content, _ = _read(path)
     if content.covariance is None:
         return None
@@ -108,7 +108,7 @@ def save_rig(
         path: the file to write.
         covariance: one standard deviation of every parameter goes to its camera, to 6 digits; None = not written.
         full: write the whole covariance matrix, too (half a megabyte for 10 cameras).
-        posterior: goes to a file beside it, from which `load_rig` attaches it to the rig; None = not written.
+        posterior: written to a file beside it, from which `load_rig` attaches it to the rig; None = not written.
 
     Raises:
         InputError: the file cannot be written, or the rig could not be read again (NaN, for example).
@@ -223,7 +223,7 @@ def _volume_entry(volume: Volume) -> dict[str, Any]:
 
 
 def _narrow(covariance: RigCovariance, rig: CameraRig) -> RigCovariance:
-    """Leave out coefficients that no camera has: some of a wider rig."""
+    """Leave out coefficients that no camera of the rig has."""
     cameras, kept = rig.num_cameras, len(parameter_names(rig.lens_models))
     matrix = covariance.matrix
     if matrix is not None and kept < covariance.std.shape[1]:

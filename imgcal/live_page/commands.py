@@ -29,7 +29,7 @@ class Command:
 
 
 def read_command(content: Any, cameras: Sequence[str], actions: Mapping[str, Action], events: int) -> Command:
-    """Check what a page sent.
+    """Check the command that a page sent.
 
     Args:
         content: anything.

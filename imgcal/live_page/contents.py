@@ -39,7 +39,7 @@ def greeting(
     actions: Sequence[Action],
     title: str,
 ) -> dict[str, Any]:
-    """The first message to the server."""
+    """Make the first message to the server."""
     return {
         "address": address,
         "token": token,
@@ -58,26 +58,25 @@ def greeting(
 
 
 def state_message(state: RigState, obj: CalibrationObject) -> dict[str, Any]:
-    """What changes with every snapshot."""
+    """Describe what changes with every snapshot."""
     pose = state.rig_from_object
     points = None if pose is None else pose.apply(obj.points.to(pose.translation)).detach().reshape(-1, 3).numpy()
     blobs = state.detections
-    labelled = blobs.camera[blobs.fiducial >= 0]
     return {
         "time": float(state.time),
         "snapshot": int(state.snapshot),
         "sentence": state.sentence,
         "refused": state.refused,
-        "in_view": state.refused is None or bool(np.bincount(blobs.camera[blobs.usable]).max(initial=0) >= LEAST_BLOBS),
+        "in_view": state.refused is None or bool(blobs.count_by_camera(blobs.usable).max() >= LEAST_BLOBS),
         "health": [str(state.cameras[name]) for name in state.rig.camera_names],
         "residual": np.asarray(state.residual, dtype=np.float64),
-        "sees": np.bincount(labelled, minlength=state.rig.num_cameras),
+        "sees": blobs.count_by_camera(blobs.labelled),
         "object": points,
     }
 
 
 def event_message(event: Event) -> dict[str, Any]:
-    """One event; numbers that are not finite are left out."""
+    """Describe one event; numbers that are not finite are left out."""
     return {
         name: getattr(event, name)
         for name in ("time", "snapshot", "kind", "camera", "since", "change", "size", "sigma", "unit", "message")

@@ -12,7 +12,7 @@ from imgcal.errors import RefusedError
 from imgcal.live_page.address import Address
 from imgcal.live_page.commands import Action, Command
 from imgcal.live_page.live_page import LivePage
-from imgcal.live_page.viewing_volume import viewing_volume
+from imgcal.live_page.rig_drawing import viewing_volume
 from imgcal.online import RigKeeper, RigState
 from imgcal.synthesis import PhysicalDrift, SimulatedRig
 from imgcal.types import CalibrationObject, CameraRig

@@ -1,4 +1,4 @@
-"""How well the volume is known, and where the object teaches the most: computed now and then, beside the server."""
+"""The accuracy over the volume, and where the object teaches the most: computed now and then, beside the server."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from imgcal.estimation import Gauge, WorkingVolume, pixel_jacobian, uncertainty_over
 from imgcal.geometry import cross_matrix
 from imgcal.io import DEFAULT_SIGMA
-from imgcal.live_page.text import round_values
+from imgcal.live_page.page import round_values
 from imgcal.monitoring import RigBelief
 from imgcal.types import CameraRig
 
@@ -35,7 +35,7 @@ def compare(content: dict[str, Any]) -> tuple[CameraRig, NDArray[np.float64]]:
 def compute_guidance(
     content: dict[str, Any], points_object: NDArray[np.float64], volume: WorkingVolume
 ) -> tuple[dict[str, Any], CameraRig, Tensor]:
-    """Compute what the page says of the volume.
+    """Compute what the page shows about the volume.
 
     Args:
         content: a message with a belief (`contents.belief_message`).
@@ -81,7 +81,7 @@ def compute_guidance(
 
 
 def information_gain(belief: RigBelief, covariance: Tensor, places: Tensor, shape: Tensor, sigma: float) -> Tensor:
-    """How much one more snapshot would teach about the rig, with the object at some places: (P,) nat.
+    """Compute the information that one more snapshot would give, with the object at some places: (P,) nat.
 
     Half the logarithm of the determinants' ratio of covariances before and after, the pose eliminated: what no
     snapshot shows, as a motion of the whole rig, does not count.

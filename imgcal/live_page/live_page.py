@@ -41,7 +41,7 @@ from imgcal.live_page.contents import (
     rig_message,
     state_message,
 )
-from imgcal.live_page.viewing_volume import viewing_volume
+from imgcal.live_page.rig_drawing import viewing_volume
 from imgcal.live_page.wire import frame_message
 from imgcal.messages import shorten
 from imgcal.online import Event, RigState
@@ -141,8 +141,8 @@ class LivePage:
         if self.address.local:
             return f"live page: {self.url} (this machine only)"
         return (
-            f"live page: {self.url}\nwhoever has this address with its token can watch and command the rig; what is "
-            "sent is not encrypted"
+            f"live page: {self.url}\nanyone with this address and its token can watch and command the rig; the "
+            "connection is not encrypted"
         )
 
     def publish(self, state: RigState, frames: Mapping[str, Frame | None] | None = None) -> None:

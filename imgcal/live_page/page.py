@@ -4,16 +4,51 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from html import escape
 from importlib.resources import files
 from typing import Any
 
-from imgcal.live_page.text import to_json
+import numpy as np
+from numpy.typing import NDArray
 
 SCRIPTS = ("words", "scene", "timelines", "cameras", "pictures", "volume", "events", "controls", "main")
 """Files of the script, in the order in which they stand in the page: later ones use earlier ones."""
+
+
+def round_values(values: NDArray[np.float64], digits: int = 5) -> Any:
+    """Nested lists of numbers of so many significant digits; None for nan and infinity.
+
+    Examples:
+        >>> round_values(np.array([1.23456789, np.nan, 12345678.0]))
+        [1.2346, None, 12346000.0]
+    """
+    values = np.asarray(values, dtype=np.float64)
+    known = np.isfinite(values)
+    size = np.where(known & (values != 0), np.abs(values), 1.0)
+    scale = 10.0 ** (digits - 1 - np.floor(np.log10(size)))
+    short = np.where(known, np.round(np.where(known, values, 0.0) * scale) / scale, np.nan)
+    return _replace_nan(short.tolist())
+
+
+def _replace_nan(values: Any) -> Any:
+    if isinstance(values, list):
+        return [_replace_nan(value) for value in values]
+    return None if values != values else values
+
+
+def to_json(content: Any) -> str:
+    """Write JSON in one line, which may stand inside `<script>`, too."""
+    text = json.dumps(content, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+
+
+def stream_event(kind: str, content: Any) -> bytes:
+    """Write a server-sent event."""
+    return f"event: {kind}\ndata: {to_json(content)}\n\n".encode()
 
 
 @dataclass(frozen=True)
@@ -36,10 +71,7 @@ def report_page(title: str, contents: dict[str, Any]) -> Page:
 
 def _page(title: str, data: dict[str, Any], connections: str) -> Page:
     style, script = _style(), _script()
-    policy = (
-        f"default-src 'none'; script-src '{_digest(script)}'; style-src '{_digest(style)}'; img-src data: blob:; "
-        f"connect-src {connections}; base-uri 'none'; form-action 'none'"
-    )
+    policy = content_policy([script], f"'{_digest(style)}'", "data: blob:", connections)
     text = _asset("page.html")
     parts = {
         "POLICY": escape(policy), "TITLE": escape(title), "STYLE": style, "DATA": to_json(data), "SCRIPT": script
@@ -49,6 +81,15 @@ def _page(title: str, data: dict[str, Any], connections: str) -> Page:
         assert mark, name
         text = before + part + after
     return Page(text, f"{policy}; frame-ancestors 'none'")
+
+
+def content_policy(scripts: Sequence[str], styles: str, images: str, connections: str = "'none'") -> str:
+    """Forbid a page everything but the scripts that it carries, and what is listed: a Content-Security-Policy."""
+    digests = " ".join(f"'{_digest(script)}'" for script in scripts)
+    return (
+        f"default-src 'none'; script-src {digests}; style-src {styles}; img-src {images}; connect-src {connections}; "
+        "base-uri 'none'; form-action 'none'"
+    )
 
 
 def _digest(text: str) -> str:

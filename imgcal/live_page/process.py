@@ -7,23 +7,86 @@ import contextlib
 import json
 import os
 import socket
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from imgcal.live_page.connections import MOST_CONNECTIONS, Connection
 from imgcal.live_page.page_state import PageState
 from imgcal.live_page.security import Gate
 from imgcal.live_page.server import Application
 from imgcal.live_page.wire import read_message
 from imgcal.messages import shorten
 
+HEADER_SECONDS = 5.0
+"""Within which the head of a request must have come, from its first byte or from the beginning of the connection."""
+MOST_CONNECTIONS = 256
+MOST_OF_ONE_ADDRESS = 128
 POLITE = 5  # how much rather the loop runs than this
 GUIDANCE_SECONDS = 3.0  # rest between two computations, and twice as long as the last one took
 MOST_HEADERS = 16384  # bytes
 BUFFER = 1 << 20
+
+
+class Connection(H11Protocol):
+    """HTTP of one connection. If there are too many, the one that has waited the longest is closed."""
+
+    def __init__(self, *given: Any, **more: Any) -> None:
+        """Take uvicorn's arguments."""
+        super().__init__(*given, **more)
+        self.since = time.monotonic()
+        self._due: asyncio.TimerHandle | None = None
+
+    @property
+    def waits(self) -> bool:
+        """Whether no request is being answered."""
+        return self.cycle is None or self.cycle.response_complete
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to wait for a request, if there is room."""
+        super().connection_made(transport)
+        self._due = self.loop.call_later(HEADER_SECONDS, self._end)
+        there = [other for other in self.connections if isinstance(other, Connection) and other.is_there]
+        same = [other for other in there if other.address == self.address]
+        for group, most in ((same, MOST_OF_ONE_ADDRESS), (there, MOST_CONNECTIONS)):
+            if len(group) > most and self.is_there:
+                min((other for other in group if other.waits), key=lambda other: other.since).transport.abort()
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes; a slow header times out."""
+        super().data_received(data)
+        if not self.waits:
+            self._forget()
+        elif self._due is None:
+            self._due = self.loop.call_later(HEADER_SECONDS, self._end)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Stop waiting."""
+        self._forget()
+        super().connection_lost(exc)
+
+    @property
+    def is_there(self) -> bool:
+        """Whether it is still open."""
+        return not self.transport.is_closing()
+
+    @property
+    def address(self) -> str | None:
+        """Of the other side, without the port."""
+        return self.client[0] if self.client else None
+
+    def _forget(self) -> None:
+        if self._due is not None:
+            self._due.cancel()
+            self._due = None
+
+    def _end(self) -> None:
+        self._due = None
+        if self.waits:
+            self.transport.abort()
 
 
 def main(listening: int, pipe: int) -> None:

@@ -5,16 +5,77 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from imgcal.estimation import WorkingVolume
-from imgcal.live_page.text import round_values
+from imgcal.live_page.page import round_values
 from imgcal.types import CameraRig
 
 Array = NDArray[np.float64]
 
+USUAL_DISTANCE = 1000.0  # mm, of cameras whose axes meet nowhere
+PARALLEL = 0.02
+"""Of the mean square of the sine between axes: below it, where they meet is not known."""
+STEPS = 21
+REACH = 0.6
+"""Half a side of the searched cube, of the distance to where the axes meet."""
+ENOUGH = 0.6
+"""Of the most cameras that see a point together: what belongs to the volume."""
 CLEAR = 0.3
 """Length of the mean of unit vectors from which on they agree."""
+ALONG_AXIS = 0.97
+"""Cosine up to which a direction counts as that of an axis of the rig's frame."""
+
+
+def viewing_volume(rig: CameraRig) -> WorkingVolume:
+    """Find the box that holds what many cameras see at once, about where they look; a rig that names its volume has it.
+
+    Args:
+        rig: without batch axes.
+
+    Examples:
+        >>> import imgcal
+        >>> box = viewing_volume(imgcal.load_rig("O10"))
+        >>> bool(box.contains(torch.tensor([0.0, 0.0, 850.0], dtype=torch.float64)))
+        True
+    """
+    rig = rig.to(torch.float64)
+    if rig.volume is not None:
+        low, high = torch.tensor([rig.volume.low, rig.volume.high], dtype=torch.float64)
+        return WorkingVolume(low, high)
+    middle = _meeting_point(rig)
+    distance = float((rig.positions - middle).norm(dim=-1).median())
+    half = max(REACH * distance, 1.0)
+    searched = WorkingVolume(middle - half, middle + half)
+    grid = searched.grid(STEPS).flatten(0, -2)
+    count = rig.project(grid).visible.sum(0)
+    apart = (rig.positions[:, None] - grid).norm(dim=-1).amin(0)
+    shared = grid[(count >= ENOUGH * count.max()) & (count > 0) & (apart >= 0.3 * distance)]
+    if not len(shared):
+        return searched
+    # The outermost layers are thin corners of the views.
+    share = shared.new_tensor([0.05, 0.95])
+    low, high = shared.quantile(share, dim=0)
+    margin = 0.05 * half
+    return WorkingVolume(low - margin, high + margin)
+
+
+def _meeting_point(rig: CameraRig) -> Tensor:
+    """Where the cameras look: the point nearest to all axes, or the working distance ahead where they are parallel."""
+    axes, centres = rig.cam_from_rig.rotation[:, 2], rig.positions
+    across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None, :]
+    mean = axes.mean(0)
+    ahead = rig.working_distance or USUAL_DISTANCE
+    if rig.working_distance is not None and mean.norm() > 0.5:
+        return centres.mean(0) + ahead * mean / mean.norm()
+    if torch.linalg.eigvalsh(across.mean(0))[0] > PARALLEL:
+        point = torch.linalg.solve(across.sum(0), (across @ centres[..., None]).sum(0)[:, 0])
+        depth = ((point - centres) * axes).sum(-1)
+        if bool((depth > 0).float().mean() > 0.5):
+            return point
+    return centres.mean(0) + ahead * mean / mean.norm().clamp_min(1e-9)
 
 
 def arrangement(rig: CameraRig, volume: WorkingVolume) -> dict[str, Any]:
@@ -45,8 +106,21 @@ def arrangement(rig: CameraRig, volume: WorkingVolume) -> dict[str, Any]:
     }
 
 
+def up_and_forward(rig: CameraRig) -> tuple[Array, Array]:
+    """Find which way is up, and the level direction in which most cameras look, both (3,).
+
+    A direction that is nearly that of an axis of the rig's frame is that of the axis.
+
+    Args:
+        rig: float64, without batch axes.
+    """
+    centres, axes = rig.positions.numpy(), rig.cam_from_rig.rotation.numpy()
+    up = _snap(upright(centres, axes, _meeting_point(rig).numpy()))
+    return up, _snap(forward(centres, axes, up))
+
+
 def upright(centres: Array, axes: Array, middle: Array) -> Array:
-    """Which way is up (3,): where most cameras' images have their top, or away from the object, across the cameras.
+    """Find the up direction (3,): the top of most cameras' images, or away from the object, across the cameras.
 
     Examples:
         >>> upright(np.eye(3), np.stack([np.eye(3)] * 3), np.zeros(3))  # upright OpenCV cameras: y is down
@@ -62,7 +136,7 @@ def upright(centres: Array, axes: Array, middle: Array) -> Array:
 
 
 def forward(centres: Array, axes: Array, up: Array) -> Array:
-    """Which way most cameras look (3,), level; the longest side of a rig that looks inwards."""
+    """Find the level direction (3,) in which most cameras look; the longest side of a rig that looks inwards."""
     mean = axes[:, 2].mean(0)
     level = mean - (mean @ up) * up
     if np.linalg.norm(level) < CLEAR:
@@ -74,6 +148,13 @@ def forward(centres: Array, axes: Array, up: Array) -> Array:
         level = level - (level @ up) * up
     ahead: Array = level / np.linalg.norm(level)
     return ahead
+
+
+def _snap(direction: Array) -> Array:
+    axis = int(np.argmax(np.abs(direction)))
+    if abs(direction[axis]) < ALONG_AXIS:
+        return direction
+    return np.asarray(np.eye(3)[axis] * np.sign(direction[axis]))
 
 
 def _level(vector: Array, up: Array) -> float:

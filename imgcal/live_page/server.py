@@ -54,11 +54,11 @@ class Application:
     def __init__(
         self, board: PageState, gate: Gate, rig_yaml: Callable[[], str | None], tell: Callable[[dict[str, Any]], None]
     ) -> None:
-        """Make it.
+        """Start without viewers.
 
         Args:
             board: what is shown.
-            gate: who may ask.
+            gate: decides which requests are answered.
             rig_yaml: the present rig file; None = not known yet.
             tell: passes an object on to the loop's process.
         """

@@ -1,4 +1,4 @@
-"""A matched filter for frames in which blobs fail: the whole pattern is looked for, in all cameras together."""
+"""A matched filter for frames in which blobs fail: it searches for the whole pattern in all cameras together."""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""All markers of a camera: their common shape and their places, each found from the other in turns, compiled."""
+"""Compiled fit of all markers of a camera: alternates between their common shape and their positions."""
 
 # Compiled functions take their types from their arguments.
 # ruff: noqa: ANN001, ANN201
@@ -12,13 +12,13 @@ from imgcal.matching.marker_fit import fit_markers
 from imgcal.matching.marker_shape import RINGS, common_shape, median
 from renderers.compiling import njit
 
-USUAL_MISFIT = 0.1  # RMS of the amplitude: what whole markers differ by in their shapes, at least
+USUAL_MISFIT = 0.1  # RMS relative to the amplitude: smallest shape difference to expect between whole markers
 LEAST_HALF = 4  # px, of a window
 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def cut(grey, uv, scale, half, patches):
-    """Fill windows (K, P, P) about places (K, 2), resampled so that these are in the middle, at the markers' scales."""
+    """Fill windows (K, P, P) centred at places (K, 2), resampled to the markers' scales."""
     height, width = grey.shape
     left, right = np.empty(2 * half + 1, np.int64), np.empty(2 * half + 1, np.float32)
     for k in range(len(uv)):
@@ -42,19 +42,19 @@ def fit_camera(grey, start, inside, sure, scale, half, iterations, uv, found, mi
     """Fit the markers (N) of one camera.
 
     Args:
-        grey: (H, W) grey values, brighter where markers are, two rows and columns at least.
-        start: (N, 2) pixels, where markers are expected.
-        inside: (N,) those that are in the image; one at least.
-        sure: (N,) those from which the common shape is taken.
-        scale: (N,) size of each marker in parts of the usual one.
-        half: px, half of the first windows.
-        iterations: (P,) of the places, in each of the passes in which shape and places are found from one another.
-        uv: (N, 2) filled with the places.
-        found: (N, 5) zeros, filled as by `fit_markers`.
-        misfit: (N,) filled with the RMS difference from the common shape beyond noise, in parts of the amplitude.
+        grey: (H, W) grey values, markers bright, at least two rows and columns.
+        start: (N, 2) pixels, expected positions.
+        inside: (N,) whether each is in the image; at least one.
+        sure: (N,) the markers that define the common shape.
+        scale: (N,) size of each marker relative to the usual one.
+        half: px, half size of the first windows.
+        iterations: (P,) iterations on the positions in each pass; a pass estimates the shape, then the positions.
+        uv: (N, 2) output: positions.
+        found: (N, 5) zeros; outputs of `fit_markers`.
+        misfit: (N,) output: RMS difference from the common shape beyond noise, relative to the amplitude.
 
     Returns:
-        Radius (px) of the disc as large as the shape; 0 = there are no markers.
+        Radius (px) of the disc with the shape's area; 0 = no markers.
     """
     count, side = len(start), 2 * half + 1
     place, sure = start.copy(), sure & inside
@@ -81,7 +81,7 @@ def fit_camera(grey, start, inside, sure, scale, half, iterations, uv, found, mi
             misfit[n] = np.sqrt(max(found[n, 3] - 1.5 * found[n, 4], 0.0)) / max(found[n, 0], 1e-9)
         for k in range(len(chosen)):
             some[k] = misfit[chosen[k]]
-        # Those that look like most others say better what a whole marker looks like.
+        # Markers that look like most others define the shape of a whole marker better.
         usual = max(USUAL_MISFIT, median(some, len(chosen)))
         for n in range(count):
             sure[n] = sure[n] and misfit[n] <= usual

@@ -1,4 +1,4 @@
-"""Work on all cameras at once, in threads: for what lets go of the interpreter, as OpenCV and compiled functions do."""
+"""Threads that process all cameras at once, for functions that release the GIL, such as OpenCV and compiled ones."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ Result = TypeVar("Result")
 
 
 def each_camera(function: Callable[[int], Result], cameras: Iterable[int]) -> list[Result]:
-    """Call a function for each camera and give the results in order.
+    """Call a function for each camera and return the results in order.
 
-    The threads, one a core, begin with the first call and end with the process. A function that is called must not call
-    this one.
+    The threads, one per core, start with the first call and end with the process. The function must not call
+    `each_camera` itself.
 
     Examples:
         >>> each_camera(lambda camera: camera**2, [3, 0, 2])
@@ -26,5 +26,5 @@ def each_camera(function: Callable[[int], Result], cameras: Iterable[int]) -> li
 
 @cache
 def _pool(process: int) -> ThreadPoolExecutor:
-    """Make the threads of a process: one that was forked has none of its parent's."""
+    """Create the threads of a process; a forked process does not inherit its parent's."""
     return ThreadPoolExecutor(os.cpu_count() or 1, f"cameras-{process}")

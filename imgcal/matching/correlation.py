@@ -1,4 +1,4 @@
-"""A pattern of points laid on the maps of all cameras, each map shifted until it fits best."""
+"""Correlation of a point pattern with the maps of all cameras, each shifted to where it fits best."""
 
 # Compiled functions take their types from their arguments.
 # ruff: noqa: ANN001, ANN202
@@ -17,27 +17,27 @@ from imgcal.types import CalibrationObject, CameraRig
 from renderers.compiling import njit
 
 HIDDEN = 0.3
-"""Probability that a fiducial in view does not show."""
+"""Probability that a fiducial in view is not visible."""
 EVEN = 0.25
-"""Exponent of the distribution of ranks at markers: 1 would be that of the rest of the frame."""
+"""Exponent of the distribution of ranks at markers; 1 would be the uniform one of the rest of the frame."""
 BLIND = 0.1
-"""Probability that a camera shows nothing of the object."""
+"""Probability that a camera does not see the object at all."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """How well poses agree with the maps."""
+    """Agreement of poses with the maps."""
 
-    log_odds: NDArray[np.float64]  # (K, C) against nothing being there
+    log_odds: NDArray[np.float64]  # (K, C) against no object
     shift: NDArray[np.float64]  # (K, C, 2) pixels, map minus prediction
 
     @property
     def total(self) -> NDArray[np.float64]:
-        """All cameras together: (K,)."""
+        """Sum over all cameras: (K,)."""
         return self.log_odds.sum(1)
 
     def select(self, rows: NDArray[np.int64]) -> Scores:
-        """Keep the given poses."""
+        """Select poses."""
         return Scores(self.log_odds[rows], self.shift[rows])
 
     def __add__(self, other: Scores) -> Scores:
@@ -45,14 +45,14 @@ class Scores:
 
 
 def gains(maps: Maps) -> NDArray[np.float32]:
-    """Log odds of each cell: that a marker gives as much surprise, against the rest of the frame: (C, H, W)."""
-    # Ranks of the frame are even in [0, 1], those at markers have the density EVEN * rank^(EVEN - 1).
+    """Log odds of each cell: surprise at a marker against the rest of the frame: (C, H, W)."""
+    # Ranks of the frame are uniform in [0, 1]; those at markers have the density EVEN * rank^(EVEN - 1).
     log_odds = np.log(HIDDEN + (1 - HIDDEN) * EVEN * np.exp((1 - EVEN) * maps.surprise))
     return log_odds.astype(np.float32)
 
 
 def gain_at(maps: Maps, gain: NDArray[np.float32], uv: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sum the log odds (C, H, W) of the cells at places (C, N, 2), in pixels, as far as they are in the image: (C,)."""
+    """Sum the log odds (C, H, W) of the cells at places (C, N, 2) pixels that are in the image: (C,)."""
     cells = np.floor(maps.cells(uv)).astype(np.int64)
     inside = np.asarray(((cells >= 0) & (cells < maps.size[:, None])).all(-1))
     cells = np.where(inside[..., None], cells, 0)
@@ -67,10 +67,10 @@ def correlate(
     poses: RigidTransform,
     reach: NDArray[np.float64],
 ) -> Scores:
-    """Score poses (K,), each camera's map shifted as far as `reach` (C,) pixels."""
+    """Score poses (K,), with each camera's map shifted by up to `reach` (C,) pixels."""
     points = poses.apply(obj.points.to(rig.focal_length))
     projection = rig.expand(len(points)).project_values(points, obj.radius)
-    # Far outside of the image nothing is said; at its edge the shift decides.
+    # Cells far outside of the image do not count; near its edge, the shift decides.
     cells = np.ascontiguousarray(maps.cells(projection.uv.numpy()))
     front = np.ascontiguousarray(projection.depth.numpy() > 1)
     score, shift = np.zeros(cells.shape[:2]), np.zeros((*cells.shape[:2], 2))
@@ -97,7 +97,7 @@ def _correlate(cells, front, gain, size, steps, window, score, shift):
                 left, top = int(np.floor(cells[k, c, n, 0])) - step, int(np.floor(cells[k, c, n, 1])) - step
                 first, last = max(0, -left), min(side, width - left)
                 for i in range(max(0, -top), min(side, height - top)):
-                    # Slices of their own: of places that are sums, the sign would be asked, one by one.
+                    # Separate slices: indices that are sums would need a sign check each.
                     total, more = window[i, first:last], gain[c, top + i, left + first : left + last]
                     for j in range(last - first):
                         total[j] += more[j]
@@ -117,6 +117,6 @@ def _correlate(cells, front, gain, size, steps, window, score, shift):
                     for j in range(side):
                         if window[i, j] > most - 12:
                             odds += np.exp(window[i, j] - most)
-            # The shift is not known beforehand: the mean over all of them counts.
+            # The shift is unknown, so average over all shifts.
             score[k, c] = most + np.log(odds / (side * side))
             shift[k, c, 0], shift[k, c, 1] = at_j - step, at_i - step

@@ -1,9 +1,9 @@
-"""Frames as maps of surprise: how unusual it is, in this very frame, to look so much like a marker.
+"""Maps of surprise: how rare it is within a frame to look as much like a marker as a cell does.
 
-A frame is reduced and filtered for spots of several sizes. What the filters say is replaced by its rank: minus the
-logarithm of the share of the frame in which they say as much. Without markers that is a standard exponential variable,
-whatever noise, contrast, background and clutter are; the more clutter a frame has, the less a bright spot is worth.
-Where the object's place is known, all this is done within a window of each frame.
+A frame is reduced and filtered for spots of several sizes. The filter response is replaced by its rank: minus the
+logarithm of the share of the frame with at least this response. Without markers, this is a standard exponential
+variable for any noise, contrast, background and clutter; the more clutter a frame has, the less a bright spot counts.
+Where the object's pose is known, only a window of each frame is processed.
 """
 
 from __future__ import annotations
@@ -19,34 +19,34 @@ from imgcal.detection import Frame
 from imgcal.matching.camera_threads import each_camera
 from imgcal.matching.ranks import average, raise_ranks, rank_spots
 
-SIZES = (0.0, 1.2, 2.4)  # cells, standard deviations of the spots that are looked for; 0 = as reduced
-SURROUND = 2.0  # of the ring around a spot, in parts of the spot's
+SIZES = (0.0, 1.2, 2.4)  # cells, standard deviations of the spot filters; 0 = the reduced frame itself
+SURROUND = 2.0  # standard deviation of the ring around a spot, relative to the spot's
 LEAST_SURROUND = 1.6  # cells
 
 
 @dataclass(frozen=True)
 class Maps:
-    """Surprise of all cameras at one scale, of their frames or windows in these."""
+    """Surprise of all cameras at one scale, for whole frames or for windows."""
 
     surprise: NDArray[np.float32]  # (C, H, W), 0 where a camera has no image
-    factor: int  # pixels to a cell
+    factor: int  # pixels per cell
     size: NDArray[np.int64]  # (C, 2) width and height in cells
-    corner: NDArray[np.int64]  # (C, 2) cells left of the first one, and above it
+    corner: NDArray[np.int64]  # (C, 2) offset of the first cell from the frame's left and top
 
     def cells(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Turn pixels (*K, C, N, 2) into cells: cell i reaches from i to i + 1; what is nowhere is far outside."""
+        """Convert pixels (*K, C, N, 2) to cells: cell i extends from i to i + 1; invalid points go far outside."""
         return np.nan_to_num((uv + 0.5) / self.factor - self.corner[:, None], nan=-1e6).clip(-1e6, 1e6)
 
     def pixels(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Turn cells (*K, C, N, 2) into pixels."""
+        """Convert cells (*K, C, N, 2) to pixels."""
         return (cells + self.corner[:, None]) * self.factor - 0.5
 
     def select(self, cameras: list[int]) -> Maps:
-        """Keep the given cameras."""
+        """Select cameras."""
         return Maps(self.surprise[cameras], self.factor, self.size[cameras], self.corner[cameras])
 
     def pool(self, factor: int) -> Maps:
-        """Make larger cells, each as surprising as the most surprising one within it or next to it."""
+        """Pool into larger cells by the maximum, and rank the result again."""
         step = factor // self.factor
         if step <= 1:
             return self
@@ -59,7 +59,7 @@ class Maps:
         return Maps(_rank(most, size), self.factor * step, size, self.corner // step)
 
     def dilate(self) -> Maps:
-        """Let every cell be as surprising as its most surprising neighbour."""
+        """Replace each cell by the maximum over itself and its neighbours, and rank the result again."""
         kernel = np.ones((3, 3), np.uint8)
         most = np.stack([cv2.dilate(one, kernel) for one in self.surprise])
         return Maps(_rank(most, self.size), self.factor, self.size, self.corner)
@@ -75,15 +75,15 @@ def surprise_maps(
     """Filter the frames of all cameras.
 
     Args:
-        frames: (H, W) of each camera, None = it has none.
-        factor: pixels to a cell.
+        frames: (H, W) of each camera; None = no frame.
+        factor: pixels per cell.
         dark: markers are darker than their surroundings.
-        masks: (H, W) of each camera, True where not to look.
-        windows: (C, 4) first and last column and row of what is looked at, in pixels, the last ones excluded; a
-            multiple of `factor`, and of that of whatever `pooled` makes of it; None = all of each frame.
+        masks: (H, W) of each camera, True in excluded pixels.
+        windows: (C, 4) first and last column and row of each window, in pixels, the last ones excluded; multiples of
+            `factor`, and of the factor of later `pool` calls; None = whole frames.
 
     Returns:
-        Maps, and the response to each size of spots in standard deviations of the noise: (C, sizes, H, W).
+        Maps, and the response to each spot size in standard deviations of the noise: (C, sizes, H, W).
     """
     if windows is None:
         windows = np.array([(0, 0, 0, 0) if f is None else (0, f.shape[1], 0, f.shape[0]) for f in frames])
@@ -98,7 +98,7 @@ def surprise_maps(
         if frame is None or width * height == 0:
             return
         left, top = windows[camera, ::2].tolist()
-        # What is left over at the right and at the bottom is not seen.
+        # Incomplete cells at the right and at the bottom are dropped.
         cells = np.empty((height, width), np.float32)
         average(frame, windows[camera, ::2], factor, cells)
         _spots(-cells if dark else cells, response[camera, :, :height, :width])
@@ -113,7 +113,7 @@ def surprise_maps(
 
 
 def _rank(values: NDArray[Any], size: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Rank the values (C, H, W) of each camera among those of its map."""
+    """Rank the values (C, H, W) of each camera within its own map."""
     ranked = np.zeros_like(values)
     there = np.flatnonzero(size.prod(1)).tolist()
     each_camera(lambda camera: raise_ranks(values[camera], size[camera], 1, ranked[camera]), there)
@@ -121,7 +121,7 @@ def _rank(values: NDArray[Any], size: NDArray[np.int64]) -> NDArray[np.float32]:
 
 
 def _spots(image: NDArray[np.float32], found: NDArray[np.float32]) -> None:
-    """Fill (sizes, H, W) with what each size of spots is brighter than the ring around it."""
+    """Fill (sizes, H, W) with the contrast of each spot size against the ring around it."""
     rings = [max(LEAST_SURROUND, SURROUND * sigma) for sigma in SIZES]
     blurred = {sigma: cv2.GaussianBlur(image, (0, 0), sigma) for sigma in {*SIZES, *rings} - {0.0}} | {0.0: image}
     for number, (sigma, ring) in enumerate(zip(SIZES, rings, strict=True)):

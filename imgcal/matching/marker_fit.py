@@ -1,6 +1,6 @@
-"""Place, brightness and background of markers whose common shape is known: robust least squares, compiled.
+"""Compiled robust least squares for position, brightness and background of markers of known common shape.
 
-Markers that overlap are fitted in turns, each with the others taken away.
+Overlapping markers are fitted in turns, each with the others subtracted.
 """
 
 # Compiled functions take their types from their arguments.
@@ -16,21 +16,21 @@ from imgcal.matching.marker_shape import RINGS
 from renderers.compiling import njit
 
 MISFIT = (0.2, 0.1, 0.05, 0.03)
-"""Of the amplitude: by how much the common shape may be wrong, in each iteration."""
-NEAR = 2  # of these iterations are enough where the places are known
-ROBUST = 3.0  # standard deviations from which a pixel counts less and less
-LEAST_NOISE = 0.3  # grey levels: that of rounding
-FARTHEST = 2.0  # px of one step
-CORE = 0.3  # of the peak: the part of a marker that must look like the shape
-HALVINGS = 12  # of the interval in which the median of residuals lies
-OCTANTS = 8  # around a marker, whose residuals are taken together
+"""Relative error of the common shape to allow for, of the amplitude, in each iteration."""
+NEAR = 2  # the last iterations, enough where the positions are known
+ROBUST = 3.0  # standard deviations from which the weight of a pixel decreases
+LEAST_NOISE = 0.3  # grey levels, from rounding
+FARTHEST = 2.0  # px, largest step
+CORE = 0.3  # of the peak: the brighter part of a marker, which must look like the shape
+HALVINGS = 12  # bisection steps for the median of residuals
+OCTANTS = 8  # around a marker; residuals are summed within each
 FEW = OCTANTS / (OCTANTS - 4)
-"""By how much they scatter less than independent ones would: the fit of four values has made their sums zero."""
+"""Correction for their reduced scatter: the fit of four values has made four sums of residuals zero."""
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _median(values, count):
-    """Median of the first `count` values, none of which is negative, to a part of the largest."""
+    """Median of the first `count` non-negative values, accurate relative to the largest."""
     low, high = np.float32(0), np.float32(0)
     for i in range(count):
         high = max(high, values[i])
@@ -47,7 +47,7 @@ def _median(values, count):
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _linear(values, shapes, residual, doubt, count):
-    """Background and amplitude of a shape, where pixels weigh less by `doubt` times their squared residuals."""
+    """Background and amplitude of a shape, with weights of pixels reduced by `doubt` times their squared residuals."""
     one, zero = np.float32(1), np.float32(0)
     ss, s1, s11, sv, s1v = zero, zero, zero, zero, zero
     for i in range(count):
@@ -65,7 +65,7 @@ def _linear(values, shapes, residual, doubt, count):
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _gather(grey, n, half, uv, pixels):
-    """List the pixels around marker n: their values, and their places from its middle.
+    """List the pixels around marker n: their values, and their positions relative to its centre.
 
     Returns:
         First and last column and row, the last ones excluded.
@@ -87,8 +87,8 @@ def _gather(grey, n, half, uv, pixels):
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _take_away(box, m, half, size, amplitude, whitening, profile, uv, values):
-    """Take marker m away from the values in a box, as far as it reaches."""
+def _subtract_marker(box, m, half, size, amplitude, whitening, profile, uv, values):
+    """Subtract marker m from the values in a box, within its reach."""
     left, right, top, bottom = box
     ring = 1 / (RINGS * size)
     a, b, c = ring * whitening[0, 0], ring * whitening[0, 1], ring * whitening[1, 1]
@@ -104,14 +104,14 @@ def _take_away(box, m, half, size, amplitude, whitening, profile, uv, values):
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _shape(size, whitening, profile, pixels, count):
-    """Fill rings and brightness of pixels, and how much the brightness grows from one ring to the next."""
+    """Compute ring index and brightness of pixels, and the increase of brightness to the next ring."""
     along_u, along_v, place, brightness, step = pixels[1], pixels[2], pixels[3], pixels[4], pixels[5]
     ring = 1 / (RINGS * size)
     a, b, c = np.float32(ring * whitening[0, 0]), np.float32(ring * whitening[0, 1]), np.float32(ring * whitening[1, 1])
     for k in range(count):
         x, y = a * along_u[k] + b * along_v[k], b * along_u[k] + c * along_v[k]
         place[k] = np.sqrt(x * x + y * y)
-    # The last two values are zero, and so is what follows.
+    # The last two values are zero, and so is the brightness beyond.
     beyond = np.float32(len(profile) - 2)
     for k in range(count):
         low = int(min(place[k], beyond))
@@ -122,10 +122,10 @@ def _shape(size, whitening, profile, pixels, count):
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _sum(pixels, count, size, whitening, ground, amplitude, doubt, normal, right):
-    """Fill the normal equations of (ground, amplitude, u, v).
+    """Compute the normal equations of (ground, amplitude, u, v).
 
     Returns:
-        Sum of the weights, weighted squares, and squares and number of pixels in the middle of the marker.
+        Sum of the weights, weighted squares, and number and squares of the pixels in the marker's core.
     """
     values, along_u, along_v, place = pixels[0], pixels[1], pixels[2], pixels[3]
     brightness, step, residual = pixels[4], pixels[5], pixels[6]
@@ -137,7 +137,7 @@ def _sum(pixels, count, size, whitening, ground, amplitude, doubt, normal, right
     for k in range(count):
         t, r = brightness[k], values[k] - ground - amplitude * brightness[k]
         w = one / (one + doubt * residual[k] * residual[k])
-        # Slopes along the whitened axes: those by u and v follow from their sums.
+        # Slopes along the whitened axes; those by u and v follow from their sums.
         slope = step[k] / max(place[k], np.float32(1e-6))
         x, y = slope * (p * along_u[k] + q * along_v[k]), slope * (q * along_u[k] + s * along_v[k])
         wa, wb, wc, wd = w * t, w * x, w * y, w * r
@@ -159,7 +159,7 @@ def _sum(pixels, count, size, whitening, ground, amplitude, doubt, normal, right
         inner = one if t > np.float32(CORE) else zero
         core += inner
         middle += inner * r * r
-    # By a move of the marker its brightness changes by minus the slope.
+    # Moving the marker changes its brightness by minus the slope.
     a, b, c = -amplitude * p, -amplitude * q, -amplitude * s
     normal[0, 0], normal[1, 0], normal[1, 1] = w0, wt, wtt
     normal[2, 0], normal[3, 0] = a * wx + b * wy, b * wx + c * wy
@@ -175,7 +175,7 @@ def _sum(pixels, count, size, whitening, ground, amplitude, doubt, normal, right
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _pull(pixels, count, size, whitening, ground, amplitude, doubt, pulls):
-    """Fill what each octant contributes to the right side of the normal equations."""
+    """Compute the contribution of each octant to the right side of the normal equations."""
     values, along_u, along_v, place = pixels[0], pixels[1], pixels[2], pixels[3]
     brightness, step, residual = pixels[4], pixels[5], pixels[6]
     ring = 1 / (RINGS * size)
@@ -196,7 +196,7 @@ def _pull(pixels, count, size, whitening, ground, amplitude, doubt, pulls):
 
 @njit(cache=True, nogil=True)
 def _variance(normal, pulls, variance, axis, row):
-    """Variance of the place along one axis, after `cholesky(normal)`: that of its pixels, or of its octants."""
+    """Variance of the position along one axis, after `cholesky(normal)`: the larger one from pixels or octants."""
     row[:] = 0.0
     row[axis] = 1.0
     kernels.cholesky_solve(normal, row)
@@ -210,8 +210,8 @@ def _variance(normal, pulls, variance, axis, row):
 
 
 @njit(cache=True, nogil=True)
-def _improve(size, shape, misfit, last, count, pixels, place, told, work):
-    """Move a marker (2,) to where its pixels fit better; fill what is told of it (5,), see `fit_markers`."""
+def _improve(size, shape, misfit, last, count, pixels, place, result, work):
+    """Move a marker (2,) by one robust step; fill its results (5,), see `fit_markers`."""
     whitening, profile = shape
     values, brightness, residual = pixels[0], pixels[4], pixels[6]
     normal, right, row, pulls = work
@@ -226,8 +226,8 @@ def _improve(size, shape, misfit, last, count, pixels, place, told, work):
     ground, amplitude = _linear(values, brightness, residual, doubt, count)
     amplitude = max(amplitude, nothing)
     total, squares, core, middle = _sum(pixels, count, size, whitening, ground, amplitude, doubt, normal, right)
-    told[0], told[3], told[4] = amplitude, middle / max(core, 1), spread * spread
-    told[1], told[2] = np.inf, np.inf
+    result[0], result[3], result[4] = amplitude, middle / max(core, 1), spread * spread
+    result[1], result[2] = np.inf, np.inf
     if not kernels.cholesky(normal):
         return
     kernels.cholesky_solve(normal, right)
@@ -236,33 +236,33 @@ def _improve(size, shape, misfit, last, count, pixels, place, told, work):
     if last:
         variance = max(squares / max(total - 4, 1.0), LEAST_NOISE * LEAST_NOISE)
         _pull(pixels, count, size, whitening, ground, amplitude, doubt, pulls)
-        told[2] = 0.5 * (_variance(normal, pulls, variance, 2, row) + _variance(normal, pulls, variance, 3, row))
+        result[2] = 0.5 * (_variance(normal, pulls, variance, 2, row) + _variance(normal, pulls, variance, 3, row))
         row[:] = 0.0
         row[1] = 1.0
         kernels.cholesky_solve(normal, row)
-        told[1] = variance * row[1]
+        result[1] = variance * row[1]
 
 
 @njit(cache=True, nogil=True)
-def fit_markers(grey, inside, half, scale, close, shape, iterations, told, uv, found):
-    """Fit markers (N) in the windows around them, place by place.
+def fit_markers(grey, inside, half, scale, close, shape, iterations, with_variance, uv, found):
+    """Fit markers (N) in the windows around them, one after the other.
 
-    A marker that does not look like the shape leaves residuals that belong together: what pulls it to one side is said
-    by whole octants, and it is these whose scatter the variance of its place follows, where it is more than that of
-    single pixels (a sandwich estimator of clusters).
+    A marker that does not match the shape leaves correlated residuals. Whole octants are therefore treated as clusters,
+    and the variance of the position follows their scatter where that exceeds the scatter of single pixels (a
+    cluster-robust sandwich estimator).
 
     Args:
-        grey: (H, W) grey values, brighter where markers are.
-        inside: (N,) markers that are fitted.
-        half: px, half of a window.
-        scale: (N,) size of each marker in parts of the shape.
+        grey: (H, W) grey values, markers bright.
+        inside: (N,) the markers to fit.
+        half: px, half size of a window.
+        scale: (N,) size of each marker relative to the shape.
         close: (N, N) which other markers may reach into a window.
         shape: whitening (2, 2) and profile (R,).
-        iterations: the last ones of `MISFIT`.
-        told: whether variances are asked for; they stay infinite where not.
-        uv: (N, 2) where to begin; filled with the places.
-        found: (N, 5) amplitudes, of neighbours that were fitted before; filled with amplitude, its variance, the
-            variance of the place along an axis, the mean squared residual within the marker, and the squared noise.
+        iterations: number of iterations; uses the last entries of `MISFIT`.
+        with_variance: whether to compute variances; otherwise they stay infinite.
+        uv: (N, 2) initial positions; replaced by the fitted ones.
+        found: (N, 5) amplitudes of neighbours from an earlier fit; filled with amplitude, its variance, the variance
+            of the position per axis, the mean squared residual within the marker, and the squared noise.
     """
     whitening, profile = shape
     pixels = np.zeros((7, (2 * half + 1) ** 2), np.float32)
@@ -279,6 +279,6 @@ def fit_markers(grey, inside, half, scale, close, shape, iterations, told, uv, f
                 continue
             for m in range(len(uv)):
                 if close[n, m] and found[m, 0] > 0:
-                    _take_away(box, m, half, scale[m], found[m, 0], whitening, profile, uv, pixels[0])
-            last = told and iteration == len(MISFIT) - 1
+                    _subtract_marker(box, m, half, scale[m], found[m, 0], whitening, profile, uv, pixels[0])
+            last = with_variance and iteration == len(MISFIT) - 1
             _improve(scale[n], shape, MISFIT[iteration], last, count, pixels, uv[n], found[n], work)

@@ -1,4 +1,4 @@
-"""What the markers of a camera look like: their windows, boiled down to an ellipse and a profile, compiled."""
+"""Compiled common shape of a camera's markers: an ellipse and a radial profile from their windows."""
 
 # Compiled functions take their types from their arguments.
 # ruff: noqa: ANN001, ANN201, ANN202
@@ -11,15 +11,15 @@ import numpy as np
 from imgcal.geometry import kernels
 from renderers.compiling import njit
 
-RINGS = 0.5  # px of the shorter axis, from one value of a profile to the next
-FAINT = 0.25  # of the peak: where the shape is measured from
-MOMENTS = 6  # times that the window of the moments follows them
-TAPS = 4  # px that a blur with a standard deviation of one reaches
+RINGS = 0.5  # px along the shorter axis between values of a profile
+FAINT = 0.25  # of the peak: darker pixels do not count for the moments
+MOMENTS = 6  # iterations in which the window follows the moments
+TAPS = 4  # px, half width of a blur with a standard deviation of one
 
 
 @njit(cache=True, nogil=True)
 def median(values, count):
-    """Median of the first `count` values, which are reordered."""
+    """Median of the first `count` values; reorders them."""
     upper = kernels.select_rank(values, count, count // 2)
     if count % 2:
         return upper
@@ -31,7 +31,7 @@ def median(values, count):
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _blur(line, blurred):
-    """Blur a row of values with a standard deviation of one; the outer ones continue."""
+    """Blur a row of values with a standard deviation of one; the outer values are repeated beyond the ends."""
     weights = np.empty(2 * TAPS + 1)
     total = 0.0
     for k in range(2 * TAPS + 1):
@@ -51,9 +51,9 @@ def _blur(line, blurred):
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _medians(stack, count):
-    """Let the first row of (K, P) be the medians of its columns' first `count` values, which are reordered."""
+    """Replace the first row of (K, P) by the medians of the first `count` values of each column; reorders them."""
     middle = count // 2
-    for rank in range(middle + 1):  # of what has no rank yet, the smallest comes to the front
+    for rank in range(middle + 1):  # the smallest of the unsorted values moves to the front
         for other in range(rank + 1, count):
             for j in range(stack.shape[1]):
                 one, two = stack[rank, j], stack[other, j]
@@ -64,42 +64,42 @@ def _medians(stack, count):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _levels(patch, held):
-    """Give the medians of the rim, two pixels wide, and of the middle of a window (P, P)."""
+def _levels(patch, scratch):
+    """Medians of the rim, two pixels wide, and of the centre of a window (P, P)."""
     side = len(patch)
     half = side // 2
     reach = max(1.5, 0.25 * half)
     rim, inner, near = 0, 0, int(reach)
     for i in (0, 1, side - 2, side - 1):
         for j in range(side):
-            held[rim] = patch[i, j]
+            scratch[rim] = patch[i, j]
             rim += 1
     for i in range(2, side - 2):
         for j in (0, 1, side - 2, side - 1):
-            held[rim] = patch[i, j]
+            scratch[rim] = patch[i, j]
             rim += 1
-    level = median(held, rim)
+    level = median(scratch, rim)
     for i in range(-near, near + 1):
         for j in range(-near, near + 1):
             if i * i + j * j <= reach * reach:
-                held[inner] = patch[half + i, half + j]
+                scratch[inner] = patch[half + i, half + j]
                 inner += 1
-    return level, median(held, inner)
+    return level, median(scratch, inner)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def usual_window(patches, mean):
-    """Fill `mean` (P, P) with the median of windows (K, P, P), each less its rim and over its middle, made symmetric.
+    """Fill `mean` (P, P) with the median of windows (K, P, P), each normalized by rim and centre, made symmetric.
 
     Returns:
-        Whether there is any window that is brighter in the middle.
+        Whether any window is brighter in the centre.
     """
     count, side = len(patches), patches.shape[1]
-    held, stack = np.empty(side * side, np.float32), np.empty((count, side), np.float32)
+    scratch, stack = np.empty(side * side, np.float32), np.empty((count, side), np.float32)
     level, factor, bright = np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.int64)
     number = 0
     for n in range(count):
-        low, high = _levels(patches[n], held)
+        low, high = _levels(patches[n], scratch)
         if high > low:
             level[number], factor[number], bright[number] = low, 1 / (high - low), n
             number += 1
@@ -112,7 +112,7 @@ def usual_window(patches, mean):
         _medians(stack, number)
         for j in range(side):
             mean[i, j] = stack[0, j]
-    for i in range(side // 2 + 1):  # of a symmetric shape: the middle stays the middle
+    for i in range(side // 2 + 1):  # a symmetric shape has a fixed centre
         for j in range(side):
             both = (mean[i, j] + mean[side - 1 - i, side - 1 - j]) / 2
             mean[i, j], mean[side - 1 - i, side - 1 - j] = both, both
@@ -121,10 +121,10 @@ def usual_window(patches, mean):
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _moments(mean, covariance):
-    """Fill (a, b, c) with the covariance [[a, b], [b, c]] of what is connected to the middle; False = nothing is."""
+    """Fill (a, b, c) with the covariance [[a, b], [b, c]] of the central spot; False = no spot."""
     side = len(mean)
     half = side // 2
-    smooth, columns = np.empty((side, side)), np.empty((side, side))  # column by column
+    smooth, columns = np.empty((side, side)), np.empty((side, side))  # column-major
     for i in range(side):
         _blur(mean[i], smooth[i])
     for j in range(side):
@@ -141,7 +141,7 @@ def _moments(mean, covariance):
     if not top > 0:
         return False
     a, b, c = (0.3 * half) ** 2, 0.0, (0.3 * half) ** 2
-    for _ in range(MOMENTS):  # in a window that follows them
+    for _ in range(MOMENTS):  # the window follows the moments
         limit = 9 * (a * c - b * b)
         total, uu, uv, vv = 0.0, 0.0, 0.0, 0.0
         for j in range(side):
@@ -163,15 +163,15 @@ def _moments(mean, covariance):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def common_shape(patches, whitening, profile):
-    """Boil windows (K, P, P) with a marker in the middle of each down to what these have in common.
+    """Compute the common shape of markers from windows (K, P, P) centred on them.
 
     Args:
-        patches: grey values, brighter where markers are.
-        whitening: (2, 2) filled: ellipses become circles of the same pixels as the shorter axis.
-        profile: filled with the brightness at radii 0, RINGS, 2 RINGS, ..., one in the middle; P values are enough.
+        patches: grey values, markers bright.
+        whitening: (2, 2) output: maps ellipses to circles, in pixels of the shorter axis.
+        profile: output: brightness at radii 0, RINGS, 2 RINGS, ..., one at the centre; P values are enough.
 
     Returns:
-        How many values the profile has (0 = there is no marker), and the longer axis in parts of the shorter.
+        Number of values of the profile (0 = no marker), and the ratio of the longer to the shorter axis.
     """
     side = patches.shape[1]
     half = side // 2
@@ -181,7 +181,7 @@ def common_shape(patches, whitening, profile):
     a, b, c = covariance[0], covariance[1], covariance[2]
     apart = np.sqrt((a - c) ** 2 / 4 + b * b)
     short, long = np.sqrt((a + c) / 2 - apart), np.sqrt((a + c) / 2 + apart)
-    # The inverse of the root of a matrix of two rows, by the theorem of Cayley and Hamilton, times the shorter axis.
+    # Inverse square root of a 2 x 2 matrix by the Cayley-Hamilton theorem, times the shorter axis.
     scale = short / ((short + long) * short * long)
     whitening[0, 0], whitening[1, 1] = scale * (c + short * long), scale * (a + short * long)
     whitening[0, 1], whitening[1, 0] = -scale * b, -scale * b
@@ -200,7 +200,7 @@ def common_shape(patches, whitening, profile):
         sums[ring] /= max(numbers[ring], 1.0)
     _blur(sums, numbers)
     for ring in range(most - 1, -1, -1):
-        numbers[ring] = max(numbers[ring], numbers[ring + 1])  # it does not grow with the radius
+        numbers[ring] = max(numbers[ring], numbers[ring + 1])  # must not increase with the radius
     peak = numbers[0] - numbers[most]
     if not peak > 0:
         return 0, 1.0

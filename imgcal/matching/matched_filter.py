@@ -1,4 +1,4 @@
-"""The proposer that lays the object on the frames: where blobs fail, the whole pattern in all cameras still shows."""
+"""A proposer for frames where blobs fail: it fits the object's whole pattern in all cameras together."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from imgcal.matching.poses import Matcher, Ranked, Scene, anywhere, distinct_tur
 from imgcal.matching.refinement import Fitted, fit_and_measure
 from imgcal.types import CalibrationObject
 
-FINEST = 4  # px to a cell
-CELLS_A_GAP = 5.0  # cells of the search between neighbouring fiducials, at least
-TURNS = 4608  # of all rotations,
-TURN_APART = 0.26  # rad from each other
-KEPT = 200  # poses of each camera's search
+FINEST = 4  # px per cell
+CELLS_A_GAP = 5.0  # smallest distance between neighbouring fiducials in the search, in cells
+TURNS = 4608  # rotations, spread over all,
+TURN_APART = 0.26  # rad between neighbouring ones
+KEPT = 200  # poses from the search in one camera
 CLIMBING = 8
-SAME = 0.6  # share of the fiducials that two poses must see in the same places to be one
-SURE_CAMERA = 2.0  # log odds from which a camera has a say in that
+SAME = 0.6  # share of fiducials at equal places from which two poses count as the same
+SURE_CAMERA = 2.0  # smallest log odds of a camera that counts for this comparison
 CLEAR = 40.0  # log odds between the best pose and the best distinct one at which the search ends
 FINE_CLIMBS = (0.03, 0.012)
 """Radians: steps on the finest maps."""
-MOST_RIVALS = 4  # that are fitted, too, where the best pose does not stand out by far
-PARALLAX = 60.0  # px: what a pose from one camera may be off in the others
-NEARLY = 0.07  # rad that a pose may be turned against the known one before windows are placed anew
-WORTHWHILE = 0.6  # of the frames, above which these are looked at as a whole
+MOST_RIVALS = 4  # fitted as well if the best pose does not stand out by far
+PARALLAX = 60.0  # px: how far a pose from one camera may be off in the others
+NEARLY = 0.07  # rad: a pose rotated further than this from the known ones gets new windows
+WORTHWHILE = 0.6  # of the frames' area: larger windows are not worth it
 
 
 @dataclass(frozen=True)
 class MatchedFilter:
-    """Finds the object by its whole pattern, in all cameras together; see `Proposer`."""
+    """Find the object by its whole pattern, in all cameras together; see `Proposer`."""
 
     name: str = "matched"
 
     def propose(self, snapshot: Snapshot) -> Proposal:
-        """Look at one snapshot: around the known poses first, then at the whole frames, and anywhere in these."""
+        """Search one snapshot: around the known poses first, then whole frames, and finally for any pose."""
         scene = Scene(snapshot.rig, snapshot.obj, snapshot.prior_std, _distance(snapshot))
         near = _around(scene, snapshot)
         if near is not None and near.rig_from_object is not None and not _known_pose(near.rig_from_object, snapshot):
-            # Windows were placed for another pose: what lies at their edges is seen from the one that was found.
+            # The windows were placed for another pose, so the edges may be cut off: search from the new one.
             again = replace(snapshot, candidates=(near.rig_from_object,))
             near = _around(replace(scene, distance=_distance(again)), again) or near
         if near is not None:
@@ -53,14 +53,14 @@ class MatchedFilter:
         found = view.search_known(snapshot)
         if found is None:
             if not _searchable(scene.obj):
-                return Proposal.decline(snapshot, "its fiducials are too many and too close to search for it anywhere")
+                return Proposal.decline(snapshot, "its fiducials are too dense for a search without a known pose")
             found = view.search_anywhere()
         return view.proposal(found, snapshot)
 
 
 @dataclass(frozen=True)
 class View:
-    """The frames of a snapshot, or windows in them, as maps at the scales of the search."""
+    """The frames of a snapshot, or windows of them, as maps at the scales of the search."""
 
     scene: Scene
     frames: list[Frame | None]
@@ -72,7 +72,7 @@ class View:
 
     @classmethod
     def of(cls, scene: Scene, snapshot: Snapshot, windows: NDArray[np.int64] | None = None) -> View:
-        """Look at frames, or at windows (C, 4) of them: first and last columns and rows."""
+        """Build maps of frames, or of windows (C, 4) of them: first and last columns and rows."""
         names, dark = snapshot.rig.camera_names, snapshot.detection.polarity == "dark"
         frames, masks = [snapshot.frames.get(name) for name in names], [snapshot.masks.get(name) for name in names]
         fine, response = surprise_maps(frames, FINEST, dark, masks, windows)
@@ -80,20 +80,20 @@ class View:
         return cls(scene, frames, dark, fine, response, fine.pool(_coarsest(scene)), close)
 
     def proposal(self, found: Ranked, snapshot: Snapshot) -> Proposal:
-        """Fit and measure the best pose, and its rivals where it does not stand out by far."""
+        """Fit and measure the best pose, and its rivals if it does not stand out by far."""
         scene = self.scene
         margin, rivals = pose_margin(found, self.close)
         result = self._fit(found.best(1)) if margin > 0 else None
         if result is None:
             return Proposal.decline(snapshot, "no pose of the object stands out in the images", margin)
         if margin < CLEAR:
-            # With rig and pose fitted, places are compared to a cell: chance agreements gain nothing from that.
+            # After the fit of rig and pose, places are compared within a cell, which does not favour chance matches.
             against = rivals.scores.total.tolist()
             for k in range(min(MOST_RIVALS, len(against))):
                 rival = self._fit(rivals.select(np.array([k])))
                 if rival is None:
                     continue
-                # One that comes to the same places when it is fitted was none.
+                # A rival that converges to the same places was none.
                 other = bool(differs(rival.predicted[None], result.predicted, scene.obj)[0])
                 against[k] = max(against[k], rival.log_odds(scene, self.fine)) if other else 0.0
             margin = max(margin, result.log_odds(scene, self.fine) - max([0.0, *against]))
@@ -104,7 +104,7 @@ class View:
         return fit_and_measure(self.scene, pose, self.fine, self.response, self.frames, self.dark)
 
     def search_known(self, snapshot: Snapshot) -> Ranked | None:
-        """Look at the known poses, or the origin, and around them; None = the object is not there for sure."""
+        """Search at the known poses, or the origin, and around them; None = the object may be elsewhere."""
         scene, close, found = self.scene, self.close, None
         matcher = Matcher.on(scene, self.coarse, close.reach)
         known = [pose for pose in _known_poses(snapshot) if _is_in_view(pose, snapshot)]
@@ -121,7 +121,7 @@ class View:
         return None if _searchable(scene.obj) else found
 
     def search_anywhere(self) -> Ranked:
-        """Look anywhere: from the image of one camera after the other, until a pose stands out."""
+        """Search for any pose: from one camera's image after the other, until a pose stands out."""
         scene, close, coarse = self.scene, self.close, self.coarse
         turns = distinct_turns(scene.obj, TURNS)
         reach = 4 * 2**0.5 * scene.drift + PARALLAX
@@ -140,10 +140,10 @@ class View:
 
 
 def pose_margin(found: Ranked, matcher: Matcher) -> tuple[float, Ranked]:
-    """Compare the best pose with the best distinct ones, be they found or made by moving the object onto itself.
+    """Compare the best pose with the best distinct ones: found ones and near-symmetries of the best.
 
     Returns:
-        Log odds against the best of these, and these, the best first.
+        Log odds against the best rival, and the rivals, the best first.
     """
     obj, best = matcher.scene.obj, found.best(1)
     motions = lattice_shifts(obj) + near_symmetries(obj, 0.1 * obj.size)
@@ -157,13 +157,13 @@ def pose_margin(found: Ranked, matcher: Matcher) -> tuple[float, Ranked]:
 
 
 def distinct(found: Ranked, best: Ranked, scene: Scene) -> NDArray[np.bool_]:
-    """Tell which poses (K,) see other fiducials than the best one does in the same places, but for symmetric turns."""
+    """Find poses (K,) that do not put the fiducials in the same places as the best one, up to symmetries."""
     sure = best.scores.log_odds[0] > SURE_CAMERA
     return differs(_places(found, scene)[:, sure], _places(best, scene)[0, sure], scene.obj)
 
 
 def differs(there: NDArray[np.float64], here: NDArray[np.float64], obj: CalibrationObject) -> NDArray[np.bool_]:
-    """Tell which of K sets of places (K, C, N, 2) have other fiducials where those of one (C, N, 2) are: (K,)."""
+    """Compare K sets of places (K, C, N, 2) with one (C, N, 2): (K,) whether the fiducials are elsewhere."""
     gaps = np.linalg.norm(here[:, :, None] - here[:, None], axis=-1)
     gaps[:, np.arange(here.shape[1]), np.arange(here.shape[1])] = np.inf
     gap = gaps.min(-1)
@@ -176,25 +176,25 @@ def differs(there: NDArray[np.float64], here: NDArray[np.float64], obj: Calibrat
 
 
 def _places(found: Ranked, scene: Scene) -> NDArray[np.float64]:
-    """Where poses see all fiducials, with the shifts of the cameras: (K, C, N, 2) pixels."""
+    """Predicted places of all fiducials, with the shifts of the cameras: (K, C, N, 2) pixels."""
     points = found.poses.apply(scene.obj.points.to(scene.rig.focal_length))
     uv = scene.rig.expand(len(points)).project_values(points, scene.obj.radius).uv.numpy()
     return uv + found.scores.shift[:, :, None]
 
 
 def _reach(scene: Scene) -> NDArray[np.float64]:
-    """How far the images of a known pose may be shifted: (C,) pixels."""
+    """Largest shift of the images of a known pose: (C,) pixels."""
     return 4 * scene.drift + PARALLAX / 3
 
 
 def _coarsest(scene: Scene) -> int:
-    """Pixels to a cell with which the search begins."""
+    """Pixels per cell at the start of the search."""
     gap = _gap(scene.obj) * scene.pixels_per_mm
     return int(max(FINEST, 2 ** int(np.log2(max(gap / CELLS_A_GAP, 1)))))
 
 
 def _around(scene: Scene, snapshot: Snapshot) -> Proposal | None:
-    """Look at windows around the known poses; None = there are none, or nothing stands out in them."""
+    """Search windows around the known poses; None = no known pose, or none that stands out."""
     windows = _windows(scene, snapshot)
     if windows is None:
         return None
@@ -205,15 +205,15 @@ def _around(scene: Scene, snapshot: Snapshot) -> Proposal | None:
 
 
 def _known_pose(pose: RigidTransform, snapshot: Snapshot) -> bool:
-    """Tell whether a pose is nearly one of those that were known."""
+    """Check whether a pose is close to a known one."""
     return any(float(geodesic_angle(pose.rotation, known.rotation)) < NEARLY for known in snapshot.candidates)
 
 
 def _windows(scene: Scene, snapshot: Snapshot) -> NDArray[np.int64] | None:
-    """Where the known poses, and turns around them, put the object: (C, 4), see `View.of`.
+    """Windows that contain the object in the known poses and rotations around them: (C, 4), see `View.of`.
 
     Returns:
-        None where nothing is known, or where it is known too vaguely for windows to be much smaller than frames.
+        The windows; None where no pose is known, or where they would not be much smaller than the frames.
     """
     known = [pose for pose in snapshot.candidates if _is_in_view(pose, snapshot)]
     if not known:
@@ -236,36 +236,36 @@ def _windows(scene: Scene, snapshot: Snapshot) -> NDArray[np.int64] | None:
 
 
 def _promise(maps: Maps) -> NDArray[np.float64]:
-    """How much stands out in each camera: (C,)."""
+    """Sum of the largest surprises in each camera: (C,)."""
     flat = maps.surprise.reshape(len(maps.surprise), -1)
     return np.sort(flat, axis=1)[:, -64:].sum(1)
 
 
 def _gap(obj: CalibrationObject) -> float:
-    """Usual distance (mm) from a fiducial to the nearest other one."""
+    """Typical distance (mm) from a fiducial to its nearest neighbour."""
     gaps = torch.cdist(obj.points, obj.points)
     gaps.fill_diagonal_(torch.inf)
     return float(gaps.min(1).values.median())
 
 
 def _searchable(obj: CalibrationObject) -> bool:
-    """Tell whether turns as far apart as those of the search still show most fiducials near their places."""
+    """Check that rotations between the search's samples keep most fiducials near their places."""
     return TURN_APART / 2 * obj.size < 0.6 * _gap(obj)
 
 
 def _known_poses(snapshot: Snapshot) -> list[RigidTransform]:
-    """Poses worth a look: those given, or the origin, where many captures have the object."""
+    """Poses to try: the given ones, or the origin, where many captures have the object."""
     return list(snapshot.candidates) or [RigidTransform.identity(dtype=torch.float64)]
 
 
 def _is_in_view(pose: RigidTransform, snapshot: Snapshot) -> bool:
-    """Tell whether some camera would see the object there."""
+    """Check whether any camera would see the object there."""
     points = pose.apply(snapshot.obj.points.to(snapshot.rig.focal_length))
     return bool(snapshot.rig.expand(1).project_values(points[None]).visible.any())
 
 
 def _distance(snapshot: Snapshot) -> float:
-    """How far from the cameras the object is, roughly, mm."""
+    """Approximate distance of the object from the cameras, mm."""
     rig, obj = snapshot.rig, snapshot.obj
     if not snapshot.candidates and rig.working_distance is not None:
         return rig.working_distance
@@ -273,5 +273,5 @@ def _distance(snapshot: Snapshot) -> float:
         if _is_in_view(pose, snapshot):
             centre = pose.apply(obj.points.mean(0, keepdim=True))[0]
             return float((rig.positions - centre).norm(dim=-1).median())
-    # As large as a fifth of the image.
+    # Assume that the object spans a fifth of the image.
     return float((rig.focal_length.mean(-1) * obj.size / (0.2 * rig.image_size[:, 0])).median())

@@ -1,4 +1,4 @@
-"""Markers measured where they are expected: all of a camera share one shape, each has its place and brightness."""
+"""Measurement of markers at expected places: all in a camera share one shape, each has its position and brightness."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from imgcal.detection import Frame
 from imgcal.matching.camera_fit import USUAL_MISFIT, fit_camera
 from imgcal.matching.marker_fit import MISFIT, NEAR
 
-LEAST_SIGMA = 0.02  # px: what no fit is better than
+LEAST_SIGMA = 0.02  # px: best accuracy of a fit
 LEAST_SIGNIFICANCE = 5.0  # amplitude over its standard deviation
-HALF_HIDDEN = 0.7  # of the radius: how far the centre may be off per misfit
+HALF_HIDDEN = 0.7  # of the radius: possible shift of the centre per misfit
 UNEVEN, EVEN = (
     0.2,
     0.03,
 )  # of the radius: standard deviation of a whole marker's centre, per misfit beyond that of pixels
-LARGEST = 40  # px, half of a window
+LARGEST = 40  # px, largest half size of a window
 
 
 @dataclass(frozen=True)
@@ -27,15 +27,15 @@ class Measured:
     """Markers of one camera."""
 
     uv: NDArray[np.float64]  # (N, 2) pixels
-    sigma: NDArray[np.float64]  # (N,) pixels, one standard deviation of each axis
+    sigma: NDArray[np.float64]  # (N,) pixels, standard deviation per axis
     amplitude: NDArray[np.float64]  # (N,) grey levels
     significance: NDArray[np.float64]  # (N,) amplitude over its standard deviation
-    radius: float  # px, of the disc as large as the marker's image
-    misfit: NDArray[np.float64]  # (N,) RMS difference from the common shape beyond noise, in parts of the amplitude
+    radius: float  # px, of the disc with the area of the marker's image
+    misfit: NDArray[np.float64]  # (N,) RMS difference from the common shape beyond noise, relative to the amplitude
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """Those that are surely there: (N,)."""
+        """Markers that are certainly present: (N,)."""
         return (self.significance > LEAST_SIGNIFICANCE) & np.isfinite(self.uv).all(1)
 
 
@@ -52,10 +52,10 @@ def measure_markers(
     Args:
         frame: (H, W) grey values.
         expected: (N, 2) pixels.
-        radius: (N,) px, how large they are: roughly, but for their ratios.
+        radius: (N,) px, approximate sizes; only their ratios must be accurate.
         dark: markers are darker than their surroundings.
-        sure: (N,) those from which the common shape is taken.
-        iterations: of the places, in each of the passes in which shape and places are found from one another.
+        sure: (N,) the markers that define the common shape.
+        iterations: iterations on the positions in each pass; a pass estimates the shape, then the positions.
     """
     height, width = frame.shape
     usual = _quantile(radius, 0.5)
@@ -71,10 +71,10 @@ def measure_markers(
     if size == 0:
         return _nothing(len(expected), usual)
     amplitude, spread, place = found.T[:3]
-    # Where the middle of a marker does not look like the common shape, part of it may be hidden.
+    # If the centre of a marker does not match the common shape, part of it may be hidden.
     least = max(USUAL_MISFIT, 2 * _quantile(misfit[inside], 0.25))
     doubt = HALF_HIDDEN * np.maximum(misfit - least, 0) * size * scale
-    # What makes it uneven pulls it to one side, too: the fit follows, and no residual shows that.
+    # Uneven brightness also shifts the centre, and the fit follows it without residuals.
     uneven = UNEVEN * np.maximum(misfit - EVEN, 0) * size * scale
     sigma = np.sqrt(place + LEAST_SIGMA**2 + doubt**2 + uneven**2)
     significance = np.where(inside & (amplitude > 0), amplitude / np.sqrt(np.maximum(spread, 1e-12)), 0.0)
@@ -82,7 +82,7 @@ def measure_markers(
 
 
 def _quantile(values: NDArray[np.float64], share: float) -> float:
-    """Do what `np.quantile` does for some values (N,), in a tenth of the time."""
+    """Quantile of values (N,), ten times faster than `np.quantile` for a few."""
     ordered, place = np.sort(values), share * (len(values) - 1)
     low, high = ordered[math.floor(place)], ordered[math.ceil(place)]
     return float(low + (place % 1) * (high - low))
@@ -96,7 +96,7 @@ def _nothing(count: int, radius: float) -> Measured:
 def _part(
     frame: Frame, uv: NDArray[np.float64], reach: float, dark: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Cut out what is around places (N, 2), brighter where markers are; gives also its first column and row."""
+    """Cut out the surroundings of places (N, 2), with bright markers; also return its first column and row."""
     corner = np.maximum(np.floor(uv.min(0) - reach), 0).astype(np.int64)
     right, bottom = (np.ceil(uv.max(0) + reach) + 1).astype(np.int64).tolist()
     left, top = corner.tolist()

@@ -1,4 +1,4 @@
-"""Poses that the maps suggest: around one that is known, or anywhere."""
+"""Candidate poses from the maps: around a known one, or anywhere."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from imgcal.matching.correlation import Scores, correlate, gains
 from imgcal.matching.maps import Maps
 from imgcal.types import CalibrationObject, CameraRig
 
-NEAR = 0.31  # rad: how far a known pose may be turned
-STEP = 0.105  # rad: between the turns that are tried around it
+NEAR = 0.31  # rad: largest rotation from a known pose
+STEP = 0.105  # rad: between the rotations tried around it
 CLIMBS = (0.07, 0.035, 0.017)
-"""Radians: steps of the search for the best turn."""
-OFF = 60.0  # mm: standard deviation of the place of a pose that the maps suggest
+"""Radians: step sizes of the search for the best rotation."""
+OFF = 60.0  # mm: standard deviation of the position of a candidate pose
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What is given."""
+    """The inputs of the search."""
 
     rig: CameraRig
     obj: CalibrationObject
     std: Tensor  # (C, parameters)
-    distance: float  # mm, from the cameras to the object, roughly
+    distance: float  # mm, approximate, from the cameras to the object
 
     @cached_property
     def drift(self) -> NDArray[np.float64]:
-        """One standard deviation of how far drift moves the object's image: (C,) pixels."""
+        """Standard deviation of the image shift that drift causes: (C,) pixels."""
         return pattern_prior(self.std, self.rig, self.distance).shift
 
     @property
@@ -47,21 +47,21 @@ class Scene:
 
 @dataclass(frozen=True)
 class Ranked:
-    """Poses, the best first."""
+    """Poses with their scores."""
 
     poses: RigidTransform  # (K,)
     scores: Scores  # (K, C)
 
     def select(self, rows: NDArray[np.int64]) -> Ranked:
-        """Keep the given ones, in this order."""
+        """Select poses, in the given order."""
         return Ranked(self.poses[torch.from_numpy(rows)], self.scores.select(rows))
 
     def best(self, count: int) -> Ranked:
-        """Keep the best ones, in order."""
+        """Select the best poses, in order."""
         return self.select(np.argsort(-self.scores.total, kind="stable")[:count])
 
     def or_better(self, other: Ranked) -> Ranked:
-        """Of two sets of as many poses, the better one of each pair."""
+        """Choose the better pose of each pair from two equally long sets."""
         count = len(self.poses.rotation)
         take = np.where(other.scores.total > self.scores.total, count, 0)
         return (self + other).select(take + np.arange(count))
@@ -72,12 +72,12 @@ class Ranked:
 
 @dataclass(frozen=True)
 class Matcher:
-    """Lays the object on maps of one scale."""
+    """Match the object with maps of one scale."""
 
     scene: Scene
     maps: Maps
     gain: NDArray[np.float32]  # (C, H, W)
-    reach: NDArray[np.float64]  # (C,) pixels that images may be shifted
+    reach: NDArray[np.float64]  # (C,) pixels, largest shift of each image
 
     @classmethod
     def on(cls, scene: Scene, maps: Maps, reach: NDArray[np.float64]) -> Matcher:
@@ -85,11 +85,11 @@ class Matcher:
         return cls(scene, maps, gains(maps), reach)
 
     def rank(self, poses: RigidTransform) -> Ranked:
-        """Score poses (K,), in their order."""
+        """Score poses (K,), keeping their order."""
         return Ranked(poses, correlate(self.maps, self.gain, self.scene.rig, self.scene.obj, poses, self.reach))
 
     def climb(self, found: Ranked, steps: Sequence[float] = CLIMBS) -> Ranked:
-        """Turn and move each pose to where it fits best: (K,) in their order."""
+        """Rotate and move each pose to where it fits best: (K,), keeping their order."""
         turns = _axes(found.poses.rotation)
         for step in steps:
             found = found.or_better(self.rank(move_object(found, self.scene)))
@@ -102,7 +102,7 @@ class Matcher:
 
 
 def turns_around(pose: RigidTransform, obj: CalibrationObject) -> RigidTransform:
-    """Turn a pose about the object's centre in all directions, the smallest turns first: (K,)."""
+    """Rotate a pose about the object's centre in all directions, the smallest rotations first: (K,)."""
     steps = np.arange(-NEAR, NEAR + 1e-9, STEP)
     vectors = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
     size = np.linalg.norm(vectors, axis=1)
@@ -112,7 +112,7 @@ def turns_around(pose: RigidTransform, obj: CalibrationObject) -> RigidTransform
 
 
 def turn_object(poses: RigidTransform, vectors: Tensor, obj: CalibrationObject) -> RigidTransform:
-    """Turn the object in poses (K,) about its centre by rotation vectors (K, 3) or (3,), in the object's axes."""
+    """Rotate the object in poses (K,) about its centre by rotation vectors (K, 3) or (3,), in the object's axes."""
     rotation = poses.rotation @ rotation_from_vector(vectors)
     centre = obj.points.mean(0).to(rotation)
     place = poses.rotation @ centre + poses.translation
@@ -120,7 +120,7 @@ def turn_object(poses: RigidTransform, vectors: Tensor, obj: CalibrationObject) 
 
 
 def move_object(found: Ranked, scene: Scene) -> RigidTransform:
-    """Move the object to where most cameras see it, as far as drift does not explain the shifts of their images."""
+    """Move the object to where most cameras see it, after allowing for drift in their image shifts."""
     rotation = found.poses.rotation
     centre = scene.obj.points.mean(0).to(rotation)
     places = rotation @ centre + found.poses.translation  # (K, 3)
@@ -138,7 +138,7 @@ def move_object(found: Ranked, scene: Scene) -> RigidTransform:
 
 @lru_cache(maxsize=8)
 def all_turns(count: int) -> NDArray[np.float64]:
-    """Spread rotations evenly: (count, 3, 3).
+    """Sample rotations uniformly: (count, 3, 3).
 
     Source: Alexa 2022, "Super-Fibonacci Spirals: Fast, Low-Discrepancy Sampling of SO(3)".
     """
@@ -151,24 +151,24 @@ def all_turns(count: int) -> NDArray[np.float64]:
 
 
 def distinct_turns(obj: CalibrationObject, count: int) -> NDArray[np.float64]:
-    """Spread rotations evenly, of those that look alike one only: about (count / order, 3, 3)."""
+    """Sample rotations uniformly, without equivalent ones of a symmetric object: about (count / order, 3, 3)."""
     turns = all_turns(count)
     if len(obj.symmetries) == 1:
         return turns
     alike = np.stack([motion.rotation for motion in obj.symmetries])
-    # Of rotations that look alike, that with the smallest angle, which is that of the largest trace.
+    # Of equivalent rotations, keep the one with the smallest angle, which has the largest trace.
     traces = np.einsum("kij,gji->gk", turns, alike)
     return turns[traces[0] >= traces.max(0) - 1e-9] if len(alike) else turns
 
 
 def anywhere(matcher: Matcher, camera: int, turns: NDArray[np.float64], count: int) -> RigidTransform:
-    """Look for the object in the whole image of one camera, at the usual distance: the best poses (count,).
+    """Search for the object in the whole image of one camera, at the usual distance: the best poses (count,).
 
     Args:
         matcher: on coarse maps.
-        camera: which one.
-        turns: (K, 3, 3) of the object against that camera.
-        count: how many to give.
+        camera: index of the camera.
+        turns: (K, 3, 3) rotations of the object relative to that camera.
+        count: number of poses to return.
     """
     scene = matcher.scene
     alone = Matcher(
@@ -178,7 +178,7 @@ def anywhere(matcher: Matcher, camera: int, turns: NDArray[np.float64], count: i
         np.full(1, matcher.maps.factor * matcher.maps.size[camera].max() / 2),
     )
     cam_from_rig = scene.rig.cam_from_rig[camera]
-    # In the middle of the image, at the usual distance; the shift says where it is instead.
+    # Start in the centre of the image, at the usual distance; the shift corrects the direction.
     lens = scene.rig.select([camera])
     middle = (lens.image_size[0].to(lens.focal_length) / 2 - lens.principal_point[0]) / lens.focal_length[0]
     ray = torch.cat((middle, middle.new_ones(1)))
@@ -192,7 +192,7 @@ def anywhere(matcher: Matcher, camera: int, turns: NDArray[np.float64], count: i
     shift = torch.from_numpy(found.scores.shift[best, 0])
     ray = torch.cat((middle + shift / lens.focal_length[0], middle.new_ones(count, 1)), dim=1)
     place = ray * (scene.distance / ray.norm(dim=1, keepdim=True))
-    # What is seen away from the middle is seen from another side.
+    # Away from the centre, the object is seen from another side.
     straight = torch.cat((middle, middle.new_ones(1))).expand(count, 3)
     rotation = _between(straight, ray) @ rotation[torch.from_numpy(best)]
     return inverse @ RigidTransform(rotation, place - rotation @ centre)

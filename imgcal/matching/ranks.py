@@ -1,4 +1,4 @@
-"""How unusual values are among all of a map: ranks by a histogram, compiled."""
+"""Compiled ranks: how rare values are within a map, by a histogram."""
 
 # Compiled functions take their types from their arguments.
 # ruff: noqa: ANN001, ANN201
@@ -13,19 +13,19 @@ from renderers.compiling import njit
 
 BINS = 4096
 MOST = 9.0
-"""Surprise beyond which nothing counts more: a reflection is no better a marker for being bright."""
-EVERY = 3  # row and column from whose values the noise is taken
+"""Upper limit of surprise: a bright reflection is no better marker for its brightness."""
+EVERY = 3  # step of rows and columns for the noise estimate
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def raise_ranks(values, size, tries, ranks):
-    """Raise ranks, where they are lower, to minus the logarithm of the share of the values that are as large.
+    """Raise ranks, where they are lower, to minus the logarithm of the share of values that are at least as large.
 
     Args:
         values: (H, W).
-        size: (2,) width and height of the part that counts.
-        tries: by how much one is luckier to find as large a value: in so many maps it is looked for.
-        ranks: (H, W) from 0 to `MOST`, raised.
+        size: (2,) width and height of the valid part.
+        tries: number of maps that are searched; multiplies the share, as a correction for multiple testing.
+        ranks: (H, W) from 0 to `MOST`; raised in place.
     """
     width, height = size
     low, high = values[0, 0], values[0, 0]
@@ -34,8 +34,8 @@ def raise_ranks(values, size, tries, ranks):
             low, high = min(low, values[i, j]), max(high, values[i, j])
     if not high > low:
         return
-    # The interesting ones are few and large: bins are narrow at zero and wide far out, by a logarithm of |x| + 1 that
-    # is straight between powers of two, as the bits of a number are.
+    # The interesting values are few and large: bins are narrow at zero and wide far out. They follow a logarithm of
+    # |x| + 1 that is linear between powers of two, like the bits of a float.
     one, ends = np.ones(1, np.float32), np.empty(2, np.float32)
     ends[0], ends[1] = abs(low) + np.float32(1), abs(high) + np.float32(1)
     zero, bits = one.view(np.int32)[0], ends.view(np.int32)
@@ -66,23 +66,23 @@ def raise_ranks(values, size, tries, ranks):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def rank_spots(response, covered, size, ranks):
-    """Turn responses into standard deviations of their noise, and raise ranks to those of the best of them.
+    """Normalize responses by their noise, and raise ranks to those of the largest response.
 
     Args:
-        response: (sizes, H, W), of which as much is filled as `size` says; divided by the noise, 0 where covered.
-        covered: (H, W) non-zero where not to look, or empty.
-        size: (2,) width and height of the part that counts.
-        ranks: (H, W) zeros, filled.
+        response: (sizes, H, W), valid as far as `size` tells; divided by the noise in place, 0 where covered.
+        covered: (H, W) non-zero in excluded cells, or empty.
+        size: (2,) width and height of the valid part.
+        ranks: (H, W) zeros; filled.
     """
     width, height = size
-    held = np.empty(((height + EVERY - 1) // EVERY) * ((width + EVERY - 1) // EVERY), np.float32)
+    sample = np.empty(((height + EVERY - 1) // EVERY) * ((width + EVERY - 1) // EVERY), np.float32)
     for k in range(len(response)):
         values, number = response[k], 0
         for i in range(0, height, EVERY):
             for j in range(0, width, EVERY):
-                held[number] = abs(values[i, j])
+                sample[number] = abs(values[i, j])
                 number += 1
-        factor = np.float32(1 / max(1.4826 * median(held, number), 1e-3))
+        factor = np.float32(1 / max(1.4826 * median(sample, number), 1e-3))
         for i in range(height):
             for j in range(width):
                 values[i, j] *= factor
@@ -96,7 +96,7 @@ def rank_spots(response, covered, size, ranks):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def average(frame, corner, factor, cells):
-    """Fill cells (H, W) with the means of blocks of a frame, the first of which begins at a column and row (2,)."""
+    """Fill cells (H, W) with the means of blocks of a frame; the first block starts at a column and row (2,)."""
     height, width = cells.shape
     left, top = corner
     sums = np.empty(width * factor, np.int32)

@@ -1,4 +1,4 @@
-"""From a pose that agrees with the maps to measured fiducials: rig and pose are fitted, markers measured, in turns."""
+"""From a pose that agrees with the maps to measured fiducials: alternates fits of rig and pose with measurements."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from imgcal.matching.poses import Ranked, Scene
 from imgcal.types import CameraRig, Observations
 
 ROBUST = EstimationOptions(loss="cauchy", threshold=2.0, max_iterations=30, tolerance=1e-2)
-SURE = 6.0  # log odds from which a camera surely shows the object where the maps say
+SURE = 6.0  # log odds from which a camera certainly shows the object where the maps suggest
 SURPRISED = 4.0  # surprise from which a cell may be a marker
-LEAST_IN_CAMERA = 3  # fiducials that fit, below which a camera says nothing
-OUTLIER = 5.0  # standard deviations from which a measured marker is something else
-SHAPE_ERROR = 0.3  # px: what a measured place may be off beyond its own sigma
-MOST_STEPS = 4  # of a lattice that a camera's image may have been shifted by
-LEAST_FITTED = 6  # fiducials of all cameras
-GATES = (8.0, 2.5)  # px that a measured place may be off the fitted rig, once and again
-ITERATIONS = ((len(MISFIT), NEAR), (NEAR,))  # of the places, see `measure_markers`: once found they are near
+LEAST_IN_CAMERA = 3  # smallest number of fitting fiducials for a camera to count
+OUTLIER = 5.0  # standard deviations beyond which a measured marker is an outlier
+SHAPE_ERROR = 0.3  # px: error of a measured position beyond its own sigma
+MOST_STEPS = 4  # most steps of a lattice by which a camera's image may be shifted
+LEAST_FITTED = 6  # fiducials in all cameras together
+GATES = (8.0, 2.5)  # px between a measurement and the fitted rig, in the first and second round
+ITERATIONS = ((len(MISFIT), NEAR), (NEAR,))  # see `measure_markers`: fewer when positions are already close
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """Rig and pose, with what was measured of each fiducial."""
+    """Rig and pose, with the measurement of each fiducial."""
 
     rig: CameraRig
     rig_from_object: RigidTransform
@@ -43,12 +43,12 @@ class Fitted:
     sigma: NDArray[np.float64]  # (C, N) pixels
     radius: NDArray[np.float64]  # (C, N) pixels
     seen: NDArray[np.bool_]  # (C, N)
-    predicted: NDArray[np.float64]  # (C, N, 2) pixels, where rig and pose put the fiducials
+    predicted: NDArray[np.float64]  # (C, N, 2) pixels, predicted by rig and pose
 
     def log_odds(self, scene: Scene, maps: Maps) -> float:
-        """How much more is where the fiducials are put than elsewhere: log odds against nothing being there.
+        """Log odds of the fiducials' predicted places in the maps, against no object.
 
-        No image is shifted any more; what the fit of each has cost is that its place was known by the prior only.
+        Images are no longer shifted. The fit costs the log of each camera's prior area of the image shift.
         """
         there = gain_at(maps, gains(maps), self.predicted)
         cost = np.log(np.maximum(2 * np.pi * (scene.drift / maps.factor) ** 2, 1.0))
@@ -63,12 +63,12 @@ def fit_and_measure(
     frames: Sequence[Frame | None],
     dark: bool,
 ) -> Fitted | None:
-    """Fit and measure, finer each time; None = too little is left.
+    """Fit and measure, with increasing accuracy; None = too few markers are left.
 
     Args:
-        scene: what is given.
+        scene: the inputs of the search.
         found: one pose.
-        maps: fine ones.
+        maps: the fine maps.
         response: (C, sizes, H, W) from `surprise_maps`.
         frames: of each camera.
         dark: markers are darker than their surroundings.
@@ -84,21 +84,21 @@ def fit_and_measure(
         if fit is None:
             return None
         pose, predicted = fit.rig_from_object[0], predictions(fit.rig, scene, fit.rig_from_object[0])
-        # What was measured where the fitted rig has it need not be found again.
+        # A measurement that agrees with the fitted rig is a better start than the prediction.
         there = np.linalg.norm(uv - predicted, axis=-1, keepdims=True) < gate
         expected = np.where(there, uv, predicted)
         markers = _measure(scene, fit, expected, maps, response, frames, dark, iterations)
         uv, sigma = np.stack([m.uv for m in markers]), np.stack([m.sigma for m in markers])
         off = np.linalg.norm(np.nan_to_num(uv) - predicted, axis=-1)
         near = off < np.hypot(gate, OUTLIER * np.minimum(sigma, 3.0))
-        seen = _enough(np.stack([m.seen for m in markers]) & near)
+        seen = _drop_weak_cameras(np.stack([m.seen for m in markers]) & near)
         fit = _fit(scene, pose, uv, np.hypot(sigma, SHAPE_ERROR), seen)
     if fit is None:
         return None
     pose, predicted = fit.rig_from_object[0], predictions(fit.rig, scene, fit.rig_from_object[0])
     radius = np.stack([np.full(len(m.sigma), m.radius) for m in markers])
     off = np.linalg.norm(np.nan_to_num(uv) - predicted, axis=-1)
-    seen = _enough(seen & (off < OUTLIER * np.hypot(sigma, SHAPE_ERROR)))
+    seen = _drop_weak_cameras(seen & (off < OUTLIER * np.hypot(sigma, SHAPE_ERROR)))
     return Fitted(fit.rig, pose, uv, sigma, radius, seen, predicted)
 
 
@@ -109,19 +109,19 @@ def predictions(rig: CameraRig, scene: Scene, pose: RigidTransform) -> NDArray[n
 
 
 def spacing(uv: NDArray[np.float64]) -> float:
-    """Median distance (px) from a fiducial's image (C, N, 2) to the nearest other one."""
+    """Median distance (px) from a fiducial's image (C, N, 2) to its nearest neighbour."""
     gaps = np.linalg.norm(uv[:, :, None] - uv[:, None], axis=-1)
     gaps[:, np.arange(uv.shape[1]), np.arange(uv.shape[1])] = np.inf
     return float(np.median(gaps.min(-1)))
 
 
-def _enough(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Leave out cameras in which hardly anything (C, N) fits: it may do so by chance."""
+def _drop_weak_cameras(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Drop cameras in which only a few fiducials (C, N) fit, because that may be chance."""
     return seen & (seen.sum(1, keepdims=True) >= LEAST_IN_CAMERA)
 
 
 def _peaks(maps: Maps, predicted: NDArray[np.float64], cells: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Find the most surprising place within so many cells of each prediction (C, N, 2), to a part of a cell."""
+    """Find the most surprising place within `cells` cells of each prediction (C, N, 2), with subcell accuracy."""
     count, height, width = maps.surprise.shape
     middle = np.floor(maps.cells(predicted)).astype(np.int64)
     inside = ((middle >= 0) & (middle < maps.size[:, None])).all(-1)
@@ -132,7 +132,7 @@ def _peaks(maps: Maps, predicted: NDArray[np.float64], cells: int) -> tuple[NDAr
     columns = np.clip(middle[..., 0, None] + du, 0, width - 1)
     rows = np.clip(middle[..., 1, None] + dv, 0, height - 1)
     values = maps.surprise[np.arange(count)[:, None, None], rows, columns]  # (C, N, K)
-    # Capped maps have plateaus: their middle counts, the nearer to the prediction the more.
+    # Surprise is capped, so maps have plateaus: average over them, with weights that favour the prediction.
     peak = values.max(-1, keepdims=True)
     weight = np.exp(4 * (values - peak)) * np.exp(-(du**2 + dv**2) / (2 * cells**2))
     place = np.stack(((weight * columns).sum(-1), (weight * rows).sum(-1)), -1) / weight.sum(-1, keepdims=True)
@@ -147,7 +147,7 @@ def _fit_peaks(
     reaches: Sequence[int],
     sure: NDArray[np.bool_],
 ) -> Estimate | None:
-    """Fit to the most surprising places near predictions (C, N, 2), closer each time, `sure` (C, 1) cameras first."""
+    """Fit to the most surprising places near predictions (C, N, 2), ever closer, first in `sure` (C, 1) cameras."""
     fit: Estimate | None = None
     for cells in reaches:
         uv, seen = _peaks(maps, predicted, cells)
@@ -160,9 +160,9 @@ def _fit_peaks(
 
 
 def _align_lattice(scene: Scene, fit: Estimate | None, maps: Maps) -> Estimate | None:
-    """Shift the pattern by steps of its lattice in each camera in which more of it shows then, and fit again.
+    """Shift the pattern in each camera by lattice steps that match more of it, and fit again.
 
-    A camera whose image was shifted by one dot shows all but the edge; with rig and pose fitted, the edge is seen.
+    A camera whose image is off by one dot matches all but the edge, until rig and pose are fitted.
     """
     motions = lattice_shifts(scene.obj)
     if not motions or fit is None:
@@ -186,7 +186,7 @@ def _align_lattice(scene: Scene, fit: Estimate | None, maps: Maps) -> Estimate |
 def _fit(
     scene: Scene, pose: RigidTransform, uv: NDArray[np.float64], sigma: NDArray[np.float64], seen: NDArray[np.bool_]
 ) -> Estimate | None:
-    """Fit rig and pose to places (C, N, 2); None = there are too few."""
+    """Fit rig and pose to places (C, N, 2); None = too few."""
     if seen.sum() < LEAST_FITTED:
         return None
     observations = Observations(
@@ -208,7 +208,7 @@ def _measure(
     dark: bool,
     iterations: tuple[int, ...],
 ) -> list[Measured]:
-    """Measure the markers of all cameras near where they are expected (C, N, 2)."""
+    """Measure the markers of all cameras near their expected places (C, N, 2)."""
     points = fit.rig_from_object.apply(scene.obj.points.to(scene.rig.focal_length))  # (1, N, 3)
     depth = fit.rig.expand(1).project_values(points).depth[0].numpy()
     focal = scene.rig.focal_length.mean(-1).numpy()[:, None]
@@ -216,7 +216,7 @@ def _measure(
     given = scene.obj.radius
     high = np.array(response.shape[-1:-3:-1]) - 1
     cells = np.floor(maps.cells(expected)).clip(0, high).astype(np.int64)
-    # As the images show them: blurred, they are larger than they are.
+    # Sizes as they appear: blur makes markers larger in the images.
     shown = response[np.arange(len(frames))[:, None], :, cells[..., 1], cells[..., 0]]  # (C, N, sizes)
     seen = np.maximum(0.5, 1.6 * np.array(SIZES)[np.median(shown, axis=1).argmax(-1)]) * maps.factor
     radius = per_mm * (np.ones(scene.obj.num_fiducials) if given is None else given.numpy())  # (C, N)
@@ -224,11 +224,11 @@ def _measure(
     radius *= np.where((given is None) | (seen > usual), seen / usual, 1.0)[:, None]
     sure = np.ones(radius.shape[1], dtype=bool)
 
-    def measured(camera: int) -> Measured:
+    def measure(camera: int) -> Measured:
         frame = frames[camera]
         if frame is None:
             none = np.zeros(len(sure))
             return Measured(np.full((len(sure), 2), np.nan), none + np.inf, none, none, 1.0, none)
         return measure_markers(frame, expected[camera], radius[camera], dark, sure, iterations)
 
-    return each_camera(measured, range(len(frames)))
+    return each_camera(measure, range(len(frames)))

@@ -24,14 +24,9 @@ from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import step_by_error
-from imgcal.types import CameraRig
+from imgcal.types import PARAMETER_KINDS, CameraRig
 
-CHANGES: Mapping[str, slice] = {
-    "rotation": slice(0, 3),
-    "position": slice(3, 6),
-    "focal_length": slice(6, 8),
-    "principal_point": slice(8, 10),
-}
+CHANGES: Mapping[str, slice] = {kind: part for kind, part in PARAMETER_KINDS.items() if kind != "distortion"}
 """Kinds of change, and the camera parameters that each one covers."""
 JUMPS = (0.6, 6.0, 60.0, 600.0)
 """Pixels: prior standard deviations of a change, all equally probable. They are image shifts, whatever the kind of

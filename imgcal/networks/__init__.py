@@ -1,4 +1,4 @@
-"""Networks: point and image variants, the paper's and ours, by preset."""
+"""Networks: point and image variants, the paper's and ours, as presets."""
 
 import lazy_loader as lazy
 

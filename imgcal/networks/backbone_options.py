@@ -1,6 +1,6 @@
-"""Allowed options of a timm model: its shape. None of them names a file, loads weights or runs foreign code.
+"""Allowed options of a timm model: those of its architecture. None names a file, loads weights or runs foreign code.
 
-An experiment may come inside a model file of unknown origin, and timm would load what some of its arguments name.
+An experiment may come from a model file of unknown origin, and timm loads what some of its arguments name.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ ALLOWED = BLOCKS | SHARES | WORDS | SIZES | SWITCHES | SMALL
 
 
 def check_options(options: Mapping[str, Any]) -> None:
-    """Raise ValueError at an option that is not known to be harmless, or at a value that no network has."""
+    """Raise ValueError for an option that is not known to be harmless, or a value out of range."""
     for name, value in options.items():
         if name not in ALLOWED:
             hint = nearest(name, ALLOWED) or f", expected some of {list_names(sorted(ALLOWED))}"
-            raise ValueError(f"options: found `{shorten(name)}`, which is not among those of a network's shape{hint}")
+            raise ValueError(f"options: found `{shorten(name)}`, which is not an allowed option{hint}")
         expected = _describe_expected(name, value)
         if expected:
             raise ValueError(f"options: {name}: found {shorten(repr(value))}, expected {expected}")
 
 
 def _describe_expected(name: str, value: Any) -> str:
-    """Describe the expected value; nothing if the value is right."""
+    """Describe the expected value; empty if the value is valid."""
     if name in WORDS:
         good = isinstance(value, str) and re.fullmatch(r"[a-z0-9_]{0,20}", value)
         return "" if good else "a short word"

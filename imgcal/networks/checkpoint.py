@@ -1,4 +1,4 @@
-"""Networks in files: weights together with the rig, the object and the experiment that they belong to."""
+"""Checkpoints: network weights in a file together with their rig, object and experiment."""
 
 from __future__ import annotations
 
@@ -42,31 +42,31 @@ FORMATS_OF_FRAMES: dict[type[nn.Module], str] = {InfraredNetwork: INFRARED, Meas
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A network and what it was trained for."""
+    """A network with the rig, object and experiment of its training."""
 
     network: Network
     rig: CameraRig  # factory rig, float64, without batch axes
     obj: CalibrationObject  # float64
-    experiment: NetworkSpec  # what it was trained by; `imgcal.training.checkpoint_experiment` reads all of it
-    metrics: Mapping[str, Any]  # results to keep with it; plain values
+    experiment: NetworkSpec  # of the training; `imgcal.training.checkpoint_experiment` reads all of it
+    metrics: Mapping[str, Any]  # results to store with the network; plain values
 
     @property
     def drift_std(self) -> Tensor:
-        """Spread of the parameters that the network was trained for: (C, K) float64, the prior of a refinement."""
+        """Standard deviations of the drift in training: (C, K) float64, the prior of a refinement."""
         return self.experiment.drift.std(self.rig)
 
     def save(self, path: str | Path) -> None:
-        """Write it: `save_checkpoint`, in full precision."""
+        """Write the checkpoint with `save_checkpoint`, in full precision."""
         save_checkpoint(path, self)
 
 
 def save_checkpoint(path: str | Path, checkpoint: Checkpoint, dtype: torch.dtype = torch.float32) -> None:
-    """Write a network and what it was trained for in one step.
+    """Write a network with the rig, object and experiment of its training, in one step.
 
     Args:
         path: the file, named *.safetensors.
         checkpoint: the network may be on any device.
-        dtype: of the stored parameters: bfloat16 halves the file. Buffers keep theirs.
+        dtype: of the stored parameters: bfloat16 halves the file. Buffers keep their dtype.
 
     Raises:
         InputError: the file cannot be written.
@@ -94,7 +94,7 @@ def load_network(
     *,
     trusted: Collection[str] = (),
 ) -> Network:
-    """Read only the network of a checkpoint."""
+    """Load only the network of a checkpoint."""
     return load_checkpoint(path, rig, obj, trusted=trusted).network
 
 
@@ -105,21 +105,21 @@ def load_checkpoint(
     *,
     trusted: Collection[str] = (),
 ) -> Checkpoint:
-    """Read a network and what it was trained for.
+    """Load a network with the rig, object and experiment of its training.
 
     Args:
         path: a file written by `save_checkpoint`.
-        rig: the rig it is to be used with; None = whatever it was trained for.
-        obj: the object it is to be used with; None = whatever it was trained for.
-        trusted: classes of yours, `package.module:Class`, that the file may name as its encoder: their modules are
+        rig: the rig for which it will be used; None = the rig of its training.
+        obj: the object for which it will be used; None = the object of its training.
+        trusted: your own classes, `package.module:Class`, that the file may name as its encoder: their modules are
             imported, which runs their code.
 
     Returns:
         The checkpoint; the network is in evaluation mode, float32, on the CPU.
 
     Raises:
-        InputError: not such a file, damaged, another version, a pickle, trained for another rig or object, or with an
-            encoder of somebody's that is not trusted; a trusted name that is no `package.module:Class`.
+        InputError: no checkpoint, a damaged file, another version, a pickle, a network for another rig or object, or a
+            custom encoder that is not trusted; a trusted name that is no `package.module:Class`.
     """
     if wrong := [name for name in trusted if not is_import_path(name)]:
         raise InputError(f"trusted: found {shorten(wrong[0])!r}, expected a class as package.module:Class")
@@ -141,24 +141,24 @@ def read_subject(path: str | Path) -> tuple[CameraRig, CalibrationObject]:
     """Read the rig and the object of a checkpoint, without the network.
 
     Raises:
-        InputError: not such a file, damaged, another version, or a pickle.
+        InputError: no checkpoint, a damaged file, another version, or a pickle.
     """
     return _parse_texts(path, read_texts(path, FORMAT))
 
 
 def warm_start(start: str | Path | Sequence[str | Path], network: nn.Module) -> tuple[str, ...]:
-    """Take over the parameters of checkpoints that fit by name and shape, whatever rig or drift they were trained for.
+    """Copy the parameters of checkpoints that match by name and shape, whatever rig or drift they were trained for.
 
     Args:
-        start: a file, the folder of a training run, or the name of a shipped network; or several: what a later one has
-            replaces what an earlier one had.
-        network: takes them over.
+        start: a file, the folder of a training run, or the name of a shipped network; or several, where later ones
+            override earlier ones.
+        network: receives the parameters.
 
     Returns:
-        Names of the network's parameters that were in no checkpoint, or had another shape there.
+        Names of the network's parameters that no checkpoint has with the same shape.
 
     Raises:
-        InputError: a file cannot be used, or nothing in it fits.
+        InputError: a file cannot be used, or none of its parameters match.
     """
     missing = [set(_take_over(path, network)) for path in ([start] if isinstance(start, str | Path) else start)]
     return tuple(name for name, _ in network.named_parameters() if all(name in names for names in missing))
@@ -173,9 +173,9 @@ def _take_over(path: str | Path, network: nn.Module) -> tuple[str, ...]:
     fitting = [name for name in own if name in tensors and tensors[name].shape == own[name].shape]
     spec = None if tag is not None else _read_records(path, texts)[0]
     if spec is not None and is_position_training(spec):
-        fitting = [name for name in fitting if name.startswith("positions.")]  # the rest has learnt nothing
+        fitting = [name for name in fitting if name.startswith("positions.")]  # the rest is untrained
     if not fitting:
-        raise InputError(f"{path}: found no parameter that fits the network by name and shape, expected some")
+        raise InputError(f"{path}: found no parameter that matches the network by name and shape")
     with torch.no_grad():
         for name in fitting:
             own[name].copy_(tensors[name])
@@ -186,10 +186,10 @@ def _take_over(path: str | Path, network: nn.Module) -> tuple[str, ...]:
 
 
 def _check_code(path: str | Path, spec: NetworkSpec, trusted: Collection[str]) -> None:
-    """Refuse a file that would import a foreign module.
+    """Refuse a file that would import an untrusted module.
 
     Raises:
-        InputError: its encoder is such a class, and not among the trusted ones.
+        InputError: its encoder is a custom class that is not among the trusted ones.
     """
     backbone = getattr(spec.network.variant(), "backbone", "")
     if is_import_path(backbone) and backbone not in trusted:
@@ -202,8 +202,8 @@ def _check_code(path: str | Path, spec: NetworkSpec, trusted: Collection[str]) -
 def _fill(path: str | Path, network: nn.Module, tensors: dict[str, Tensor]) -> None:
     if "belief.weight" in tensors:
         raise InputError(
-            f"{path}: found an image network that reads positions by hue, of an earlier version of imgcal; "
-            "expected one whose encoder finds them: train it anew"
+            f"{path}: found an image network that reads positions by hue, from an earlier version of imgcal; "
+            "expected one whose encoder locates them: train it again"
         )
     own = network.state_dict()
     wrong = sorted(own.keys() ^ tensors.keys()) or sorted(n for n in own if own[n].shape != tensors[n].shape)
@@ -230,7 +230,7 @@ def _read_records(path: str | Path, texts: dict[str, str]) -> tuple[NetworkSpec,
 
 
 def _parse_texts(path: str | Path, texts: dict[str, str]) -> tuple[CameraRig, CalibrationObject]:
-    """Read rig and object from the text of their files."""
+    """Parse rig and object from the texts of their files."""
     try:
         name = title_from_name(Path(texts["object_name"]))
         return rig_from_text(texts["rig"], "rig"), object_from_text(texts["object"], "object", name)

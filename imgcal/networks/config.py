@@ -1,4 +1,4 @@
-"""Network configuration: presets by name, and the changes that each allows."""
+"""Network configuration: presets by name, and the values that can be changed in each."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _make_heads_whole(config: Attending) -> Attending:
 
 
 class PaperPoints(StrictModel):
-    """The paper's point variant; camera by camera outputs, not offsets."""
+    """The paper's point variant; it predicts values per camera, not offsets."""
 
     encoder: Encoder = "transformer"  # blocks of attention, or of one-dimensional convolution
     width: Width = 512  # of features
@@ -44,7 +44,7 @@ class PaperPoints(StrictModel):
 
 
 class PaperImages(StrictModel):
-    """The paper's image variant: one pooled feature an image."""
+    """The paper's image variant: one pooled feature per image."""
 
     backbone: Annotated[str, Field(max_length=200)] = "vit_base_patch16_224"  # any model of timm, by name
     pretrained: bool = False  # begin with published weights of timm
@@ -66,7 +66,7 @@ class TrunkConfig(StrictModel):
     heads: Count = 4  # of attention
     depth: Count = 5  # blocks of the first pass
     later_depth: Count = 2  # blocks of every later pass, which share their weights
-    passes: Count = 3  # each sees what the one before left over
+    passes: Count = 3  # each sees the residuals of the previous one
     trust: bool = False  # predict how far the refinement may trust each fiducial
 
     @model_validator(mode="after")
@@ -81,7 +81,7 @@ class Points(StrictModel):
 
 
 def is_import_path(backbone: str) -> bool:
-    """Tell whether a backbone is a class of the user's, `package.module:Class`, whose code would run."""
+    """Check whether a backbone is a custom class, `package.module:Class`, whose code would run."""
     return re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", backbone) is not None
 
 
@@ -92,7 +92,7 @@ class HueCentroids(StrictModel):
 
 
 class Images(StrictModel):
-    """Our image variant: an encoder's map says where each fiducial is, then our trunk."""
+    """Our image variant: an encoder's map locates each fiducial, then our trunk follows."""
 
     backbone: Annotated[str, Field(max_length=200)] = "vit"  # vit or cnn, ours; a timm model; or package.module:Class
     pretrained: bool = False  # begin with published weights of timm
@@ -124,7 +124,7 @@ class PooledImages(StrictModel):
 
 Variant = PaperPoints | PaperImages | Points | HueCentroids | Images | PooledImages
 
-# Half a million parameters each, quick on a CPU: patches of 32 pixels, or a narrow ConvNeXt; for pooled features.
+# Half a million parameters each, fast on a CPU: patches of 32 pixels, or a narrow ConvNeXt; for pooled features.
 SMALL_VIT = {"patch_size": 32, "embed_dim": 96, "depth": 3, "num_heads": 3}
 SMALL_CNN = {"depths": [1, 1, 2, 1], "dims": [16, 32, 64, 128]}
 
@@ -145,7 +145,7 @@ PRESETS: dict[str, Variant] = {
 
 
 class NetworkConfig(StrictModel):
-    """The block `network` of an experiment file: a preset, and what is changed in it.
+    """The block `network` of an experiment file: a preset and its changes.
 
     Examples:
         >>> NetworkConfig(preset="points", change={"trunk": {"passes": 2}}).variant().trunk.passes
@@ -167,19 +167,19 @@ class NetworkConfig(StrictModel):
         """The preset with its changes.
 
         Raises:
-            ValueError: a change that the preset does not know, or an impossible value (pydantic's ValidationError).
+            ValueError: a change to an unknown key, or an invalid value (pydantic's ValidationError).
         """
         preset = PRESETS[self.preset]
         values = preset.model_dump()
         if "backbone" in self.change and "options" in values:
-            values["options"] = {}  # those of the preset are of its own encoder
+            values["options"] = {}  # the preset's options belong to its own encoder
         return type(preset).model_validate(_merge(values, self.change, self.preset), strict=False)
 
 
 class NetworkSpec(StrictModel):
     """The blocks of an experiment that define a network and its training target; other blocks are kept unchanged.
 
-    `imgcal.training.Experiment` is one, with all other blocks in words.
+    `imgcal.training.Experiment` is a subclass that also defines the other blocks.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -194,7 +194,7 @@ Spec = TypeVar("Spec", bound=NetworkSpec)
 
 
 def drop_pretrained(spec: Spec) -> Spec:
-    """The same without published weights, for when other weights replace them."""
+    """Copy a spec without pretrained weights, for when other weights replace them."""
     if "pretrained" not in spec.network.change:
         return spec
     plain = spec.network.model_copy(update={"change": {**spec.network.change, "pretrained": False}})

@@ -1,7 +1,7 @@
-"""Our own image encoders: images in, a map of features at an output stride of 4 pixels out.
+"""Our own image encoders: from images to a feature map at an output stride of 4 pixels.
 
-Both make a map of the same size and width, and are matched: about 1.1 million weights, and half
-a GFLOP for 224 x 224 pixels.
+Both produce maps of the same size and width, and are matched: about 1.1 million weights, and half a GFLOP for 224 x 224
+pixels.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from torch.nn import functional
 
 from imgcal.networks.layers import transformer
 
-STRIDE = 4  # pixels of the image a cell of the map
+STRIDE = 4  # pixels of the image per cell of the map
 PATCH = 16  # pixels, width and height of a patch of the transformer
 
 
 class Pyramid(nn.Module):
-    """Add maps of several strides up into the finest one.
+    """Merge maps of several strides into the finest one.
 
     Source: Lin et al., "Feature Pyramid Networks for Object Detection", CVPR 2017.
     """
 
     def __init__(self, widths: Sequence[int], width: int) -> None:
-        """Make the layers; `widths` are those of the maps, from fine to coarse."""
+        """Create the layers; `widths` are those of the maps, from fine to coarse."""
         super().__init__()
         self.lateral = nn.ModuleList(nn.Conv2d(inputs, width, 1) for inputs in widths)
         self.smooth = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in widths[1:-1])
@@ -44,7 +44,7 @@ class Pyramid(nn.Module):
 
 
 class Residual(nn.Module):
-    """Two convolutions beside an identity, without normalization: the brightness of a dot is what counts."""
+    """Residual block of two convolutions, without normalization, because the absolute brightness of a dot matters."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -57,12 +57,12 @@ class Residual(nn.Module):
 
 
 class CnnEncoder(nn.Module):
-    """A small convolutional network: strides 4, 8, 16 and 32, and an additive way back up."""
+    """A small convolutional network: strides 4, 8, 16 and 32, and an additive upsampling path."""
 
     def __init__(
         self, width: int, dims: Sequence[int] = (32, 64, 96, 128), depths: Sequence[int] = (1, 1, 1, 2)
     ) -> None:
-        """Make the layers: `dims` and `depths` are widths and residual blocks of the strides, `width` is the map's."""
+        """Create the layers: `dims` and `depths` are widths and residual blocks per stride, `width` is the map's."""
         super().__init__()
         self.width = width
         self.stem = nn.Conv2d(3, dims[0], 7, stride=STRIDE, padding=3)
@@ -82,18 +82,18 @@ class CnnEncoder(nn.Module):
         return self.pyramid(maps)
 
     def group_matcher(self, coarse: bool = False) -> dict[str, Any]:
-        """Layers by depth, as timm's models tell them: for rates that fall towards the images."""
+        """Group layers by depth, as timm's models do: for learning rates that decrease towards the images."""
         return {"stem": "^stem", "blocks": [(r"^(?:down|stages)\.(\d+)", None), (r"^pyramid", (99999,))]}
 
 
 class VitEncoder(nn.Module):
-    """A small vision transformer: every patch's token becomes the cells of the map that lie in it.
+    """A small vision transformer: the token of every patch is expanded to the cells of the map within it.
 
     Source: Dosovitskiy et al., "An Image is Worth 16x16 Words", ICLR 2021; Shi et al. (pixel shuffle), CVPR 2016.
     """
 
     def __init__(self, width: int, size: int, embed_dim: int = 128, depth: int = 4, num_heads: int = 4) -> None:
-        """Make the layers for images of `size` pixels; `width` is the map's."""
+        """Create the layers for images of `size` pixels; `width` is the map's."""
         if embed_dim % num_heads:
             raise ValueError(f"found embed_dim {embed_dim} and {num_heads} heads, expected a multiple of the heads")
         super().__init__()
@@ -113,15 +113,15 @@ class VitEncoder(nn.Module):
         return self.cells(encoded)[..., :side, :side]
 
     def group_matcher(self, coarse: bool = False) -> dict[str, Any]:
-        """Layers by depth, as timm's models tell them: for rates that fall towards the images."""
+        """Group layers by depth, as timm's models do: for learning rates that decrease towards the images."""
         return {"stem": "^(?:patches|place)", "blocks": [(r"^blocks\.(\d+)", None), (r"^cells", (99999,))]}
 
 
 class Cells(nn.Module):
-    """A token a patch to a feature a cell: linear, then pixel shuffle."""
+    """From one token per patch to one feature per cell: linear, then pixel shuffle."""
 
     def __init__(self, inner: int, width: int, factor: int) -> None:
-        """Make the layer; a patch is `factor` x `factor` cells."""
+        """Create the layer; a patch is `factor` x `factor` cells."""
         super().__init__()
         self.factor = factor
         self.linear = nn.Conv2d(inner, width * factor**2, 1)
@@ -132,7 +132,7 @@ class Cells(nn.Module):
 
 
 def resize_images(images: Tensor, size: tuple[int, int]) -> Tensor:
-    """Images (I, 3, H, W) of another size (height, width); the same where they have it."""
+    """Resize images (I, 3, H, W) to another size (height, width), unless they already have it."""
     if images.shape[-2:] == size:
         return images
     return functional.interpolate(images, size, mode="bilinear", antialias=True, align_corners=False)

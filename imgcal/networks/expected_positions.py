@@ -1,4 +1,4 @@
-"""Input of the query network: crops where a rig and poses expect the object, and queries."""
+"""Inputs of the query network: crops where a rig and poses expect the object, and queries."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from imgcal.networks.infrared import Queries
 from imgcal.networks.measurer import RADIUS
 from imgcal.types import CROP_MARGIN, PATCH_SIZE, CalibrationObject, CameraRig, CropPlacement
 
-USUAL_RADIUS = 0.05  # of an object's size, where it does not say how large its markers are
+USUAL_RADIUS = 0.05  # of an object's size, if it does not specify the size of its markers
 
 Frames = Mapping[str, NDArray[np.uint8] | NDArray[np.uint16] | None]
 
 
 @dataclass(frozen=True)
 class Expectation:
-    """Where H poses put the fiducials."""
+    """Fiducials predicted from H poses."""
 
     uv: Tensor  # (H, C, N, 2) pixels
     radius: Tensor  # (H, C, N) pixels
@@ -40,7 +40,7 @@ class Expectation:
             rig: the cameras.
             obj: the object.
             rig_from_object: poses (H,).
-            usual: mm, radius of markers where the object does not say how large they are; None = of its size.
+            usual: mm, radius of the markers if the object does not specify it; None = derived from its size.
         """
         points = rig_from_object.apply(obj.points.to(rig.focal_length))
         seen = rig.expand(len(points)).project(points)
@@ -51,16 +51,16 @@ class Expectation:
         return cls(seen.uv, radius, seen.depth, seen.visible)
 
     def placement(self, rig: CameraRig, size: int) -> CropPlacement:
-        """Place crops around what all poses expect: (C,)."""
+        """Place crops around the predictions of all poses: (C,)."""
         uv, visible = self.uv.movedim(0, 1).flatten(1, 2), self.visible.movedim(0, 1).flatten(1, 2)
         return CropPlacement.around(uv, visible, CROP_MARGIN * rig.focal_length.mean(-1), size)
 
     def queries(self, placement: CropPlacement, shift: Tensor | None = None) -> Queries:
-        """Ask for all fiducials of all poses: (H C, N).
+        """Build queries for all fiducials in all poses: (H C, N).
 
         Args:
             placement: (C,) of the crops.
-            shift: (H, C, 2) pixels that the cameras are known to be off; None = nothing is known.
+            shift: (H, C, 2) pixels, known image shift of the cameras; None = unknown.
         """
         uv = self.uv if shift is None else self.uv + shift[..., None, :]
         place = placement.to_crop(uv)
@@ -75,12 +75,12 @@ class Expectation:
 
 
 def cut_crops(frames: Frames, names: tuple[str, ...], placement: CropPlacement, *, inverted: bool = False) -> Tensor:
-    """Cut crops out of frames, each pixel the mean of a block of the frame's.
+    """Cut crops from frames, each pixel the mean of a block of the frame.
 
     Args:
         frames: by camera; None or absent = no frame.
         names: of the cameras, C.
-        placement: (C,) where; parts outside of the image become NaN.
+        placement: (C,) of the crops; parts outside of the image become NaN.
         inverted: markers are dark on bright ground.
 
     Returns:
@@ -110,7 +110,7 @@ def cut_crops(frames: Frames, names: tuple[str, ...], placement: CropPlacement, 
 def cut_patches(
     frames: Frames, names: tuple[str, ...], uv: Tensor, radius: Tensor, *, inverted: bool = False
 ) -> tuple[Tensor, CropPlacement]:
-    """Cut patches around places, for the measurer: reduced until the markers of a camera are small enough.
+    """Cut patches around places, for the measurer, downsampled until the markers of a camera are small enough.
 
     Args:
         frames: by camera; None or absent = no frame.
@@ -120,7 +120,7 @@ def cut_patches(
         inverted: markers are dark on bright ground.
 
     Returns:
-        (C, N, 24, 24) float32 grey levels, NaN outside of the image, and where they lie (C, N).
+        (C, N, 24, 24) float32 grey levels, NaN outside of the image, and their placement (C, N).
     """
     cameras, count = radius.shape
     scale = (radius.median(-1).values / RADIUS).round().clamp(1, 64)[:, None].expand(-1, count)

@@ -1,7 +1,7 @@
-"""Networks for other runtimes: a program of tensors alone (`Program`), as ONNX or as a `torch.export` program.
+"""Export of networks to other runtimes: a tensor-only program (`Program`), as ONNX or as a `torch.export` program.
 
-ONNX is made of `torch.export`'s graph by the exporter of TorchScript, which needs no library but `onnx`; what it cannot
-say is rewritten first (`_rewritten`). Shapes are fixed there.
+ONNX is made from the graph of `torch.export` by the TorchScript exporter, which needs no library but `onnx`. Operations
+that it does not support are rewritten first (`_rewrite`). Shapes are fixed in ONNX.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ class Program:
     """A network as a function of tensors."""
 
     kind: str  # measurer, query network, point network
-    module: nn.Module  # takes the inputs in order, gives the outputs as a tuple
-    inputs: dict[str, str]  # name -> type, shape and meaning; the first axis counts
+    module: nn.Module  # takes the inputs in order, returns the outputs as a tuple
+    inputs: dict[str, str]  # name -> type, shape and meaning; the first axis is the batch
     outputs: dict[str, str]
     example: tuple[Tensor, ...]  # inputs
 
     def metadata(self) -> dict[str, str]:
-        """Metadata in the file."""
+        """Metadata for the file."""
         return {"imgcal": self.kind, "inputs": json.dumps(self.inputs), "outputs": json.dumps(self.outputs)}
 
 
@@ -82,15 +82,15 @@ class _Points(nn.Module):
 
 
 def load_program(path: Path, count: int = 1, fiducials: int = 8) -> Program:
-    """Read a trained network as a program.
+    """Load a trained network as a program.
 
     Args:
-        path: of any of our files of weights.
+        path: any of our weight files.
         count: patches, crops or snapshots of the example, and of an ONNX file.
-        fiducials: of the object, where the network serves any.
+        fiducials: of the object, for networks that serve any object.
 
     Raises:
-        InputError: no such file, something else in it, or a network of images.
+        InputError: no such file, other content, or a network of images.
     """
     loaders: dict[str, Callable[[], Program]] = {
         MEASURER: lambda: _measurer(load_measurer(path).network, count),
@@ -157,7 +157,7 @@ def _query(network: InfraredNetwork, count: int, fiducials: int) -> Program:
 
 def _points(path: Path, network: Network, count: int) -> Program:
     if network.image_options is not None:
-        kind = "found a network of images, whose positions are found by compiled code of ours"
+        kind = "found an image network, which locates fiducials with compiled code that cannot be exported"
         raise InputError(f"{path}: {kind}; expected a point network, a query network or a measurer")
     generator, rig, obj = torch.Generator().manual_seed(0), network.factory, network.obj
     cameras, fiducials = rig.num_cameras, obj.num_fiducials
@@ -186,7 +186,7 @@ def save_exported(program: Program, path: Path) -> float:
     """Write a `torch.export` program (.pt2) for any number of patches, crops or snapshots.
 
     Returns:
-        By how much it differs from the network; see `difference`.
+        Difference from the network's own output; see `difference`.
 
     Raises:
         InputError: the file cannot be written.
@@ -194,8 +194,8 @@ def save_exported(program: Program, path: Path) -> float:
     exported = _export(program, fixed=False)
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of weights that lie in one block
-        plain = exported.run_decompositions({})  # without it, what switches autocast off cannot be saved
+        warnings.simplefilter("ignore")  # about weights that share one block of memory
+        plain = exported.run_decompositions({})  # without it, code that disables autocast cannot be saved
         torch.export.save(plain, buffer, extra_files=program.metadata())
     write_bytes(path, buffer.getvalue())
     buffer.seek(0)
@@ -205,23 +205,23 @@ def save_exported(program: Program, path: Path) -> float:
 
 
 def save_onnx(program: Program, path: Path) -> float:
-    """Write ONNX, with the shapes of the example, and run it.
+    """Write ONNX, with the shapes of the example, and check it by running it.
 
     Returns:
-        By how much onnxruntime's answer differs from the network; see `difference`.
+        Difference of onnxruntime's output from the network's; see `difference`.
 
     Raises:
         InputError: the file cannot be written.
     """
-    import onnx  # not in the core
+    import onnx  # not a core dependency
     import onnxruntime
 
     buffer = io.BytesIO()
     with warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore")  # of the exporter, about itself
+        warnings.simplefilter("ignore")  # the exporter's warnings about itself
         torch.onnx.export(
-            _Held(_rewritten(_export(program, fixed=True).module())), program.example,
-            buffer,  # type: ignore[arg-type]  # its stubs know paths alone
+            _Unregistered(_rewrite(_export(program, fixed=True).module())), program.example,
+            buffer,  # type: ignore[arg-type]  # its stubs only allow paths
             input_names=list(program.inputs), output_names=list(program.outputs), opset_version=OPSET, dynamo=False,
         )  # fmt: skip
     model = onnx.load_model_from_string(buffer.getvalue())
@@ -236,7 +236,7 @@ def save_onnx(program: Program, path: Path) -> float:
 
 
 def difference(found: Sequence[NDArray[Any]], expected: Sequence[Tensor]) -> float:
-    """Largest difference of any output, relative to its largest number.
+    """Largest difference of any output, relative to its largest absolute value.
 
     Examples:
         >>> difference([np.array([1.0, 2.0])], [torch.tensor([1.0, 2.5])])
@@ -252,10 +252,10 @@ def difference(found: Sequence[NDArray[Any]], expected: Sequence[Tensor]) -> flo
 
 
 def _export(program: Program, fixed: bool) -> torch.export.ExportedProgram:
-    """Follow the network; its first axes may be of any length unless they are fixed."""
+    """Trace the network; its first axes have any length unless they are fixed."""
     example, shapes = program.example, None
     if not fixed:
-        if len(example[0]) < 2:  # what is one would be taken for a constant
+        if len(example[0]) < 2:  # a length of one would be traced as a constant
             example = tuple(torch.cat((one, one)) for one in example)
         shapes = tuple({0: torch.export.Dim("count", min=1, max=2**16)} for _ in example)
     with torch.no_grad(), warnings.catch_warnings():
@@ -263,8 +263,8 @@ def _export(program: Program, fixed: bool) -> torch.export.ExportedProgram:
         return torch.export.export(program.module, example, dynamic_shapes=shapes)
 
 
-class _Held(nn.Module):
-    """Calls a graph that is not a part of it: the exporter would switch it to evaluation, which graphs refuse."""
+class _Unregistered(nn.Module):
+    """Call a graph without registering it as a submodule: the exporter would call `eval`, which graphs refuse."""
 
     def __init__(self, graph: Callable[..., tuple[Tensor, ...]]) -> None:
         super().__init__()
@@ -275,8 +275,8 @@ class _Held(nn.Module):
         return found
 
 
-def _rewritten(graph: nn.Module) -> nn.Module:
-    """Rewrite what the exporter does not know (`mT`) or gets wrong (`movedim` from the back)."""
+def _rewrite(graph: nn.Module) -> nn.Module:
+    """Rewrite operations that the exporter does not support (`mT`) or gets wrong (`movedim` from the back)."""
     aten = torch.ops.aten
     parts = [part for part in graph.modules() if isinstance(part, torch.fx.GraphModule)]
     for part in parts:
@@ -294,7 +294,7 @@ def _rewritten(graph: nn.Module) -> nn.Module:
 
 
 def _order(rank: int, source: int | Sequence[int], target: int | Sequence[int]) -> list[int]:
-    """Axes in their order after `movedim`.
+    """Order of the axes after `movedim`.
 
     Examples:
         >>> _order(4, (-1, -2), (0, 1))

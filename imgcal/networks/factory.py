@@ -1,4 +1,4 @@
-"""A network from its configuration."""
+"""Construction of a network from its configuration."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ def build(
     generator: torch.Generator,
     images: ImageOptions | None = None,
 ) -> Network:
-    """Make an untrained network.
+    """Create an untrained network.
 
     Args:
-        config: which network.
+        config: preset and changes.
         factory: the factory rig, float32, without batch axes.
         obj: the calibration object.
         drift_std: (C, K) prior standard deviation of the parameters (`Drift.std`), the unit of predicted offsets.
-        generator: of its weights, on the CPU; torch's default generators are left alone.
-        images: how the images of image variants are drawn; None = as large as their encoder takes them.
+        generator: for the initial weights, on the CPU; torch's default generators keep their state.
+        images: how the images of image variants are drawn; None = in the size that their encoder takes.
 
     Returns:
         A network in training mode, on the CPU.
@@ -64,8 +64,8 @@ def build(
 
 
 def _make(config: NetworkConfig, parameterization: Parameterization, images: ImageOptions | None) -> Network:
-    """Make what a configuration says; see `build`."""
-    # timm takes seconds to import: only for those who need it.
+    """Create the network of a configuration; see `build`."""
+    # timm takes seconds to import, so only do it where necessary.
     from imgcal.networks.points import PaperPointNetwork, PointNetwork
 
     variant = config.variant()
@@ -89,7 +89,7 @@ def _make(config: NetworkConfig, parameterization: Parameterization, images: Ima
 
 
 def build_network(spec: NetworkSpec, rig: CameraRig, obj: CalibrationObject, generator: torch.Generator) -> Network:
-    """Make the untrained network of an experiment, with float32 factory values; see `build`."""
+    """Create the untrained network of an experiment, with float32 factory values; see `build`."""
     single = torch.float32
     prior_std = spec.drift.std(rig).to(single)
     return build(spec.network, rig.to(single), obj, prior_std, generator, spec.images)

@@ -1,4 +1,4 @@
-"""Encoders by name: ours, any of timm, or a class of yours; each gives a map of features at a stride of 4 pixels."""
+"""Encoders by name: ours, any timm model, or a custom class; each returns a feature map at a stride of 4 pixels."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from imgcal.networks.encoders import STRIDE, CnnEncoder, VitEncoder
 
 
 def make_encoder(config: Images, size: int | None) -> tuple[nn.Module, int, int]:
-    """Make the encoder that an experiment names.
+    """Create the encoder that an experiment names.
 
     Args:
         config: the encoder and its options. An import path runs the code of its module: refuse it first if the
             configuration comes from a file of unknown origin (`load_checkpoint` does).
-        size: pixels, width and height of the images; None = as the encoder takes them.
+        size: pixels, width and height of the images; None = the encoder's own.
 
     Returns:
         The encoder, images (I, 3, H, W) -> (I, F, H / 4, W / 4); F; and the size of the images.
 
     Raises:
-        InputError: nothing of that name, options that it does not take, or an encoder that is too large.
+        InputError: an unknown name, unsupported options, or an encoder that is too large.
     """
     name, options = config.backbone, config.options
     if name in ("cnn", "vit") or is_import_path(name):
@@ -43,14 +43,14 @@ def make_encoder(config: Images, size: int | None) -> tuple[nn.Module, int, int]
         encoder_class = _import(name)
         encoder = _count_weights(name, lambda: encoder_class(**options))
         return encoder, _check_width(encoder, name, drawn), drawn
-    from imgcal.networks.timm_encoder import TimmEncoder  # timm takes seconds to import: only for those who need it
+    from imgcal.networks.timm_encoder import TimmEncoder  # takes seconds to import, so only where necessary
 
     timms = TimmEncoder(name, config.pretrained, options, config.width)
     return timms, config.width, size or max(timms.size)
 
 
 def _import(path: str) -> Callable[..., nn.Module]:
-    """Find the class that `package.module:Class` names.
+    """Import the class that `package.module:Class` names.
 
     Raises:
         InputError: no such module or class, or a class that is no `nn.Module`.
@@ -58,7 +58,7 @@ def _import(path: str) -> Callable[..., nn.Module]:
     module, _, name = path.partition(":")
     try:
         found = getattr(importlib.import_module(module), name)
-    except Exception as error:  # the module's own code runs
+    except Exception as error:  # importing runs the module's own code
         raise InputError(
             f"backbone: found `{shorten(path)}`, which cannot be imported: {_first_line(error)}"
         ) from error
@@ -68,7 +68,7 @@ def _import(path: str) -> Callable[..., nn.Module]:
 
 
 def _count_weights(name: str, make: Callable[[], nn.Module]) -> nn.Module:
-    """Make an encoder whose weights were counted before they have memory."""
+    """Create an encoder after counting its weights, before any memory is allocated."""
     try:
         with torch.device("meta"):
             weights = sum(parameter.numel() for parameter in make().parameters())
@@ -77,16 +77,16 @@ def _count_weights(name: str, make: Callable[[], nn.Module]) -> nn.Module:
         return make()
     except InputError:
         raise
-    except Exception as error:  # a class of the user's does what it likes with what the options give it
-        raise InputError(f"backbone {shorten(name)}: cannot be made of its options: {_first_line(error)}") from error
+    except Exception as error:  # a custom class may raise anything for invalid options
+        raise InputError(f"backbone {shorten(name)}: cannot be built with its options: {_first_line(error)}") from error
 
 
 @torch.no_grad()
 def _check_width(encoder: nn.Module, name: str, size: int) -> int:
-    """Number of features of an encoder's map, measured on one image.
+    """Measure the number of features of an encoder's map on one image.
 
     Raises:
-        InputError: it takes no such image, or gives no map at a stride of 4.
+        InputError: it rejects such an image, or returns no map at a stride of 4.
     """
     was_training = encoder.training
     try:
@@ -100,12 +100,12 @@ def _check_width(encoder: nn.Module, name: str, size: int) -> int:
     if not isinstance(features, Tensor) or features.ndim != 4 or features.shape[2:] != (cells, cells):
         found = list(features.shape) if isinstance(features, Tensor) else type(features).__name__
         raise InputError(
-            f"backbone {shorten(name)}: of an image of {size} x {size} pixels found {found}, "
+            f"backbone {shorten(name)}: found {found} for an image of {size} x {size} pixels, "
             f"expected features of shape (1, F, {cells}, {cells}): a stride of {STRIDE}"
         )
     return int(features.shape[1])
 
 
 def _first_line(error: Exception) -> str:
-    """The first line of an error raised by a foreign class, with its name."""
+    """First line of a foreign class's error, with the name of the error."""
     return quote(f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}")

@@ -1,4 +1,4 @@
-"""Networks for captured frames in files: weights and configuration alone, since they belong to no rig and no object."""
+"""Checkpoints of networks for captured frames: weights and configuration only, because they fit any rig and object."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ EARLIER = {
     "from_heads": "attention_out",
     "norm_mlp": "mlp_norm",
 }
-"""How networks that were trained earlier name the parts of a transformer block, and how they are named now."""
+"""Names of a transformer block's parts in files of earlier versions, and their current names."""
 
 Config = TypeVar("Config", bound=StrictModel)
 
@@ -38,7 +38,7 @@ class InfraredCheckpoint:
     metrics: Mapping[str, Any]  # plain values
 
     def save(self, path: str | Path) -> None:
-        """Write it in one step, in bfloat16: its weights need no more.
+        """Write the checkpoint in one step, in bfloat16, which is accurate enough for its weights.
 
         Raises:
             InputError: the file cannot be written.
@@ -54,15 +54,15 @@ class MeasurerCheckpoint:
     metrics: Mapping[str, Any]  # plain values
 
     def save(self, path: str | Path) -> None:
-        """Write it in one step, in bfloat16; see `InfraredCheckpoint.save`."""
+        """Write the checkpoint in one step, in bfloat16; see `InfraredCheckpoint.save`."""
         _write(path, MEASURER, self.network, self.network.config, self.metrics)
 
 
 def load_infrared(path: str | Path) -> InfraredCheckpoint:
-    """Read a query network: float32, on the CPU, in evaluation mode.
+    """Load a query network: float32, on the CPU, in evaluation mode.
 
     Raises:
-        InputError: no such file, or something else in it.
+        InputError: no such file, or other content.
     """
     config, tensors, metrics = _read(path, INFRARED, InfraredConfig)
     with drawing_from(torch.Generator()):
@@ -72,7 +72,7 @@ def load_infrared(path: str | Path) -> InfraredCheckpoint:
 
 
 def load_measurer(path: str | Path) -> MeasurerCheckpoint:
-    """Read a measurer; see `load_infrared`."""
+    """Load a measurer; see `load_infrared`."""
     config, tensors, metrics = _read(path, MEASURER, MeasurerConfig)
     with drawing_from(torch.Generator()):
         network = Measurer(config)
@@ -87,7 +87,7 @@ def _write(path: str | Path, tag: str, network: nn.Module, config: StrictModel, 
 
 
 def read_weights(path: str | Path, tag: str) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read tensors by the names that networks have now, and texts; see `read_tensors`."""
+    """Read tensors by their current names, and texts; see `read_tensors`."""
     tensors, texts = read_tensors(path, tag)
     named = {".".join(EARLIER.get(part, part) for part in name.split(".")): each for name, each in tensors.items()}
     return named, texts

@@ -1,4 +1,4 @@
-"""Encoders of monochrome crops: a dense CNN and a small ViT, with the same output stride, parameters and operations."""
+"""Encoders of monochrome crops: a dense CNN and a small ViT with the same output stride, parameters and operations."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from torch.nn import functional
 from imgcal.networks.layers import TransformerBlock
 
 STRIDE = 2
-"""Crop pixels a cell of the feature map, of either encoder."""
+"""Crop pixels per cell of the feature map, for either encoder."""
 
 EncoderName = Literal["cnn-small", "cnn", "cnn-large", "vit-small", "vit", "vit-large", "vit-stem"]
 """Encoders that an experiment file can name."""
 
 
 class CropCnn(nn.Module):
-    """Strides 2, 4 and 8 in 3x3 convolutions, and an additive way back up.
+    """Strides 2, 4 and 8 in 3x3 convolutions, and an additive upsampling path.
 
-    Dense convolutions, since depthwise ones are slow on a CPU; no norm, since brightness is already normalized and
-    small batches would disturb one another.
+    The convolutions are dense, because depthwise ones are slow on a CPU. There is no normalization layer, because
+    brightness is already normalized, and statistics of small batches would be noisy.
     """
 
     def __init__(self, channels: int, widths: tuple[int, int, int] = (24, 48, 88)) -> None:
-        """Make it for crops of any size that is a multiple of 8.
+        """Create the layers, for crops of any size that is a multiple of 8.
 
         Args:
             channels: of the feature map.
@@ -45,7 +45,7 @@ class CropCnn(nn.Module):
         self.out = nn.Conv2d(a, channels, 3, padding=1)
 
     def forward(self, crops: Tensor) -> Tensor:
-        """Turn crops (P, 1, S, S) into features (P, channels, S / 2, S / 2)."""
+        """Encode crops (P, 1, S, S) as features (P, channels, S / 2, S / 2)."""
         fine = self.fine(functional.gelu(self.stem(crops)))
         middle = self.middle(functional.gelu(self.down_middle(fine)))
         coarse = self.coarse(functional.gelu(self.down_coarse(middle)))
@@ -53,27 +53,27 @@ class CropCnn(nn.Module):
         return self.out(functional.gelu(fine + _twice(self.up_fine(middle))))
 
     def group_matcher(self, coarse: bool = False) -> dict[str, Any]:
-        """Layers by depth, as timm's models tell them: for rates that fall towards the crops."""
+        """Group layers by depth, as timm's models do: for learning rates that decrease towards the crops."""
         blocks = [(r"^(?:down_)?middle", (0,)), (r"^(?:down_)?coarse", (1,)), (r"^(?:up_|out)", (99999,))]
         return {"stem": "^(?:stem|fine)", "blocks": blocks}
 
 
 class CropVit(nn.Module):
-    """Patches of 6 pixels, blocks of attention over the whole crop, then each token draws its own 3 x 3 cells."""
+    """Patches of 6 pixels, attention over the whole crop, then each token is expanded to its own 3 x 3 cells."""
 
     def __init__(
         self, channels: int, size: int, width: int = 80, depth: int = 3, heads: int = 4, stem: int = 0
     ) -> None:
-        """Make it for crops of one size.
+        """Create the layers for crops of one size.
 
         Args:
             channels: of the feature map.
-            size: crop pixels, each way; a multiple of the patch.
+            size: crop pixels, width and height; a multiple of the patch.
             width: of the tokens.
             depth: blocks.
             heads: of the attention.
             stem: channels of a convolution before the tokens (Xiao et al., Early Convolutions Help Transformers See
-                Better, 2021); 0: patches are embedded as they are.
+                Better, 2021); 0: patches are embedded directly.
         """
         super().__init__()
         patch = 3 * STRIDE
@@ -87,19 +87,19 @@ class CropVit(nn.Module):
         self.out = nn.Linear(width, channels * 9)
 
     def forward(self, crops: Tensor) -> Tensor:
-        """Turn crops (P, 1, S, S) into features (P, channels, S / 2, S / 2)."""
+        """Encode crops (P, 1, S, S) as features (P, channels, S / 2, S / 2)."""
         patches = self.embed(crops)
         tokens = self.blocks(patches.flatten(2).mT + self.position)
         cells = self.out(self.norm(tokens)).mT.unflatten(-1, patches.shape[-2:])
         return functional.pixel_shuffle(cells, 3)
 
     def group_matcher(self, coarse: bool = False) -> dict[str, Any]:
-        """Layers by depth, as timm's models tell them: for rates that fall towards the crops."""
+        """Group layers by depth, as timm's models do: for learning rates that decrease towards the crops."""
         return {"stem": "^(?:embed|position)", "blocks": [(r"^blocks\.(\d+)", None), (r"^(?:norm|out)", (99999,))]}
 
 
 class CropResidual(nn.Module):
-    """Two 3x3 convolutions beside the identity."""
+    """Residual block of two 3x3 convolutions."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -121,7 +121,7 @@ ENCODERS: dict[EncoderName, Callable[[int, int], nn.Module]] = {
     "vit-large": lambda channels, size: CropVit(channels, size, width=96, depth=4),
     "vit-stem": lambda channels, size: CropVit(channels, size, width=72, stem=16),
 }
-"""Makers by name: channels of the feature map and pixels of the crop in, encoder out; of one size, one cost."""
+"""Constructors by name, of channels of the feature map and pixels of the crop; equal sizes have equal cost."""
 
 
 def _twice(x: Tensor) -> Tensor:

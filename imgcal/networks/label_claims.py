@@ -1,4 +1,4 @@
-"""From evidence to claims: at most one place per fiducial, and at most one fiducial per place."""
+"""Label claims from evidence: at most one place per fiducial, and at most one fiducial per place."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from torch.nn import functional
 from imgcal.networks.infrared import Evidence
 from imgcal.networks.transport import partial_transport
 
-PEAKS = 3  # places that each fiducial puts forward at most ...
-LEAST_MASS = 0.02  # ... with this probability at least
-SAME = 1.5  # crop pixels within which two places are one
-TOLERANCE = 0.6  # crop pixels, one standard deviation between what two fiducials say of one place
+PEAKS = 3  # most candidate places per fiducial ...
+LEAST_MASS = 0.02  # ... and the smallest probability of each
+SAME = 1.5  # crop pixels within which two places are the same
+TOLERANCE = 0.6  # crop pixels, standard deviation between two fiducials' positions for one place
 STRAY = -3.0  # log odds that a place belongs to no fiducial
 
 
@@ -24,8 +24,8 @@ class Claims:
     """The claimed place of each fiducial."""
 
     place: Tensor  # (P, N, 2) crop pixels
-    sigma: Tensor  # (P, N) crop pixels, one standard deviation of each axis
-    probability: Tensor  # (P, N) that the fiducial is there; 0 where it was not asked for
+    sigma: Tensor  # (P, N) crop pixels, standard deviation per axis
+    probability: Tensor  # (P, N) that the fiducial is there; 0 for invalid queries
     runner_up: Tensor  # (P, N) probability of the best other place
 
 
@@ -34,20 +34,20 @@ def claim(evidence: Evidence, asked: Tensor) -> Claims:
 
     Args:
         evidence: of (P, N) queries.
-        asked: (P, N) bool, queries that count.
+        asked: (P, N) bool, the valid queries.
     """
     mass = _local_mass(evidence)
     logit, place, log_sigma = _peaks(evidence, mass, asked)
     kept = _distinct(place, logit)
     step = evidence.cells[0, 0, 0, 1, 0] - evidence.cells[0, 0, 0, 0, 0]
-    # What every fiducial says of every place: (P, N, M).
+    # Evaluate every fiducial's evidence at every place: (P, N, M).
     along = (place[:, None] - evidence.cells[:, :, None, 0, 0]) / step
     size = mass.shape[-1]
     inside = ((along > -0.5) & (along < size - 0.5)).all(-1)
     column, row = along.round().clamp(0, size - 1).long().unbind(-1)
     index = row * size + column
     own = (evidence.cells + evidence.offset).flatten(2, 3).gather(2, index[..., None].expand(*index.shape, 2))
-    # Another's place counts as far as it is the one that this fiducial would have put forward itself.
+    # Another fiducial's place counts less the farther it is from this fiducial's own position there.
     beside = (own - place[:, None]).square().sum(-1) / (2 * TOLERANCE**2)
     said = mass.flatten(2).gather(2, index) - beside
     present = functional.logsigmoid(evidence.present)[..., None]
@@ -56,7 +56,7 @@ def claim(evidence: Evidence, asked: Tensor) -> Claims:
     absent = functional.logsigmoid(-evidence.present)
     stray = torch.full_like(logit, STRAY).masked_fill(~kept, -torch.inf)
     shares = partial_transport(scores, absent, stray).exp()[..., :-1]
-    # Rivals that are both sure converge slowly: what is promised twice by now is divided.
+    # With two confident rivals, transport converges slowly: normalize shares that still exceed one.
     shares = shares / shares.sum(1, keepdim=True).clamp(min=1)
     share, best = shares.max(-1)
     rest = shares.scatter(2, best[..., None], 0.0).amax(-1)
@@ -65,7 +65,7 @@ def claim(evidence: Evidence, asked: Tensor) -> Claims:
 
 
 def _local_mass(evidence: Evidence) -> Tensor:
-    """Logarithm of the probability of each cell and its neighbours, given that the fiducial is seen: (P, N, K, K)."""
+    """Log probability of each cell and its neighbours, given that the fiducial is visible: (P, N, K, K)."""
     shape = evidence.logits.shape
     probability = evidence.logits.flatten(2).softmax(-1).unflatten(2, shape[2:])
     pooled = functional.avg_pool2d(probability, 3, stride=1, padding=1) * 9
@@ -73,8 +73,8 @@ def _local_mass(evidence: Evidence) -> Tensor:
 
 
 def _peaks(evidence: Evidence, mass: Tensor, asked: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The best local maxima of all windows, in one row: log odds (P, M), place (P, M, 2), log sigma (P, M)."""
-    # So far apart that no two peaks share their neighbours' mass.
+    """Best local maxima of all windows, concatenated: log odds (P, M), place (P, M, 2), log sigma (P, M)."""
+    # The radius is large enough that no two peaks share the mass of their neighbours.
     highest = functional.max_pool2d(evidence.logits, 5, stride=1, padding=2) == evidence.logits
     highest &= mass > math.log(LEAST_MASS)
     value, index = mass.masked_fill(~highest, -torch.inf).flatten(2).topk(PEAKS, dim=-1)
@@ -86,7 +86,7 @@ def _peaks(evidence: Evidence, mass: Tensor, asked: Tensor) -> tuple[Tensor, Ten
 
 
 def _distinct(place: Tensor, value: Tensor) -> Tensor:
-    """Tell which places (P, M, 2) are not a better one's neighbours, by value (P, M): (P, M) bool."""
+    """Non-maximum suppression of places (P, M, 2) by value (P, M): (P, M) bool, True for those to keep."""
     order = torch.arange(value.shape[1], device=value.device)
     near = (place[:, :, None] - place[:, None]).square().sum(-1) < SAME**2
     equal = value[:, None] == value[:, :, None]

@@ -34,14 +34,14 @@ class TransformerBlock(nn.Module):
 
 
 def _attend(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-    """Attention of (B, heads, T, D); on a CPU as plain products, whose gradient is several times faster there."""
+    """Attention of (B, heads, T, D); as plain products on a CPU, where their gradient is several times faster."""
     if query.device.type != "cpu":
         return functional.scaled_dot_product_attention(query, key, value)
     return (query * query.shape[-1] ** -0.5 @ key.mT).softmax(-1) @ value
 
 
 class ConvBlock(nn.Module):
-    """Residual pair of 1D convolutions along the cameras, widened inside."""
+    """Residual pair of 1D convolutions along the cameras, with a wider inner layer."""
 
     def __init__(self, width: int, inner: int, kernel: int = 3) -> None:
         super().__init__()

@@ -1,6 +1,6 @@
-"""Where each fiducial is in an image, by an encoder's map: heatmaps say roughly, a look at the pixels there exactly.
+"""Fiducial positions from an encoder's map: heatmaps locate them roughly, and the pixels there precisely.
 
-Everything here is float32. The map alone decides where is looked: with another image's map, it is the wrong place.
+Everything here is float32. Only the map decides where to look: with another image's map, that is the wrong place.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from torch.nn import functional
 from imgcal.geometry import resized_pixels
 from imgcal.networks.layers import mlp, zero_last_layer
 
-WINDOW = 5  # cells around the maximum of a heatmap over which its centre is taken
-CROP = 9  # pixels of the image that are looked at around there
-DARK = 1 / 255  # keeps the logarithm of light finite
-SHARPEST, BLUNTEST = -8.0, 3.0  # log of the error's scale, pixels of the image
+WINDOW = 5  # cells around the maximum of a heatmap in which its centroid is computed
+CROP = 9  # pixels, side of the crop around this centroid
+DARK = 1 / 255  # keeps the logarithm of brightness finite
+SHARPEST, BLUNTEST = -8.0, 3.0  # limits of the log of the error's scale, pixels of the image
 
 
 @dataclass(frozen=True)
@@ -27,21 +27,21 @@ class Located:
     """Output of a locator for I images, in pixels of the image."""
 
     uv: Tensor  # (I, N, 2)
-    log_scale: Tensor  # (I, N) log of b, the mean absolute error of an axis, if the dot is near there
-    confidence: Tensor  # (I, N) in [0, 1]: probability that the dot is near there, and not elsewhere or nowhere
+    log_scale: Tensor  # (I, N) log of b, the mean absolute error per axis, if the dot is nearby
+    confidence: Tensor  # (I, N) in [0, 1]: probability that the dot is nearby, rather than elsewhere or absent
     near: Tensor  # (I, N, 2) centre of the crop, without gradient
     logits: Tensor  # (I, N, h, w) of the cells
     nowhere: Tensor  # (I, N) logit that a fiducial is not in the image
 
 
 class Locator(nn.Module):
-    """Heads on an encoder's map: a heatmap a fiducial with a logit for nowhere, then a soft-argmax over pixels.
+    """Heads on an encoder's map: a heatmap per fiducial with a logit for absence, then a soft-argmax over pixels.
 
-    Source: spatial soft-argmax by kornia; Laplace's distribution as the error's (Kendall and Gal, NeurIPS 2017).
+    Source: spatial soft-argmax by kornia; Laplace distribution of the errors (Kendall and Gal, NeurIPS 2017).
     """
 
     def __init__(self, width: int, fiducials: int, inner: int = 64) -> None:
-        """Make the layers for maps of `width` features."""
+        """Create the layers for maps of `width` features."""
         super().__init__()
         self.heatmaps = nn.Conv2d(width, fiducials, 1)
         self.nowhere = nn.Linear(width, fiducials)
@@ -52,7 +52,7 @@ class Locator(nn.Module):
         self.correct = zero_last_layer(mlp((3 * CROP**2 + inner, inner, 3)))
 
     def forward(self, features: Tensor, images: Tensor) -> Located:
-        """Locate fiducials, by maps (I, width, h, w), in images (I, 3, H, W); float32."""
+        """Locate fiducials in images (I, 3, H, W) from maps (I, width, h, w); float32."""
         logits, nowhere = self.heatmaps(features), self.nowhere(features.mean((-2, -1)))
         coarse, confidence = _centre(logits, nowhere)
         height, width = images.shape[-2:]
@@ -63,7 +63,7 @@ class Locator(nn.Module):
         return Located(near + offset, log_scale, confidence, near, logits, nowhere)
 
     def _fine(self, features: Tensor, images: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
-        """Offsets (I, N, 2) from the centres of crops, and the log of their error's scale (I, N)."""
+        """Offsets (I, N, 2) from the centres of crops, and the log scale of their errors (I, N)."""
         crops, place = _crops(images, near)  # (I, N, P, 3), (P, 2)
         cells = ((near + 0.5) / _cell(images, features)).long()
         index = (cells[..., 1] * features.shape[-1] + cells[..., 0]).clamp(0, features[0, 0].numel() - 1)
@@ -76,7 +76,7 @@ class Locator(nn.Module):
 
 
 class PositionNetwork(nn.Module):
-    """An encoder with a locator on its map: the part of an image network that a training of positions trains."""
+    """An encoder with a locator on its map: the part of an image network that position training trains."""
 
     def __init__(self, backbone: nn.Module, width: int, fiducials: int) -> None:
         """Put a locator on an encoder's map of `width` features."""
@@ -85,23 +85,23 @@ class PositionNetwork(nn.Module):
         self.locator = Locator(width, fiducials)
 
     def forward(self, images: Tensor) -> Located:
-        """Locate the fiducials in single images (I, 3, H, W); float32 behind the encoder."""
+        """Locate the fiducials in single images (I, 3, H, W); float32 after the encoder."""
         features = self.backbone(images)
         with torch.autocast(images.device.type, enabled=False):
             return self.locator(features.float(), images.float())
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
-        """Parameters that may have their own learning rates, or be frozen."""
+        """Parameters by group, for separate learning rates or freezing."""
         return {"encoder": self.backbone.parameters(), "heads": self.locator.parameters()}
 
 
 def _cell(images: Tensor, features: Tensor) -> Tensor:
-    """Pixels a cell of a map: (2,) width, height."""
+    """Pixels per cell of a map: (2,) width, height."""
     return images.new_tensor((images.shape[-1] / features.shape[-1], images.shape[-2] / features.shape[-2]))
 
 
 def _centre(logits: Tensor, nowhere: Tensor) -> tuple[Tensor, Tensor]:
-    """Centres (I, N, 2), in cells, of heatmaps around their maximum, and the probability mass there (I, N)."""
+    """Centroids (I, N, 2), in cells, of heatmaps around their maxima, and the probability mass there (I, N)."""
     height, width = logits.shape[-2:]
     flat = logits.flatten(2)
     most = flat.detach().argmax(-1)
@@ -116,7 +116,7 @@ def _centre(logits: Tensor, nowhere: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _crops(images: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels around whole-numbered places (I, N, 2): their light (I, N, P, 3) and offsets (P, 2)."""
+    """Pixels around integer places (I, N, 2): their colours (I, N, P, 3) and offsets (P, 2)."""
     step = torch.arange(CROP, device=images.device) - CROP // 2
     place = torch.stack(torch.meshgrid(step, step, indexing="xy"), dim=-1).flatten(0, 1)
     pixels = near.long()[..., None, :] + place

@@ -1,7 +1,7 @@
-"""The measurer: the centre of a marker in a small patch at full scale, how well it is known, and whether it is one.
+"""The measurer: the centre of a marker in a small patch at full scale, its accuracy, and whether it is a marker.
 
-It learns what a fitted ellipse cannot know: that half of a sphere may be hidden or dark, that motion has smeared it, or
-that two have merged.
+It learns effects that a fitted ellipse cannot model: a half-hidden or half-dark sphere, motion blur, or two merged
+markers.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from imgcal.io import StrictModel
 from imgcal.networks.infrared_encoders import STRIDE, CropCnn, CropVit
 from imgcal.types import PATCH_SIZE, BlobKind
 
-RADIUS = 3.5  # patch pixels that a marker's radius is reduced to; smaller ones are taken as they are
+RADIUS = 3.5  # patch pixels to which larger markers are downsampled; smaller ones keep their scale
 
-CNN_WIDTHS, VIT_WIDTH_AND_DEPTH = (8, 18, 54), (48, 2)  # as many weights and operations
+CNN_WIDTHS, VIT_WIDTH_AND_DEPTH = (8, 18, 54), (48, 2)  # equal numbers of weights and operations
 
 
 class MeasurerConfig(StrictModel):
-    """Which measurer."""
+    """Architecture of the measurer."""
 
     encoder: Literal["cnn", "vit"] = "cnn"  # family of the encoder
     channels: Annotated[int, Field(ge=1, le=128)] = 24  # of the feature map
@@ -33,23 +33,23 @@ class MeasurerConfig(StrictModel):
 
 @dataclass(frozen=True)
 class Measured:
-    """What patches show, M of them."""
+    """Measurements of M patches."""
 
-    offset: Tensor  # (M, 2) patch pixels, from the middle of the patch to the marker's centre
-    log_sigma: Tensor  # (M,) of its error, patch pixels, one standard deviation of each axis
+    offset: Tensor  # (M, 2) patch pixels, from the centre of the patch to the marker's centre
+    log_sigma: Tensor  # (M,) log standard deviation of the offset per axis, patch pixels
     kind: Tensor  # (M, 4) logits of BlobKind
 
     @property
     def valid(self) -> Tensor:
-        """Logit that the marker is to be seen: (M,)."""
+        """Logit that the marker is visible: (M,)."""
         return self.kind[:, : BlobKind.FALSE].logsumexp(-1) - self.kind[:, BlobKind.FALSE]
 
 
 class Measurer(nn.Module):
-    """Patches in, centres out."""
+    """Measure marker centres in patches."""
 
     def __init__(self, config: MeasurerConfig = MeasurerConfig()) -> None:
-        """Make an untrained network; weights come from torch's default generators (see `drawing_from`)."""
+        """Create an untrained network; weights come from torch's default generators (see `drawing_from`)."""
         super().__init__()
         self.config = config
         channels = config.channels
@@ -67,7 +67,7 @@ class Measurer(nn.Module):
         )
 
     def forward(self, patches: Tensor, radius: Tensor) -> Measured:
-        """Measure one marker a patch, the one that is asked for in its middle.
+        """Measure one marker per patch, the one near its centre.
 
         Args:
             patches: (M, 24, 24) grey, normalized by `normalized`.
@@ -81,15 +81,15 @@ class Measurer(nn.Module):
         cells = torch.stack(torch.meshgrid(steps, steps, indexing="xy"))
         votes = (cells + said[:, 1:3]).flatten(2)
         offset = (votes * weight[:, None]).sum(-1)
-        # Cells that disagree are the first sign that a centre is not well known.
+        # Disagreement between cells is the best sign of an inaccurate centre.
         spread = ((votes - offset[..., None]).square().mean(1) * weight).sum(-1, keepdim=True).clamp(min=1e-4).log()
         attended = (features.float().flatten(2) * weight[:, None]).sum(-1)
-        # What a blob shows is to be seen around its centre, too.
+        # The kind of a blob also shows around its centre.
         around = functional.gelu(features.float()).mean((2, 3))
         verdict = self.verdict(torch.cat((attended, around, spread), -1)).float()
         return Measured(offset, verdict[:, 0].clamp(-5, 3), verdict[:, 1:])
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
-        """Parameters that may have their own learning rates."""
+        """Parameters by group, for separate learning rates."""
         rest = [p for name, p in self.named_parameters() if not name.startswith("encoder.")]
         return {"encoder": self.encoder.parameters(), "decoder": rest}

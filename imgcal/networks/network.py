@@ -1,4 +1,4 @@
-"""What every network is."""
+"""Base class of all networks."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 
 
 class Network(nn.Module, ABC):
-    """Views in, predictions out; it knows the rig and the object that it is for, on the device where its weights are.
+    """Predict rigs from views. A network has the rig and the object that it is for, on the device of its weights.
 
-    State dictionaries hold weights only: rig, object and drift are buffers that are not saved with them.
+    State dictionaries contain only weights: rig, object and drift are non-persistent buffers.
     """
 
     def __init__(self, parameterization: Parameterization, image_options: ImageOptions | None = None) -> None:
-        """Keep what all networks have.
+        """Store what all networks have.
 
         Args:
             parameterization: factory rig, object, and the drift that is the unit of its offsets.
-            image_options: how the images are drawn that it takes; None = it takes points.
+            image_options: how its input images are drawn; None = its inputs are points.
         """
         super().__init__()
         self.parameterization = parameterization
@@ -41,17 +41,17 @@ class Network(nn.Module, ABC):
 
     @property
     def encoder(self) -> nn.Module | None:
-        """The part whose output everything behind it must live on; None = there is no such part.
+        """The part whose output everything after it must depend on; None = there is no such part.
 
-        `imgcal.evaluation.check_encoder` spoils what it returns (a tensor, or tuples of them; the first axis counts
-        rigs, or rigs times cameras) and sees whether that hurts.
+        `imgcal.evaluation.check_encoder` corrupts its output (a tensor, or tuples of them; the first axis is rigs, or
+        rigs times cameras) and checks that the predictions get worse.
         """
         return None
 
     @abstractmethod
     def forward(self, views: Views) -> tuple[Prediction, ...]:
-        """Predict (B,) rigs from (B,) views: one prediction a pass, coarse to fine."""
+        """Predict (B,) rigs from (B,) views: one prediction per pass, coarse to fine."""
 
     @abstractmethod
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
-        """Parameters that may have their own learning rates."""
+        """Parameters by group, for separate learning rates."""

@@ -1,4 +1,4 @@
-"""From the numbers of a network's heads to rigs: the one place that owns their scales."""
+"""Conversion of a network's head outputs to rigs: the only place that defines their scales."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from imgcal.errors import InputError
 from imgcal.geometry import Projection, RigidTransform, rotate, rotation_from_6d, rotation_from_vector
 from imgcal.types import CalibrationObject, CameraRig, Prediction, unpack18
 
-POSE_SHIFT = 10.0  # mm that one unit of a head moves the object
-POSE_TURN = 0.05  # rad that one unit of a head turns it, after the first pass
+POSE_SHIFT = 10.0  # mm of the object's position per unit of a head
+POSE_TURN = 0.05  # rad of the object's rotation per unit of a head, after the first pass
 
 
 @dataclass(frozen=True)
 class RigState:
-    """A rig near the factory's and the object's pose, as networks move them."""
+    """A rig near the factory's and the object's pose, as networks update them."""
 
     offsets: Tensor  # (B, C, K) parameters minus factory values, in units of their prior standard deviation
     rotation: Tensor  # (B, 3, 3) rig_from_object
     centre: Tensor  # (B, 3) mm, the object's centroid in the rig
 
     def detach(self) -> RigState:
-        """Cut the graph."""
+        """Detach from the graph."""
         return RigState(self.offsets.detach(), self.rotation.detach(), self.centre.detach())
 
 
 class Parameterization(nn.Module):
-    """Turn head outputs into predictions; holds the factory rig, the object and the prior as buffers, no weights."""
+    """Convert head outputs to predictions; has the factory rig, the object and the prior as buffers, no weights."""
 
     focal_length: Tensor  # (C, 2)
     principal_point: Tensor  # (C, 2)
@@ -51,7 +51,7 @@ class Parameterization(nn.Module):
         super().__init__()
         if factory.working_distance is None:
             raise InputError(f"rig {factory.name}: found no working_distance, expected one (mm) to start from")
-        self._factory, self._obj = factory, obj  # for what they hold beside tensors
+        self._factory, self._obj = factory, obj  # for their attributes that are not tensors
         self.working_distance = factory.working_distance
         points = obj.points.to(factory.focal_length)
         buffers = {
@@ -69,23 +69,23 @@ class Parameterization(nn.Module):
             "tolerance": None if obj.tolerance is None else obj.tolerance.to(points),
             "centroid": points.mean(0),
             "centred": points - points.mean(0),
-            # Seen from the rig, an object below it that lies level has its z axis towards the cameras.
+            # The z axis of a level object below the rig points towards the cameras.
             "level": torch.diag(torch.tensor((1.0, -1.0, -1.0))),
         }
         for name, tensor in buffers.items():
             self.register_buffer(name, None if tensor is None else tensor.clone(), persistent=False)
-        # Takes a fiducial's distance from the principal point, over f, to about one.
+        # Scales a fiducial's distance from the principal point, over f, to about one.
         self.unit = factory.working_distance / float(self.centred.norm(dim=-1).mean())
 
     @property
     def widths(self) -> dict[str, int]:
-        """Numbers of a camera of each kind, the paper's eighteen where the lens has five coefficients."""
+        """Number of outputs per camera by kind; with five lens coefficients, the paper's eighteen."""
         lens = self.distortion.shape[-1]
         return {"rotation": 6, "translation": 3, "focal_length": 2, "principal_point": 2, "distortion": lens}
 
     @property
     def num_parameters(self) -> int:
-        """Free parameters of a camera, K."""
+        """Free parameters per camera, K."""
         return self.prior_std.shape[-1]
 
     @property
@@ -107,15 +107,15 @@ class Parameterization(nn.Module):
         return replace(self._obj, **tensors)  # type: ignore[arg-type]
 
     def normalize(self, uv: Tensor) -> Tensor:
-        """Pixels (B, C, N, 2) to numbers of about one, by the factory's intrinsics."""
+        """Normalize pixels (B, C, N, 2) to values of about one, with the factory's intrinsics."""
         return (uv - self.principal_point[:, None]) / self.focal_length[:, None] * self.unit
 
     def start(self, offsets: Tensor, pose: Tensor) -> RigState:
-        """Place rigs from nothing.
+        """Create the initial state of rigs.
 
         Args:
             offsets: (B, C, K) in units of `prior_std`.
-            pose: (B, 9) 6D rotation less that of a level object, then a shift from the working distance.
+            pose: (B, 9) 6D rotation relative to a level object, then a shift from the working distance.
         """
         identity = pose.new_tensor((1.0, 0.0, 0.0, 0.0, 1.0, 0.0))
         rotation = self.level @ rotation_from_6d(pose[:, :6] + identity)
@@ -123,25 +123,24 @@ class Parameterization(nn.Module):
         return RigState(offsets, rotation, centre)
 
     def move(self, state: RigState, offsets: Tensor, pose: Tensor) -> RigState:
-        """Correct rigs: offsets (B, C, K) in units of `prior_std`, pose (B, 6) turn and shift."""
+        """Update rigs: offsets (B, C, K) in units of `prior_std`, pose (B, 6) rotation and shift."""
         rotation = rotation_from_vector(POSE_TURN * pose[:, :3]) @ state.rotation
         return RigState(state.offsets + offsets, rotation, state.centre + POSE_SHIFT * pose[:, 3:])
 
     def prediction(self, state: RigState) -> Prediction:
-        """The rig and the pose of a state: (B,)."""
+        """Convert a state to rig and pose: (B,)."""
         shift = state.centre - rotate(state.rotation, self.centroid.expand_as(state.centre))
         return Prediction(self.factory.retract(state.offsets * self.prior_std), RigidTransform(state.rotation, shift))
 
     def project(self, prediction: Prediction) -> Projection:
-        """Project the object's fiducials, as points: (B, C, N), without gradient."""
+        """Project the object's fiducials, treated as points: (B, C, N), without gradient."""
         return prediction.rig.project_values(prediction.rig_from_object.apply(self.centred + self.centroid))
 
     def absolute(self, numbers: Tensor) -> Prediction:
-        """Decode the paper's 13 + D numbers a camera: (B, C, 13 + D), each camera on its own in the object's frame.
+        """Decode the paper's 13 + D numbers per camera (B, C, 13 + D), each camera independently in the object's frame.
 
-        Scales are those of a rig, not of one camera: working distance for translations, mean focal length, mean
-        principal point; the 6D rotation and the distortion as they are. Coefficients that a lens does not have stay
-        zero.
+        Scales are common to the rig: working distance for translations, mean focal length, mean principal point; the
+        6D rotation and the distortion are unscaled. Coefficients that a lens does not have stay zero.
 
         Source: paper, supplementary section 1.
         """

@@ -1,4 +1,4 @@
-"""Point variants: labelled fiducial positions in, a rig out. The paper's network and ours."""
+"""Point variants: from labelled fiducial positions to a rig. The paper's network and ours."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class PaperHeads(nn.Module):
         self.heads = nn.ModuleList(mlp((features, *widths, count)) for count in outputs.values())
 
     def forward(self, features: Tensor) -> Tensor:
-        """(B, C, features) -> (B, C, 13 + D), in float32 whatever autocast is on."""
+        """(B, C, features) -> (B, C, 13 + D), in float32 even under autocast."""
         with torch.autocast(features.device.type, enabled=False):
             features = features.float()
             return torch.cat([head(features) for head in self.heads], dim=-1)
@@ -77,46 +77,46 @@ class PaperPointNetwork(Network):
 
     @property
     def encoder(self) -> nn.Module:
-        """What relates the cameras to one another."""
+        """The layers that relate the cameras to one another."""
         return self.layers
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
-        """Predict the rig from `views.uv`; fiducials that are not seen count as at the principal point."""
+        """Predict the rig from `views.uv`; missing fiducials are placed at the principal point."""
         uv, seen = stack_points(views)
         with torch.autocast(uv.device.type, enabled=False):
             positions = torch.where(seen[..., None], self.parameterization.normalize(uv.float()), 0.0).flatten(-2)
-            embedded = self.embed(positions)  # bf16 would round a position to a pixel before it is looked at
+            embedded = self.embed(positions)  # bf16 would round positions to a pixel
         numbers = self.heads(self.layers(self.identity(embedded)))
         with torch.autocast(uv.device.type, enabled=False):
             return (self.parameterization.absolute(numbers),)
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
-        """Parameters that may have their own learning rates."""
+        """Parameters by group, for separate learning rates."""
         return {"encoder": [*self.embed.parameters(), *self.layers.parameters()]} | self.heads.groups()
 
 
 class PointNetwork(Network):
-    """Our point variant: `IterativeRefiner` on the positions; fiducials that are missing are masked."""
+    """Our point variant: `IterativeRefiner` on the positions; missing fiducials are masked."""
 
     def __init__(self, config: Points, parameterization: Parameterization) -> None:
         super().__init__(parameterization)
         self.trunk = IterativeRefiner(parameterization, **config.trunk.model_dump())
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
-        """Predict the rig from `views.uv` and `views.seen`; one prediction a pass."""
+        """Predict the rig from `views.uv` and `views.seen`; one prediction per pass."""
         uv, seen = stack_points(views)
         return self.trunk(torch.where(seen[..., None], uv, 0.0), seen.to(uv.dtype))
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
-        """Parameters that may have their own learning rates."""
+        """Parameters by group, for separate learning rates."""
         return {"trunk": self.trunk.parameters()}
 
 
 def stack_points(views: Views) -> tuple[Tensor, Tensor]:
-    """Positions (B, C, N, 2) and which are seen (B, C, N).
+    """Return positions (B, C, N, 2) and a visibility mask (B, C, N).
 
     Raises:
-        ValueError: the views hold images only.
+        ValueError: the views have only images.
     """
     if views.uv is None:
         raise ValueError("a point variant needs views.uv, found images only")

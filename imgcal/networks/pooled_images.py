@@ -1,4 +1,4 @@
-"""Image variants that know one pooled feature an image: the paper's network, and ours beside it."""
+"""Image variants with one pooled feature per image: the paper's network, and ours for comparison."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class _PooledNetwork(Network):
     def __init__(
         self, config: PaperImages | PooledImages, parameterization: Parameterization, images: ImageOptions | None = None
     ) -> None:
-        """Make the layers; images are as large as the encoder takes them unless `images` says otherwise."""
+        """Create the layers; the image size is the encoder's own unless `images` overrides it."""
         size = None if images is None else images.size
         backbone = Backbone(config.backbone, config.pretrained, config.options, size)
         super().__init__(parameterization, images or ImageOptions(size=max(backbone.size)))
@@ -39,7 +39,7 @@ class _PooledNetwork(Network):
 
 
 class PaperImageNetwork(_PooledNetwork):
-    """The paper's image variant: each image on its own through an encoder, bottleneck to 128, five heads.
+    """The paper's image variant: each image goes through an encoder by itself, a bottleneck to 128, and five heads.
 
     Source: paper, supplementary section 1.2.
     """
@@ -47,7 +47,7 @@ class PaperImageNetwork(_PooledNetwork):
     def __init__(
         self, config: PaperImages, parameterization: Parameterization, images: ImageOptions | None = None
     ) -> None:
-        """Make the layers; see `_PooledNetwork`."""
+        """Create the layers; see `_PooledNetwork`."""
         super().__init__(config, parameterization, images)
         self.heads = PaperHeads(config.bottleneck, config.head_widths, parameterization.widths)
 
@@ -60,23 +60,23 @@ class PaperImageNetwork(_PooledNetwork):
             return (self.parameterization.absolute(numbers),)
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
-        """Parameters that may have their own learning rates."""
+        """Parameters by group, for separate learning rates."""
         groups = {"encoder": self.backbone.parameters(), "bottleneck": self.bottleneck.parameters()}
         return groups | self.heads.groups()
 
 
 class PooledImageNetwork(_PooledNetwork):
-    """An image variant that knows one pooled feature an image, as the paper's does, and our trunk."""
+    """An image variant with one pooled feature per image, like the paper's, and our trunk."""
 
     def __init__(
         self, config: PooledImages, parameterization: Parameterization, images: ImageOptions | None = None
     ) -> None:
-        """Make the layers; see `_PooledNetwork`."""
+        """Create the layers; see `_PooledNetwork`."""
         super().__init__(config, parameterization, images)
         self.trunk = IterativeRefiner(parameterization, **config.trunk.model_dump(), features=config.bottleneck)
 
     def forward(self, views: Views) -> tuple[Prediction, ...]:
-        """Predict the rig from `views.images`; one prediction a pass."""
+        """Predict the rig from `views.images`; one prediction per pass."""
         images = stack_images(views)
         features = functional.gelu(self.bottleneck(self.backbone(images.flatten(0, 1))))
         fiducials = len(self.parameterization.colours)
@@ -85,7 +85,7 @@ class PooledImageNetwork(_PooledNetwork):
         return self.trunk(uv, nothing, features.float().unflatten(0, images.shape[:2]))
 
     def parameter_groups(self) -> Mapping[str, Iterable[nn.Parameter]]:
-        """Parameters that may have their own learning rates."""
+        """Parameters by group, for separate learning rates."""
         return {
             "encoder": self.backbone.parameters(),
             "heads": self.bottleneck.parameters(),

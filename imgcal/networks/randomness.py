@@ -1,4 +1,4 @@
-"""Layers that draw from a given generator: torch's initializers and dropout ask the process's default one only."""
+"""Layers that draw from a given generator: torch's initializers and dropout only use the process's default one."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import torch
 
 @contextmanager
 def drawing_from(*generators: torch.Generator) -> Iterator[None]:
-    """Put generators in the place of the default ones of their devices, which are afterwards as they were.
+    """Replace the default generators of devices by given ones, and restore them afterwards.
 
-    Default generators belong to the process: other threads must not draw meanwhile.
+    Default generators are global: other threads must not draw at the same time.
 
     Args:
-        generators: one a device; each goes on where the block has left it.
+        generators: one per device; each keeps the state that it has at the end of the block.
     """
     defaults = [_default(generator.device) for generator in generators]
     before = [default.get_state() for default in defaults]

@@ -1,9 +1,9 @@
-"""From fiducial positions to a rig: our own network, common to the point and the image variants.
+"""From fiducial positions to a rig: our own network, shared by the point and the image variants.
 
-One token a camera and one for the rig; attention over all of them. A first pass places the rig from positions alone.
-Every later pass projects the object with the rig as it stands and sees what is left over, so that positions reach the
-heads as differences: a fraction of a pixel is then a number that a network can act on. All heads predict offsets from
-the factory rig and start at zero: an untrained network returns the factory calibration.
+There is one token per camera and one for the rig, with attention over all of them. The first pass predicts the rig from
+positions alone. Every later pass projects the object with the current rig and gets the residuals, so that a fraction of
+a pixel becomes a number that the network can act on. All heads predict offsets from the factory rig and start at zero:
+an untrained network returns the factory calibration.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from imgcal.networks.layers import conv1d, mlp, transformer, zero_last_layer
 from imgcal.networks.parameterization import Parameterization, RigState
 from imgcal.types import Prediction
 
-RESIDUAL_SCALES = (20.0, 4.0)  # pixels, where a residual saturates; a linear part (in 100 px) stands beside
+RESIDUAL_SCALES = (20.0, 4.0)  # pixels at which a residual saturates; in addition to a linear part (in 100 px)
 LIMIT = 5.0  # largest input of the linear parts
-LEAST_TRUST = 7.0  # largest log of a factor on sigma: a thousand sigmas, no weight at all
+LEAST_TRUST = 7.0  # largest log of a factor on sigma: a thousand sigmas, practically no weight
 
 
 class UpdateBlock(nn.Module):
-    """One pass: numbers of each camera in, parameters of each camera and of the pose out."""
+    """One pass: from the inputs of each camera to parameters of each camera and of the pose."""
 
     def __init__(
         self,
@@ -55,12 +55,12 @@ class UpdateBlock(nn.Module):
         encoded = self.encoder(tokens)
         with torch.autocast(inputs.device.type, enabled=False):
             encoded = encoded.to(inputs.dtype)
-            # The heads see the positions themselves, too: pooling and normalization would round them.
+            # The heads also get the inputs directly, because normalization would lose precision.
             return self.camera_head(torch.cat((encoded[:, :-1], inputs), dim=-1)), self.pose_head(encoded[:, -1])
 
 
 class IterativeRefiner(nn.Module):
-    """Positions, and how far to trust each, to predictions coarse to fine."""
+    """Predict rigs, coarse to fine, from positions and their weights."""
 
     def __init__(
         self,
@@ -88,15 +88,15 @@ class IterativeRefiner(nn.Module):
         self.trust_head = zero_last_layer(mlp((inputs, width, fiducials))) if trust else None
 
     def forward(self, uv: Tensor, weight: Tensor, features: Tensor | None = None) -> tuple[Prediction, ...]:
-        """Predict.
+        """Predict rigs in all passes.
 
         Args:
             uv: (B, C, N, 2) pixels of the sensor; any finite value where the weight is zero.
-            weight: (B, C, N) in [0, 1], zero where not seen.
+            weight: (B, C, N) in [0, 1], zero for missing fiducials.
             features: (B, C, F) of an image encoder, or None.
 
         Returns:
-            One prediction a pass.
+            One prediction per pass.
         """
         device = uv.device.type
         with torch.autocast(device, enabled=False):
@@ -108,7 +108,7 @@ class IterativeRefiner(nn.Module):
             state = self.parameterization.start(offsets, pose)
             predictions = [self.parameterization.prediction(state)]
         for _ in range(self.passes - 1):
-            state = state.detach()  # each pass answers for its own error only, as in RAFT (Teed and Deng, ECCV 2020)
+            state = state.detach()  # each pass only learns from its own error, as in RAFT (Teed and Deng, ECCV 2020)
             with torch.autocast(device, enabled=False):
                 inputs = self._differences(state, predictions[-1], uv, weight)
             assert self.later is not None
@@ -124,11 +124,12 @@ class IterativeRefiner(nn.Module):
 
     @torch.no_grad()
     def rescale(self, prior_std: Tensor) -> None:
-        """Make weights that were trained with offsets in other units say the same in those of this network.
+        """Convert weights that were trained with offsets in other units to the units of this network.
 
         Args:
-            prior_std: (C', K') of the other training; cameras may differ, their mean counts. With lenses of another
-                width, what knows units has another shape, and nothing was taken over that could be rescaled.
+            prior_std: (C', K') of the other training; its mean over cameras is used, so their number may differ. With
+                another number of lens coefficients, the affected layers have another shape and were not copied, so
+                nothing is converted.
         """
         if prior_std.shape[-1] != self.parameterization.num_parameters:
             return
@@ -138,13 +139,13 @@ class IterativeRefiner(nn.Module):
             if stage is not None:
                 for parameter in stage.camera_head[-1].parameters():  # (K, width) and (K,)
                     parameter.mT.mul_(ratio) if parameter.ndim == 2 else parameter.mul_(ratio)
-        # Some layers are also told the offsets: their last inputs.
-        told = [] if self.later is None else [self.later.embed[0], self.later.camera_head[0]]
-        for layer in [*told, *([] if self.trust_head is None else [self.trust_head[0]])]:
+        # Offsets are also the last inputs of some layers.
+        offset_layers = [] if self.later is None else [self.later.embed[0], self.later.camera_head[0]]
+        for layer in [*offset_layers, *([] if self.trust_head is None else [self.trust_head[0]])]:
             next(layer.parameters())[:, -self.parameterization.num_parameters :] /= ratio
 
     def _differences(self, state: RigState, prediction: Prediction, uv: Tensor, weight: Tensor) -> Tensor:
-        """What a later pass sees: (B, C, inputs); its gradient is that of the positions, not of the rig so far."""
+        """Inputs of a later pass: (B, C, inputs). Gradients flow to the positions, not to the current rig."""
         with torch.no_grad():
             projected = self.parameterization.project(prediction).uv
         residual = (projected - uv) * weight[..., None]

@@ -1,7 +1,7 @@
-"""Where each fiducial is in a colour-coded image: soft coordinates by colour, weighted by what an encoder believes.
+"""Fiducial positions in colour-coded images: soft coordinates by colour, weighted by an encoder's heatmaps.
 
-An image is almost all black. Only the pixels that are not are looked at, as one long ragged row over all images, so
-that the cost follows the number of dots, not the number of pixels.
+An image is almost all black. Only the other pixels are processed, as one long ragged row over all images, so that the
+cost depends on the number of dots, not on the number of pixels.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from torch import Tensor
 from imgcal.operators import Operator, Tensors
 from renderers import is_traced
 
-DARK = 8 / 255  # pixels below are background: quantization has left them no hue
-HUE_TOLERANCE = 0.06  # rad, how far a pixel's hue may lie from a fiducial's; the first 8 colours are 0.3 apart
-WINDOW = 2.0  # in sizes of a dot: the second look is through a Gaussian window around the first one's centre
-LEAST_LIGHT = 0.05  # share of a full dot's light below which nothing was seen
-OUTLIER_SPREAD = 2.0  # in sizes of a dot: light farther from its centre is not one dot
+DARK = 8 / 255  # darker pixels are background: quantization has destroyed their hue
+HUE_TOLERANCE = 0.06  # rad between the hues of a pixel and a fiducial; the first 8 colours are 0.3 apart
+WINDOW = 2.0  # in sizes of a dot: Gaussian window of the second pass, around the centroid of the first
+LEAST_LIGHT = 0.05  # smallest share of a full dot's light for a detection
+OUTLIER_SPREAD = 2.0  # in sizes of a dot: light with a larger spread is not a single dot
 
 
 def find_soft_positions(
@@ -28,14 +28,13 @@ def find_soft_positions(
         images: (I, 3, H, W) colour-coded splats on black, in [0, 1].
         colours: (N, 3) of the fiducials.
         dot: standard deviation of a dot in pixels.
-        heatmap_logits: (I, N, h, w) log weights of an encoder's cells, which multiply the colour's; None =
-            colour alone.
-        through_window: the gradient also goes the way through the place of the second look's window; without it, it is
-            the one by what is within the window, which is steadier in training.
+        heatmap_logits: (I, N, h, w) log weights of an encoder's cells, which multiply the colour's; None = colour only.
+        through_window: also differentiate through the position of the second pass's window. Otherwise the gradient only
+            comes from the pixels within the window, which is more stable in training.
 
     Returns:
         uv (I, N, 2) pixels of the image and confidence (I, N) in [0, 1]: the share of a full dot's light that was found
-        in one place; zero where there is none, with finite positions. Differentiable in `heatmap_logits`, in the dtype
+        in one place; zero without a detection, with finite positions. Differentiable in `heatmap_logits`, in the dtype
         of `images`.
     """
     if not is_traced():
@@ -48,7 +47,7 @@ def find_soft_positions(
 def _soft_positions(
     images: Tensor, colours: Tensor, dot: float, heatmap_logits: Tensor | None, through_window: bool
 ) -> tuple[Tensor, Tensor]:
-    """Do the work of `find_soft_positions`; how many pixels are looked at depends on the images."""
+    """Do the work of `find_soft_positions`; the number of processed pixels depends on the images."""
     count, _, height, width = images.shape
     with torch.no_grad():
         pixels = images.amax(1)
@@ -66,7 +65,7 @@ def _soft_positions(
         apart = (place[:, None] - first[image]).square().sum(-1) / (WINDOW * dot) ** 2
         window = torch.exp(-0.5 * apart)
     second, found, spread = _centres(weight * window, place, image, count)
-    # A window of w sizes leaves w^2 / (1 + w^2) of a dot's light, and pulls its centre by the rest: undone here.
+    # A window of w sizes keeps w^2 / (1 + w^2) of a dot's light and biases its centroid accordingly: correct for it.
     kept = WINDOW**2 / (1 + WINDOW**2)
     centre = first.detach() + (second - first.detach()) / kept if heatmap_logits is None else second
     full = colours.to(images).norm(dim=-1) * (2 * torch.pi * dot**2) * kept
@@ -76,16 +75,16 @@ def _soft_positions(
 
 
 def _likeness(colour: Tensor, colours: Tensor) -> Tensor:
-    """How well the hue of pixels (M, 3) agrees with that of fiducials (N, 3): (M, N) in [0, 1]."""
+    """Agreement between the hues of pixels (M, 3) and fiducials (N, 3): (M, N) in [0, 1]."""
     direction = torch.nn.functional.normalize(colour, dim=-1)
     cosine = (direction @ torch.nn.functional.normalize(colours, dim=-1).T).clamp(-1, 1)
-    # The quantization of a dark pixel turns its hue: it may be off by more.
+    # Quantization changes the hue of dark pixels, so their tolerance is larger.
     tolerance = HUE_TOLERANCE + (0.5 / 255) / colour.norm(dim=-1, keepdim=True).clamp_min(1e-6)
     return torch.exp(-(1 - cosine) / tolerance.square())
 
 
 def _centres(weight: Tensor, place: Tensor, image: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Weighted centres (I, N, 2), sums of weights (I, N) and mean squared distances from the centre (I, N)."""
+    """Weighted centroids (I, N, 2), sums of weights (I, N) and mean squared distances from the centroid (I, N)."""
     total = _sums(weight, image, count)
     safe = total.clamp_min(1e-12)
     moments = torch.stack([_sums(weight * place[:, axis, None], image, count) for axis in (0, 1)], dim=-1)

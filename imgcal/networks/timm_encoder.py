@@ -1,4 +1,4 @@
-"""Any timm model as an encoder of images: a map of features at a stride of 4 pixels."""
+"""timm models as image encoders: a feature map at a stride of 4 pixels."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from imgcal.networks.encoders import STRIDE, Cells, Pyramid, resize_images
 
 
 class TimmEncoder(nn.Module):
-    """Any timm model: its maps of several strides, added up, where it has them; else its tokens, spread over cells."""
+    """A timm model: the sum of its maps of several strides, if it has them; otherwise its tokens, expanded to cells."""
 
     mean: Tensor  # (3, 1, 1)
     std: Tensor  # (3, 1, 1)
 
     def __init__(self, name: str, pretrained: bool, options: Mapping[str, Any], width: int) -> None:
-        """Make the model without its classifier, and what turns its features into a map of `width`."""
+        """Create the model without its classifier, and the layers that convert its features to a map of `width`."""
         super().__init__()
         plain = make_backbone(name, pretrained, options)
         self.size = input_size(plain)
@@ -42,7 +42,7 @@ class TimmEncoder(nn.Module):
             self.join = Cells(cast(int, plain.num_features), width, factor)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Images (I, 3, H, W) in [0, 1] -> (I, width, h / 4, w / 4) of the h x w pixels that the model takes."""
+        """Images (I, 3, H, W) in [0, 1] -> (I, width, h / 4, w / 4) for the h x w pixels of the model's input."""
         height, width = self.size
         normalized = (resize_images(images, self.size) - self.mean) / self.std
         if self.levels:
@@ -61,19 +61,19 @@ class TimmEncoder(nn.Module):
         features = self.model.forward_features(images)
         if features.ndim == 4:
             return _channels_first(self.model, features)
-        # Tokens before the patches (class token) do not belong to the map.
+        # Tokens before the patches (class token) are not part of the map.
         patches = features[:, int(getattr(self.model, "num_prefix_tokens", 0)) :]
         side = round((patches.shape[1] * images.shape[-2] / images.shape[-1]) ** 0.5)
         return patches.mT.unflatten(-1, (side, -1))
 
 
 def _make_strided(name: str, pretrained: bool, options: Mapping[str, Any]) -> tuple[Any, list[int]]:
-    """Make a timm model that gives its maps, with the numbers of those from stride 4 on; nothing where it has one."""
+    """Create a timm model that returns its maps, and the indices of those from stride 4 on; None without several."""
     try:
         model: Any = timm.create_model(name, pretrained=pretrained, features_only=True, **options)
         strides = model.feature_info.reduction()
     except (RuntimeError, AttributeError, AssertionError, TypeError, ValueError, KeyError):
-        return None, []  # timm's way to say that it has no maps
+        return None, []  # the errors of timm models without maps
     levels = [level for level, stride in enumerate(strides) if stride >= STRIDE]
     if len({strides[level] for level in levels}) < 2 or len(set(strides)) < len(strides):
         return None, []

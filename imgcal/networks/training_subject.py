@@ -1,4 +1,4 @@
-"""Whether a network was trained for what it is to say, and the rig and the object that are there."""
+"""Checks that a network was trained for the given rig and object, and for predicting rigs."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ def check_rig(path: str | Path, trained: CameraRig, rig: CameraRig) -> None:
 
 
 def is_position_training(experiment: NetworkSpec) -> bool:
-    """Tell whether a training was one of positions, in which the trunk has learnt nothing."""
+    """Check whether a training was one of positions, which leaves the trunk untrained."""
     return getattr(experiment, "task", None) == "positions"
 
 
 def check_says_rigs(path: str | Path, experiment: NetworkSpec) -> None:
-    """Refuse a network that finds positions and has not learnt what a rig is.
+    """Refuse a network that was trained only to find positions, not to predict rigs.
 
     Raises:
-        InputError: it was trained by the task of positions.
+        InputError: the training's task was `positions`.
     """
     if is_position_training(experiment):
         raise InputError(

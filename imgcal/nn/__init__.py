@@ -1,4 +1,4 @@
-"""Differentiable modules for training loops of one's own: `torch.nn.Module`s over imgcal's stateless functions.
+"""Differentiable modules for your own training loops: `torch.nn.Module`s over imgcal's stateless functions.
 
 Each runs on any device in float32 and float64, with any batch axes, under `torch.compile(fullgraph=True)`,
 `torch.export` (not strict), `torch.func.vmap`, `jacfwd` and `jacrev`. Importing this package makes the value types of

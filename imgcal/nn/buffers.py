@@ -11,7 +11,7 @@ from imgcal.types import CalibrationObject, CameraRig
 
 
 class RigBuffers(nn.Module):
-    """A rig in buffers; not part of the state that is saved."""
+    """A rig in buffers that are not part of the saved state."""
 
     focal_length: Tensor
     principal_point: Tensor
@@ -34,7 +34,7 @@ class RigBuffers(nn.Module):
             self.register_buffer(name, tensor.clone(), persistent=False)
 
     def forward(self) -> CameraRig:
-        """Return the rig, where the module is."""
+        """Return the rig on the module's device."""
         return replace(
             self._like,
             focal_length=self.focal_length,
@@ -46,7 +46,7 @@ class RigBuffers(nn.Module):
 
 
 class ObjectBuffers(nn.Module):
-    """The fiducials of an object in buffers, as exact ones; not part of the state that is saved."""
+    """The fiducials of an object in buffers that are not part of the saved state, treated as exact."""
 
     points: Tensor
     colours: Tensor
@@ -60,5 +60,5 @@ class ObjectBuffers(nn.Module):
         self.register_buffer("radius", None if obj.radius is None else obj.radius.clone(), persistent=False)
 
     def forward(self) -> CalibrationObject:
-        """Return the object, where the module is."""
+        """Return the object on the module's device."""
         return CalibrationObject(self.points, self.colours, self.radius, self.name, self.fiducial_names)

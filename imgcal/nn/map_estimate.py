@@ -29,25 +29,25 @@ from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 
 @dataclass(frozen=True)
 class MapSolution:
-    """The most probable rig, and the object's poses. Gradients flow through all but `dof` and `converged`."""
+    """The most probable rig and poses of the object. Gradients flow through all but `dof` and `converged`."""
 
     rig: CameraRig  # (*B)
     rig_from_object: RigidTransform  # (*B, S)
     points_object: Tensor  # (*B, N, 3) mm, the fiducials as estimated; as given where the object is exact
     chi2: Tensor  # (*B) sum of squared whitened residuals (robust), data and prior
     dof: Tensor  # (*B) expected chi2
-    converged: Tensor  # (*B) bool: must be looked at; a rig that has not converged is returned where it ended
+    converged: Tensor  # (*B) bool: check it; a rig that has not converged is returned in its last state
 
 
 register(MapSolution)
 
 
 class MapEstimate(nn.Module):
-    """Find the rig and the object's poses that best explain labelled fiducials and the factory calibration.
+    """Estimate the rig and the object's poses that best explain labelled fiducials and the factory calibration.
 
-    The gradient is that of the solution, by the implicit function theorem, whatever the way to it: to the pixels and
-    their sigmas, to the factory rig and how far it may have drifted. One opaque operator in a compiled or exported
-    graph; derivatives in both directions, under `torch.func.vmap`, but not second ones.
+    Gradients follow from the solution by the implicit function theorem, independent of the iterations. They flow to the
+    pixels and their sigmas, the factory rig and its prior. The module is one opaque operator in a compiled or
+    exported graph, with forward and reverse derivatives, also under `torch.func.vmap`, but no second ones.
 
     Args:
         factory: the factory rig, (*B) or without batch axes; its prior says how far cameras may have drifted.
@@ -58,9 +58,9 @@ class MapEstimate(nn.Module):
 
     Shape:
         - observations: uv (*B, S, C, N, 2) pixels, sigma (*B, S, C, N) pixels, seen (*B, S, C, N).
-        - factory, prior_std: in the place of what the module holds; None = that.
-        - rig_from_object: (*B, S) where to start; None = found from the observations.
-        - initial_rig: (*B) rigs where to start; None = the factory rig.
+        - factory, prior_std: replace the module's own; None = the module's.
+        - rig_from_object: (*B, S) initial poses; None = computed from the observations.
+        - initial_rig: (*B) initial rigs; None = the factory rig.
         - Output: `MapSolution`.
 
     Source: docs/method.md; implicit differentiation as in Gould et al., "Deep Declarative Networks" (PAMI 2022).
@@ -107,7 +107,7 @@ class MapEstimate(nn.Module):
         rig_from_object: RigidTransform | None = None,
         initial_rig: CameraRig | None = None,
     ) -> MapSolution:
-        """Estimate."""
+        """Estimate rig and poses."""
         factory = self.factory() if factory is None else factory
         problem = self._problem(observations, factory, self.prior_std if prior_std is None else prior_std)
         state, converged = map_state(problem, self._start(problem, rig_from_object, initial_rig), self._encoded)
@@ -120,7 +120,7 @@ class MapEstimate(nn.Module):
         return replace(problem, object_prior_std=self.object_prior_std.to(problem.uv).expand(len(problem.uv), -1))
 
     def _start(self, problem: Problem, rig_from_object: RigidTransform | None, initial_rig: CameraRig | None) -> State:
-        if rig_from_object is None:  # no poses: the operator finds them
+        if rig_from_object is None:  # no poses: the operator computes them
             new, count = problem.uv.new_zeros, len(problem.uv)
             poses = RigidTransform(new(count, 0, 3, 3), new(count, 0, 3))
             return initial_state(replace(problem, uv=problem.uv[:, :0]), poses, initial_rig)

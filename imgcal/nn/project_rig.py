@@ -1,4 +1,4 @@
-"""`ProjectRig`: where each camera sees each fiducial."""
+"""`ProjectRig`: projection of fiducials into the cameras of a rig."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class ProjectRig(nn.Module):
     """Project an object's fiducials into the cameras of a rig.
 
     Differentiable in the rig and in the pose. Convention: pixel (0, 0) is the centre of the top-left pixel; `visible`
-    says whether a pixel means anything, whose coordinates are finite in any case.
+    tells whether a pixel is valid; its coordinates are finite in any case.
 
     Args:
         obj: N fiducials (mm); those with a radius are spheres, whose apparent centres are projected.
@@ -23,7 +23,7 @@ class ProjectRig(nn.Module):
         - rig_from_object: (*B) poses (mm); None = the rig is given in the object's frame.
         - Output: `Projection` of uv (*B, C, N, 2) pixels, depth (*B, C, N) mm and visible (*B, C, N).
 
-    Source: each camera's own lens, as in OpenCV; `imgcal.CameraRig.project`.
+    Source: each camera's own lens model, as in OpenCV; `imgcal.CameraRig.project`.
 
     Example:
         >>> import imgcal
@@ -40,7 +40,7 @@ class ProjectRig(nn.Module):
         self.obj = ObjectBuffers(obj)
 
     def forward(self, rig: CameraRig, rig_from_object: RigidTransform | None = None) -> Projection:
-        """Project."""
+        """Project the fiducials."""
         points = self.obj.points.to(rig.focal_length)
         radius = None if self.obj.radius is None else self.obj.radius.to(points)
         if rig_from_object is not None:

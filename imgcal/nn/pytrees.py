@@ -1,7 +1,7 @@
-"""Value types as pytrees: `torch.func`, `torch.compile` and `torch.export` see their tensors.
+"""Value types as pytrees, whose tensors `torch.func`, `torch.compile` and `torch.export` can access.
 
-Names, numbers and the size of a rig's images are constants of the tree, not leaves: `torch.func.grad` and `vmap` take a
-rig as it is. Two trees are the same only where those are equal.
+Names, numbers and a rig's image sizes are constants of the tree, not leaves, so `torch.func.grad` and `vmap` accept a
+rig directly. Two trees have the same structure only if these constants are equal.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
-from torch.utils import _pytree as pytree  # where PyTorch keeps it; it has no other name for it
+from torch.utils import _pytree as pytree  # PyTorch has no public name for it
 
 from imgcal.geometry import Projection, RigidTransform
 from imgcal.types import CalibrationObject, CameraRig, DriftRate, Observations, Prediction, RigPrior, Views, Volume
@@ -21,10 +21,10 @@ Value = TypeVar("Value")
 
 
 class Constant:
-    """A tensor of whole numbers that is part of a tree's structure; equal to others of the same values."""
+    """An integer tensor that is part of a tree's structure; equal to others with the same values."""
 
     def __init__(self, tensor: Tensor) -> None:
-        """Hold a tensor."""
+        """Store a tensor."""
         self.tensor = tensor
 
     def __eq__(self, other: object) -> bool:
@@ -40,10 +40,10 @@ class Constant:
 
 
 def register(cls: type[Value], constants: tuple[str, ...] = ()) -> type[Value]:
-    """Make a frozen dataclass a pytree whose leaves are all fields but the constants.
+    """Register a frozen dataclass as a pytree whose leaves are all fields but the constants.
 
-    Fields that are None have no leaves. Trees are put together again without the checks of the class, because what
-    PyTorch puts into them while it traces need not be tensors.
+    Fields that are None have no leaves. Unflattening skips the checks of the class, because the leaves are not always
+    tensors while PyTorch traces.
     """
     names = tuple(field.name for field in fields(cls) if field.name not in constants)  # type: ignore[arg-type]
 
@@ -92,7 +92,7 @@ _LOAD: dict[str, Callable[[Any], Any]] = {
 
 
 def _dump(value: Any) -> Any:
-    """Write a constant as JSON can hold it."""
+    """Convert a constant to a JSON value."""
     if isinstance(value, Constant):
         return ["Constant", {"values": value.tensor.tolist(), "device": str(value.tensor.device)}]
     if isinstance(value, RigPrior | DriftRate | Volume):
@@ -107,7 +107,7 @@ def _load(dumped: Any) -> Any:
 
 for _type in (RigidTransform, Projection, Observations, Prediction, Views):
     register(_type)
-# Exported programs hold the inputs that they were traced with, and are read without pickles of unknown types.
+# Exported programs contain example inputs, and are loaded without unpickling unknown types.
 torch.serialization.add_safe_globals(
     [
         RigidTransform,

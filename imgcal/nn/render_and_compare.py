@@ -1,4 +1,4 @@
-"""`RenderAndCompare`: the rig whose images are the given ones, as a layer."""
+"""`RenderAndCompare`: the rig whose rendered images match the given ones, as a layer."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from imgcal.types import CalibrationObject, CameraRig, Prediction, RigPrior
 
 @dataclass(frozen=True)
 class RefinedImages:
-    """What images say about a rig."""
+    """A rig refined on images."""
 
     rig: CameraRig  # (*B)
     rig_from_object: RigidTransform  # (*B)
-    converged: Tensor  # (*B) bool: the images are explained; must be looked at
+    converged: Tensor  # (*B) bool: the images are explained; check it
 
 
 register(RefinedImages)
 
 
 class RenderAndCompare(nn.Module):
-    """Refine a prediction on the colour-coded images that it was made from: photometric Gauss-Newton, then MAP.
+    """Refine a prediction on the colour-coded images from which it was made: photometric Gauss-Newton, then MAP.
 
-    The gradient is that of the solution, by the implicit function theorem, to the images (by their Gauss-Newton
-    curvature: exact where they are explained) and to the factory rig and its prior; none flows through the first
-    guess, which only says where to begin. One opaque operator in a compiled or exported graph; computed in float64,
-    images in float32.
+    Gradients follow from the solution by the implicit function theorem. They flow to the images (with their
+    Gauss-Newton curvature: exact where the images are explained), the factory rig and its prior. None flows through the
+    first guess, which only starts the search. The module is one opaque operator in a compiled or
+    exported graph; it computes in float64, images in float32.
 
     Args:
         factory: the factory rig, without batch axes; its prior says how far cameras may have drifted.
         obj: N fiducials (mm) in their colours, taken as exact.
         prior_std: (C, K) standard deviation of each factory value; None = the rig's own prior.
-        options: how to compare; `options.image` says how large images and dots are.
+        options: how to compare; `options.image` gives the sizes of images and dots.
 
     Shape:
         - prediction: (*B) rigs and poses.
@@ -76,7 +76,7 @@ class RenderAndCompare(nn.Module):
         self._encoded = encode_image_options(options)
 
     def forward(self, prediction: Prediction, images: Tensor, factory: CameraRig | None = None) -> RefinedImages:
-        """Refine; another factory rig in the place of that which the module holds."""
+        """Refine the prediction; `factory` replaces the module's own factory rig."""
         batch, dtype = images.shape[:-4], prediction.rig.focal_length.dtype
         count = batch.numel()
         factory = self.factory() if factory is None else factory

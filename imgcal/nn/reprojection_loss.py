@@ -1,4 +1,4 @@
-"""`ReprojectionLoss`: how far the fiducials are from where they should be, in pixels; projected by kornia."""
+"""`ReprojectionLoss`: reprojection error of the fiducials in pixels; projected by kornia."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from imgcal.geometry import project_kornia
 from imgcal.nn.buffers import ObjectBuffers
 from imgcal.types import CalibrationObject, CameraRig, Prediction
 
-# Nearer points (mm) are projected at this depth, differences are cut at this size (pixels): what an untrained network
-# predicts behind a camera would overflow float32, whose gradient is then nan even where the loss itself is clamped.
+# Nearer points (mm) are projected at this depth, differences are clipped to this size (pixels): predictions behind a
+# camera, as of an untrained network, overflow float32 and give nan gradients even where the loss itself is clamped.
 LEAST_DEPTH, LARGEST_DIFFERENCE = 50.0, 1e6
 
 
 class ReprojectionLoss(nn.Module):
     """Root mean squared difference between pixel coordinates of fiducials.
 
-    Computed in float32 or better, whatever autocast is on: bfloat16 would round a coordinate of 1234.567 to 1232.
-    Finite with finite gradients also for cameras that have fiducials behind them.
+    Computed in float32 or better even under autocast: bfloat16 would round a coordinate of 1234.567 to 1232. Finite
+    with finite gradients also for cameras with fiducials behind them.
 
     Args:
         obj: N fiducials (mm); those with a radius are spheres, whose apparent centres are projected.
@@ -28,9 +28,9 @@ class ReprojectionLoss(nn.Module):
 
     Shape:
         - prediction: (*B) rigs of C cameras, and poses.
-        - target: the true (*B) prediction, or (*B, C, N, 2) pixels where fiducials are.
-        - seen: (*B, C, N) bool: which count; None = all.
-        - Output: pixels, () or with reduction "none" (*B); zero where nothing counts.
+        - target: the true (*B) prediction, or (*B, C, N, 2) true pixels of the fiducials.
+        - seen: (*B, C, N) bool: valid fiducials; None = all.
+        - Output: pixels, () or with reduction "none" (*B); zero without valid fiducials.
 
     Source: paper section 4.3; projection through `kornia.geometry.calibration.distort_points`.
 
@@ -53,7 +53,7 @@ class ReprojectionLoss(nn.Module):
         self.obj, self.reduction = ObjectBuffers(obj), reduction
 
     def forward(self, prediction: Prediction, target: Prediction | Tensor, seen: Tensor | None = None) -> Tensor:
-        """Compare."""
+        """Compute the loss."""
         with torch.autocast(prediction.rig.focal_length.device.type, enabled=False):
             obj = self.obj()
             uv = project_fiducials(_exact(prediction).cameras_from_object, obj)
@@ -65,7 +65,7 @@ class ReprojectionLoss(nn.Module):
         return each.mean() if self.reduction == "mean" else each.sum()
 
     def extra_repr(self) -> str:
-        """Say what is configured."""
+        """Describe the settings."""
         return f"reduction={self.reduction!r}"
 
 
@@ -74,7 +74,7 @@ def project_fiducials(cameras: CameraRig, obj: CalibrationObject) -> Tensor:
 
     Args:
         cameras: (*B) rigs whose cam_from_rig is cam_from_object.
-        obj: radius of spherical fiducials included.
+        obj: the object, including the radius of spherical fiducials.
 
     Returns:
         (*B, C, N, 2) pixels, finite for finite cameras.
@@ -87,11 +87,11 @@ def project_fiducials(cameras: CameraRig, obj: CalibrationObject) -> Tensor:
 
 
 def rms_per_axis(difference: Tensor, seen: Tensor | None = None) -> Tensor:
-    """Root mean squared coordinate of differences, for each rig.
+    """Root mean square of the coordinates of differences, for each rig.
 
     Args:
         difference: (*B, C, N, 2) pixels between two images of the fiducials.
-        seen: (*B, C, N) bool: which count, the others may be anything; None = all.
+        seen: (*B, C, N) bool: valid fiducials, the others may have any value; None = all.
 
     Returns:
         (*B) pixels.
@@ -104,16 +104,16 @@ def rms_per_axis(difference: Tensor, seen: Tensor | None = None) -> Tensor:
 
 
 def squared(difference: Tensor) -> Tensor:
-    """Square differences in pixels, as far as float32 can hold them."""
+    """Square differences in pixels, clipped so that float32 does not overflow."""
     return difference.clamp(-LARGEST_DIFFERENCE, LARGEST_DIFFERENCE).square()
 
 
 def root(mean_square: Tensor) -> Tensor:
-    """Square root whose gradient at zero is zero instead of infinite."""
+    """Square root with zero gradient at zero instead of an infinite one."""
     return mean_square.clamp_min(1e-20).sqrt()
 
 
 def _exact(prediction: Prediction) -> Prediction:
-    """Take half precision to float32."""
+    """Convert half precision to float32."""
     dtype = prediction.rig.focal_length.dtype
     return prediction.to(torch.float32) if dtype in (torch.bfloat16, torch.float16) else prediction

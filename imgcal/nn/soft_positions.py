@@ -1,4 +1,4 @@
-"""`SoftPositions`: where each fiducial is in colour-coded images."""
+"""`SoftPositions`: positions of fiducials in colour-coded images."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from imgcal.networks import find_soft_positions
 class SoftPositions(nn.Module):
     """Locate fiducials in colour-coded images: soft coordinates by colour, weighted by heatmap logits.
 
-    Only pixels that are not black are looked at. Differentiable in the logits; one opaque operator in a compiled or
+    Processes only pixels that are not black. Differentiable in the logits; one opaque operator in a compiled or
     exported graph.
 
     Args:
@@ -19,9 +19,9 @@ class SoftPositions(nn.Module):
 
     Shape:
         - images: (*B, 3, H, W) in [0, 1], coloured splats on black.
-        - logits: (*B, N, h, w) of a coarser map over the image, which weigh what has a fiducial's colour; None = none.
+        - logits: (*B, N, h, w) on a coarser grid, weights for pixels of a fiducial's colour; None = none.
         - Output: uv (*B, N, 2) pixels of the image, and confidence (*B, N) in [0, 1]: the share of a full dot's light
-          that was found in one place; zero where there is none, with finite positions.
+          that was found in one place; zero without a detection, with finite positions.
 
     Source: soft-argmax, as in `kornia.geometry.subpix.spatial_expectation2d`, on the pixels of one hue.
 
@@ -43,7 +43,7 @@ class SoftPositions(nn.Module):
         self.register_buffer("colours", colours.clone(), persistent=False)
 
     def forward(self, images: Tensor, logits: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Locate."""
+        """Locate the fiducials."""
         batch = images.shape[:-3]
         given = None if logits is None else logits.reshape(-1, *logits.shape[-3:])
         uv, confidence = find_soft_positions(
@@ -52,5 +52,5 @@ class SoftPositions(nn.Module):
         return uv.reshape(*batch, *uv.shape[1:]), confidence.reshape(*batch, *confidence.shape[1:])
 
     def extra_repr(self) -> str:
-        """Say what is configured."""
+        """Describe the settings."""
         return f"fiducials={len(self.colours)}, dot={self.dot}"

@@ -11,21 +11,21 @@ from renderers import splat
 
 
 class SplatRenderer(nn.Module):
-    """Draw fiducials as Gaussian splats: anti-aliased, sub-pixel exact, differentiable in their places and intensities.
+    """Draw fiducials as Gaussian splats: anti-aliased, sub-pixel exact, differentiable in positions and intensities.
 
-    A pixel holds the integral of its splats over its area. On CPUs "add" is a compiled operator that touches only
-    pixels that a splat reaches; see `renderers.splat`, of which this is the module.
+    A pixel is the integral of its splats over its area. On CPUs "add" is a compiled operator that only visits pixels
+    that a splat reaches. The module wraps `renderers.splat`.
 
     Args:
         colours: (N, K) in [0, 1], such as `CalibrationObject.colours`.
         image_size: height and width of the images, pixels.
         size: standard deviation of a splat, pixels.
-        compositing: "add" sums the light of splats in any order, "over" lets the nearer ones hide those behind.
+        compositing: "add" sums the light of splats in any order, "over" lets nearer ones occlude those behind.
 
     Shape:
-        - uv: (*B, N, 2) pixels of the image, or a `Projection` of them, which says what is visible and how deep it is.
-        - visible: (*B, N) bool; None = what the projection says, or all.
-        - depth: (*B, N), for "over"; None = that of the projection, or the first fiducial is the nearest.
+        - uv: (*B, N, 2) pixels of the image, or a `Projection` of them with visibility and depth.
+        - visible: (*B, N) bool; None = that of the projection, or all.
+        - depth: (*B, N), for "over"; None = that of the projection, or increasing with the fiducial's index.
         - intensity: broadcastable to (*B, N); None = 1.
         - Output: (*B, K, H, W) images on black, in the dtype of uv.
 
@@ -66,7 +66,7 @@ class SplatRenderer(nn.Module):
         depth: Tensor | None = None,
         intensity: Tensor | None = None,
     ) -> Tensor:
-        """Draw."""
+        """Draw the fiducials."""
         if isinstance(uv, Projection):
             visible = uv.visible if visible is None else visible
             depth = uv.depth if depth is None else depth
@@ -83,5 +83,5 @@ class SplatRenderer(nn.Module):
         )
 
     def extra_repr(self) -> str:
-        """Say what is configured."""
+        """Describe the settings."""
         return f"image_size={self.image_size}, size={self.size}, compositing={self.compositing!r}"

@@ -1,4 +1,4 @@
-"""Refinement after the network: MAP on its points, with outliers or without, or render-and-compare on its images."""
+"""Refinement after the network: MAP on its points, robust or not, or render-and-compare on its images."""
 
 import lazy_loader as lazy
 

@@ -1,9 +1,10 @@
-"""Points after the network: MAP refinement that outliers cannot pull away, and that mends exchanged labels.
+"""Robust MAP refinement of points after the network: outliers lose their influence and exchanged labels are corrected.
 
-First all points, by plain least squares: where the residuals fit the noise and the prior, that is the answer. The other
-rigs go through graduated non-convexity: a bounded loss (Geman and McClure) whose threshold shrinks from the error of
-the first guess to the noise, so that outliers lose their pull before they can mislead. Then points are chosen anew
-among all, those of exchanged labels under the label that fits, and least squares on the chosen ones ends it.
+Plain least squares on all points comes first. Where the residuals agree with the noise and the prior, that is the
+answer. The other rigs go through graduated non-convexity: a bounded loss (Geman and McClure) whose threshold shrinks
+from the error of the first guess to the noise, so that outliers lose their influence before they can mislead. Then the
+inliers are selected again among all points, exchanged labels are corrected, and a least-squares fit to the inliers
+follows.
 
 Source: graduated non-convexity as in Yang et al., RA-L 2020.
 """
@@ -20,26 +21,26 @@ from imgcal.refinement.points import make_observations, make_prediction, refine_
 from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 
 SQUARED = EstimationOptions(loss="squared")
-AT_FIRST = EstimationOptions(loss="squared", max_iterations=15)  # outliers can keep it busy without end
-FAR = 100.0  # pixels: points farther off are all equally wrong
+AT_FIRST = EstimationOptions(loss="squared", max_iterations=15)  # outliers can keep it from converging
+FAR = 100.0  # pixels; larger distances count as this one
 
 
 @dataclass(frozen=True)
 class RobustOptions:
-    """What counts as an outlier. All but `thresholds` in standard deviations or multiples of others."""
+    """What counts as an outlier. Values without a unit are in standard deviations or are ratios."""
 
-    thresholds: tuple[float, ...] = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0, 0.5)  # pixels, of rounds from far to near
-    last_threshold: float = 3.0  # sigma, of the last round
-    begin: float = 0.25  # of the first guess's median residual: the narrowest threshold to begin with
-    mending: float = 16.0  # of a round's threshold: points farther off may belong to another fiducial
-    gate: float = 8.0  # sigma: points farther off are left out in the end
+    thresholds: tuple[float, ...] = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0, 0.5)  # pixels, one per round, decreasing
+    last_threshold: float = 3.0  # sigma, in the last round
+    begin: float = 0.25  # smallest first threshold, as a fraction of the first guess's median residual
+    mending: float = 16.0  # times a round's threshold: points farther off may belong to another fiducial
+    gate: float = 8.0  # sigma: points farther off are excluded from the final fit
     fits: float = 5.0  # standard deviations of chi2, and of a residual, beyond which outliers are suspected
-    rounds: int = 2  # of choosing points, in the end
+    rounds: int = 2  # of inlier selection and least squares at the end
 
 
 @dataclass(frozen=True)
 class Target:
-    """What predictions are refined towards."""
+    """The measurements and the prior to which predictions are fitted."""
 
     uv: Tensor  # (B, C, N, 2) pixels
     seen: Tensor  # (B, C, N) bool
@@ -47,7 +48,7 @@ class Target:
     obj: CalibrationObject
     prior_std: Tensor  # (C, K) standard deviations of the factory values
     sigma: float  # pixels, noise of the points
-    factor: Tensor | None = None  # (B, C, N) on the sigma of each fiducial, as a network may say
+    factor: Tensor | None = None  # (B, C, N) multiplies each fiducial's sigma, for instance from a network
 
     def __getitem__(self, rows: Tensor) -> Target:
         factor = None if self.factor is None else self.factor[rows]
@@ -60,7 +61,7 @@ class Target:
         uv: Tensor | None = None,
         seen: Tensor | None = None,
     ) -> Estimate:
-        """MAP estimate from a start, of all points or of the given ones."""
+        """Compute the MAP estimate from a start, for all points or the given ones."""
         views = Views(uv=self.uv if uv is None else uv, seen=self.seen if seen is None else seen)
         sigma = self.sigma if self.factor is None else self.sigma * self.factor
         return refine_points(start, views, self.factory, self.obj, self.prior_std, sigma, options)
@@ -76,10 +77,10 @@ def refine_robustly(
     sigma: float,
     options: RobustOptions = RobustOptions(),
 ) -> Prediction:
-    """Refine predictions by the points that were seen.
+    """Refine predictions on the observed points.
 
     Args:
-        prediction: (B,) first guesses, a network's or others; its `log_sigma` weighs the points.
+        prediction: (B,) first guesses, from a network or elsewhere; its `log_sigma` weights the points.
         views: (B,) uv and seen.
         factory: the factory rig, without batch axes.
         obj: N fiducials.
@@ -88,7 +89,7 @@ def refine_robustly(
         options: what counts as an outlier.
 
     Returns:
-        (B,) refined, in float64. Each rig on its own: the others of its batch do not matter.
+        (B,) refined, in float64. Each rig is refined independently of the rest of its batch.
     """
     if views.uv is None or views.seen is None:
         raise ValueError("views hold no points")
@@ -99,19 +100,19 @@ def refine_robustly(
     suspect = (~fits(fit, sigma, options.fits)).nonzero().squeeze(-1)
     result = make_prediction(fit)
     if len(suspect):
-        result = _replace_rigs(result, suspect, _robust(guess[suspect], target[suspect], options))
+        result = _replace_rigs(result, suspect, _refine_with_outliers(guess[suspect], target[suspect], options))
     return result
 
 
 def fits(fit: Estimate, sigma: float, limit: float) -> Tensor:
-    """Tell which estimates explain all their points: (B,) bool."""
+    """Check which estimates explain all their points: (B,) bool."""
     dof = fit.dof.clamp_min(1).to(fit.chi2)
     whole = fit.chi2 <= dof + limit * (2 * dof).sqrt()
     each = fit.residual.norm(dim=-1).flatten(1).amax(-1) <= limit * sigma
     return whole & each & fit.converged
 
 
-def _robust(guess: Prediction, target: Target, options: RobustOptions) -> Prediction:
+def _refine_with_outliers(guess: Prediction, target: Target, options: RobustOptions) -> Prediction:
     """Refine rigs that have outliers."""
     near = options.last_threshold
     limits = (*(limit for pixels in options.thresholds if (limit := pixels / target.sigma) > near), near)
@@ -133,15 +134,15 @@ def _robust(guess: Prediction, target: Target, options: RobustOptions) -> Predic
 
 
 def _misfit(prediction: Prediction, target: Target) -> Tensor:
-    """Mean distance of the points from where they are expected, each at most `FAR`: (B,) pixels. A fit that ran away
-    from a bad start fits nothing, the start at least some.
+    """Mean distance of the points from their predicted positions, each clipped at `FAR`: (B,) pixels. After a fit that
+    diverged from a bad start, the start itself has the smaller distance.
     """
     distance = (_predicted_uv(prediction, target) - target.uv).norm(dim=-1).nan_to_num(nan=FAR).clamp_max(FAR)
     return (distance * target.seen).sum((1, 2)) / target.seen.sum((1, 2)).clamp_min(1)
 
 
 def _first_round(guess: Prediction, target: Target, limits: tuple[float, ...], share: float) -> Tensor:
-    """Number of the round to begin with, (B,): the narrowest threshold of pixels that is wide enough for the guess."""
+    """Index of the first round, (B,): the narrowest threshold that is still wide enough for the guess."""
     distance = (_predicted_uv(guess, target) - target.uv).norm(dim=-1) / target.sigma
     typical = torch.where(target.seen, distance, torch.nan).flatten(1).nanmedian(-1).values.nan_to_num()
     wide_enough = torch.tensor(limits).to(typical) >= share * typical[:, None]
@@ -150,20 +151,20 @@ def _first_round(guess: Prediction, target: Target, limits: tuple[float, ...], s
 
 @dataclass(frozen=True)
 class UnswappedPoints:
-    """Points, some under another label than they came with."""
+    """Points after label correction."""
 
     uv: Tensor  # (B, C, N, 2) pixels
     seen: Tensor  # (B, C, N) bool
-    fits: Tensor  # (B, C, N) bool: of those, near where they are expected
+    fits: Tensor  # (B, C, N) bool: seen, and near their predicted position
 
 
 def undo_label_swaps(prediction: Prediction, target: Target, gate: float) -> UnswappedPoints:
-    """Give points that do not fit to other fiducials of the same camera: those that have no fitting point themselves.
+    """Reassign points that do not fit to other fiducials of the same camera that have no fitting point.
 
     Args:
-        prediction: (B,) where points are expected.
-        target: the points as they came.
-        gate: sigma within which a point fits. Point and fiducial must be each other's nearest.
+        prediction: (B,) gives the predicted positions of the points.
+        target: the points with their original labels.
+        gate: sigma within which a point fits. Point and fiducial must be mutual nearest neighbours.
     """
     expected, limit = _predicted_uv(prediction, target), gate * target.sigma
     fit = target.seen & ((expected - target.uv).norm(dim=-1) <= limit)
@@ -180,7 +181,7 @@ def undo_label_swaps(prediction: Prediction, target: Target, gate: float) -> Uns
 
 
 def mutual_nearest(distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Find the nearest column of each row of (*B, N, N), and whether that column's nearest row is the same one.
+    """Find the nearest column of each row of (*B, N, N), and whether the two are mutual nearest neighbours.
 
     Returns:
         Distance, column, and bool, each (*B, N).
@@ -191,7 +192,7 @@ def mutual_nearest(distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def robust_pose(views: Views, factory: CameraRig, obj: CalibrationObject, sigma: float) -> Prediction:
-    """Place the object with the factory rig as it stands, in spite of outliers: a start without a network."""
+    """Fit the object's pose with the factory rig fixed, robustly: a start without a network."""
     if views.uv is None or views.seen is None:
         raise ValueError("views hold no points")
     uv, rig = views.uv.double(), factory.to(torch.float64)
@@ -212,5 +213,5 @@ def _predicted_uv(prediction: Prediction, target: Target) -> Tensor:
 
 
 def _replace_rigs(whole: Prediction, rows: Tensor, part: Prediction) -> Prediction:
-    """Put `part` in the place of some rigs of a batch."""
+    """Replace some rigs of a batch by `part`."""
     return Prediction.combine((whole, part), lambda pair: pair[0].index_copy(0, rows, pair[1]))

@@ -1,8 +1,8 @@
-"""Photometric normal equations of colour-coded dots: what images say about moving each dot.
+"""Photometric normal equations of colour-coded dots, for the position of each dot.
 
 A dot is an outer product (colour x profile down x profile across), so products of images of dots are products of short
-one-dimensional sums. From afar (`take_blurred_step`) no image is rendered at all; from near (`DotWindows`) windows are,
-because only there overlapping dots that saturate can be told from others.
+one-dimensional sums. Blurred steps (`take_blurred_step`) render no image at all. Near steps (`DotWindows`) render
+windows, because only rendering models overlapping dots that saturate.
 
 Axes: M images (rigs times cameras), N dots, K channels, H, W image, w side of a window.
 """
@@ -18,22 +18,22 @@ from torch import Tensor
 
 from renderers.compositing import window_starts
 
-AMPLITUDE_RIDGE = 0.1  # how strongly a dot is believed to be there before the image is looked at
+AMPLITUDE_RIDGE = 0.1  # weight of the prior that every dot is present
 WINDOW_SIGMAS = 3.5  # beyond it a dot is darker than half a grey level of 8 bit
 WINDOW_MARGIN = 0.75  # pixels that a dot may move in its window
-FARTHEST = 30.0  # half the squared distance, in standard deviations, beyond which a profile is flat
-DAMPING = 1e-3  # relative addition to the diagonal of near normal equations
+FARTHEST = 30.0  # half the squared distance, in standard deviations, beyond which the slope is zero
+DAMPING = 1e-3  # added to the diagonal of the near normal equations, relative to it
 
 
 @dataclass(frozen=True)
 class ShiftPrior:
-    """How far dots may be from where they are predicted: pixels, one standard deviation of each axis."""
+    """How far dots may be from their predicted positions: pixels, one standard deviation of each axis."""
 
-    together: float  # all dots of an image alike
-    alone: float  # each dot on its own
+    together: float  # shift common to all dots of an image
+    alone: float  # independent shift of each dot
 
     def precision(self, like: Tensor) -> Tensor:
-        """Inverse covariance of all u and all v of N dots, for colours (N, K) that give dtype and device: (2N, 2N)."""
+        """Inverse covariance of all u and all v of N dots, (2N, 2N). `like` (N, K) gives N, dtype and device."""
         count, alone, together = len(like), self.alone**2, self.together**2
         one_axis = (torch.eye(count).to(like) - together / (alone + count * together)) / alone
         return torch.block_diag(one_axis, one_axis)
@@ -46,10 +46,10 @@ class ShiftPrior:
 def take_blurred_step(
     images: Tensor, uv: Tensor, colours: Tensor, dot: float, blur: float, prior: ShiftPrior, trust: float
 ) -> tuple[Tensor, Tensor]:
-    """Take one Gauss-Newton step of all dots at once towards the images, both blurred.
+    """Take one Gauss-Newton step of all dots at once on blurred images with blurred dots.
 
-    The blur is applied to the profiles instead of the images: a product with a blurred image is a product of the image
-    with a blurred profile. Amplitudes are solved for first, so that dots that are missing pull at nothing.
+    The blur is applied to the profiles instead of the images: the product with a blurred image equals the product of
+    the image with a blurred profile. Amplitudes are solved for first, so that missing dots have no influence.
 
     Args:
         images: (M, K, H, W), square.
@@ -58,7 +58,7 @@ def take_blurred_step(
         dot: standard deviation of a dot, pixels.
         blur: standard deviation of the blur, pixels.
         prior: how far the dots may be from the prediction.
-        trust: share of a blurred dot's width to which its place in the blurred image is believed, against the prior.
+        trust: standard deviation of a measured position in the blurred image, as a fraction of the blurred dot's width.
 
     Returns:
         (M, N, 2) step in pixels, and (M, N) amplitude: about 1 where a dot is found, about 0 where it is missing.
@@ -97,23 +97,23 @@ def take_blurred_step(
 
 
 class NearFit(NamedTuple):
-    """Places of dots after some near steps, and what is known about them."""
+    """Positions of dots after some near steps, and their accuracy."""
 
     uv: Tensor  # (M, N, 2) pixels
-    variance: Tensor  # (M, N) square pixels of each axis where a channel's noise has variance 1
-    mean_square: Tensor  # (M, N) residual of the last step's start, over the pixels and channels of each window
+    variance: Tensor  # (M, N) square pixels, per axis, for unit noise variance of a channel
+    mean_square: Tensor  # (M, N) residual before the last step, over the pixels and channels of each window
 
 
 class DotWindows:
-    """Windows of images around predicted dots, cut out once and compared with rendered dots again and again."""
+    """Windows of the images around the predicted dots, cut out once and compared with rendered dots in each step."""
 
     def __init__(self, images: Tensor, uv: Tensor, colours: Tensor, dot: float) -> None:
         """Cut the windows out.
 
         Args:
             images: (M, K, H, W).
-            uv: (M, N, 2) pixels, finite; what is outside the image gets the nearest window.
-            colours: (N, K), dtype of the computation.
+            uv: (M, N, 2) pixels, finite; positions outside the image get the nearest window.
+            colours: (N, K); their dtype is used for the computation.
             dot: standard deviation of a dot, pixels.
         """
         height, width = images.shape[-2:]
@@ -128,11 +128,11 @@ class DotWindows:
         self.windows = pixels.unflatten(2, index.shape[1:]).transpose(1, 2).contiguous().to(colours)  # (M, N, K, w, w)
 
     def fit(self, uv: Tensor, present: Tensor, steps: int) -> NearFit:
-        """Take Gauss-Newton steps, the last with the Hessian of the one before: the dots hardly move any more.
+        """Take Gauss-Newton steps. The last one reuses the previous Hessian, because the dots hardly move by then.
 
         Args:
             uv: (M, N, 2) pixels to start from.
-            present: (M, N) bool: dots that are there.
+            present: (M, N) bool: dots that are in the image.
             steps: at least 1.
         """
         count = len(self.colours)
@@ -152,10 +152,10 @@ class DotWindows:
 
         Returns:
             Minus the gradient (M, 2N), the mean squared residual (M, N), and for `_hessian` the profiles across and
-            down (M, N windows, N dots, 2, w), value and slope, and where light may still grow (M, N, K, w, w).
+            down (M, N windows, N dots, 2, w), value and slope, and the unsaturated pixels (M, N, K, w, w).
         """
         colours = self.colours
-        # Relative to the window before the precision is lowered.
+        # Subtract the window's origin before lowering the precision.
         centre = (uv[:, None] - self.start[:, :, None]).to(colours)  # (M, N windows, N dots, 2)
         both = torch.stack(profile_and_slope(centre, self.dot, self.side), -2)  # (M, N, N, 2 axes, 2, w)
         across, down = (both * present.to(colours)[:, None, :, None, None, None]).unbind(3)
@@ -170,13 +170,13 @@ class DotWindows:
         return pull, residual.square().mean((2, 3, 4)), (across, down, free)
 
     def _hessian(self, across: Tensor, down: Tensor, free: Tensor) -> Tensor:
-        """Gauss-Newton Hessian (M, 2N, 2N) from the windows: row n counts the pixels of window n."""
+        """Gauss-Newton Hessian (M, 2N, 2N) from the windows: row n sums over the pixels of window n."""
         count = len(self.colours)
         along = self._own(across)[:, :, None, :, None] * across[:, :, :, None]  # (M, N, N, 2 own, 2 other, w)
         below = self._own(down)[:, :, None, :, None] * down[:, :, :, None]
         rows = free.flatten(2, 3) @ along.flatten(2, 4).mT  # (M, N, K w, 4N)
         rows = rows.unflatten(2, (-1, self.side)).unflatten(-1, (count, 4))
-        # Slope across goes with value down, and the other way round.
+        # Slope across is paired with value down, and vice versa.
         columns = below.flatten(3, 4).flip(3).permute(0, 1, 4, 2, 3)[:, :, None]  # (M, N, 1, w, N, 4)
         pairs = self.colours[:, :, None] * self.colours.mT  # (N, K, N)
         blocks = ((rows * columns).sum(3) * pairs[..., None]).sum(2)  # (M, N, N, 4): vv, vu, uv, uu
@@ -185,28 +185,28 @@ class DotWindows:
         return 0.5 * (hessian + hessian.mT)
 
     def _own(self, profiles: Tensor) -> Tensor:
-        """Of profiles of all dots in all windows, those of each window's own dot: (M, N, 2, w)."""
+        """Select each window's own dot from the profiles of all dots in all windows: (M, N, 2, w)."""
         return profiles.diagonal(dim1=1, dim2=2).movedim(-1, 1)
 
 
 def profile_and_slope(centre: Tensor, size: float, length: int) -> tuple[Tensor, Tensor]:
-    """Integrate a Gaussian of peak 1 over neighbouring pixels, and differentiate that by its centre.
+    """Integrate a Gaussian of peak 1 over neighbouring pixels, and differentiate the result by its centre.
 
     Args:
-        centre: (...) pixels from the first one's centre.
+        centre: (...) pixels, relative to the centre of the first pixel.
         size: standard deviation, pixels.
         length: number of pixels.
 
     Returns:
-        Twice (..., length).
+        Values and derivatives, each (..., length).
     """
     edges = torch.arange(length + 1, dtype=centre.dtype, device=centre.device) - 0.5 - centre[..., None]
     scaled = edges * (1 / (math.sqrt(2) * size))
     value = (math.sqrt(math.pi / 2) * size) * torch.erf(scaled).diff(dim=-1)
-    # Far away exactly zero: numbers near underflow would make everything that follows several times slower.
+    # Exactly zero far away: denormal numbers would make everything that follows several times slower.
     return value, -torch.exp(-scaled.square().clamp_max(FARTHEST)).diff(dim=-1)
 
 
 def _blocks(uu: Tensor, uv: Tensor, vu: Tensor, vv: Tensor) -> Tensor:
-    """Put blocks (M, N, N) together: (M, 2N, 2N), all u first."""
+    """Assemble blocks (M, N, N) into (M, 2N, 2N), all u first."""
     return torch.cat((torch.cat((uu, uv), 2), torch.cat((vu, vv), 2)), 1)

@@ -1,4 +1,4 @@
-"""Network, then MAP: the rig that best explains labelled points, found from a network's first guess."""
+"""MAP refinement after the network: the rig that best explains labelled points, from a network's first guess."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor
 from imgcal.estimation import Estimate, EstimationOptions, estimate
 from imgcal.types import CalibrationObject, CameraRig, Observations, Prediction, Views
 
-# From a start this near, gross outliers (swapped labels, false blobs) are best given up at once.
+# From a start this near, it is best to reject gross outliers (swapped labels, false blobs) at once.
 ROBUST = EstimationOptions(loss="cauchy")
 
 
@@ -21,10 +21,11 @@ def refine_points(
     sigma: Tensor | float,
     options: EstimationOptions = ROBUST,
 ) -> Estimate:
-    """Refine a network's prediction on the points that it has seen.
+    """Refine a network's prediction on its input points.
 
-    In float64 whatever the network's precision. Differentiable in uv, sigma (per-observation weights), the factory rig
-    and the spread by the implicit function theorem; not in the prediction, which is only where the search starts.
+    Computes in float64 whatever the network's precision. Differentiable in uv, sigma (per-observation weights), the
+    factory rig and the prior's standard deviations by the implicit function theorem. No gradient reaches the
+    prediction, which only starts the search.
 
     Args:
         prediction: (B,) first guess.
@@ -36,11 +37,11 @@ def refine_points(
         options: how to minimize.
 
     Returns:
-        The estimate, one snapshot a rig; `converged` says which to believe.
+        The estimate, one snapshot per rig; `converged` tells which ones to trust.
 
     Raises:
         ValueError: views without points.
-        InputError: shapes that do not belong together.
+        InputError: inconsistent shapes.
 
     Examples:
         >>> import imgcal
@@ -48,7 +49,7 @@ def refine_points(
         >>> factory, obj = imgcal.load_rig("T4"), imgcal.load_object("cube8")
         >>> drawn = synthesize(factory, obj, 3, torch.Generator().manual_seed(0))
         >>> views = Views(drawn.projection.uv, torch.ones(drawn.projection.uv.shape[:-1], dtype=torch.bool))
-        >>> start = Prediction(factory.expand(3), drawn.rig_from_object)  # what a network might say
+        >>> start = Prediction(factory.expand(3), drawn.rig_from_object)  # as from a network
         >>> refined = refine_points(start, views, factory, obj, RelativeDrift().std(factory), sigma=0.1)
         >>> bool(refined.converged.all()), float(refined.rms.max()) < 0.1
         (True, True)
@@ -70,11 +71,11 @@ def refine_points(
 
 
 def make_observations(uv: Tensor, seen: Tensor, sigma: Tensor | float) -> Observations:
-    """One snapshot a rig, uv (B, C, N, 2), seen and sigma (B, C, N), as observations (B, 1, C, N)."""
+    """Convert one snapshot per rig, uv (B, C, N, 2), seen and sigma (B, C, N), to observations (B, 1, C, N)."""
     sigmas = torch.as_tensor(sigma, dtype=uv.dtype, device=uv.device).expand(seen.shape)
     return Observations(uv[:, None], sigmas[:, None], seen[:, None])
 
 
 def make_prediction(estimate: Estimate) -> Prediction:
-    """Take an estimate of one snapshot a rig, (B,) and (B, 1) poses, as a prediction."""
+    """Convert an estimate of one snapshot per rig, (B,) and (B, 1) poses, to a prediction."""
     return Prediction(estimate.rig, estimate.rig_from_object[:, 0])

@@ -35,18 +35,18 @@ RIG = ("focal_length", "principal_point", "distortion", "rotation", "translation
 def refine_images_anywhere(
     prediction: Prediction, images: Tensor, factory: CameraRig, obj: CalibrationObject, prior_std: Tensor, options: str
 ) -> tuple[CameraRig, RigidTransform, Tensor]:
-    """Do the work of `refine_images` also where PyTorch traces; differentiable in the images and in the prior.
+    """Do the work of `refine_images`, traceable by PyTorch; differentiable in the images and in the prior.
 
     Args:
-        prediction: (B,) first guess, through which no gradient flows.
+        prediction: (B,) first guess; no gradient flows through it.
         images: (B, C, 3, size, size) in [0, 1].
         factory: (B,) the centre of the prior.
         obj: N fiducials in their colours, exact.
         prior_std: (B, C, K) standard deviation of each factory value.
-        options: how to compare, as `encode_image_options` returns it.
+        options: as `encode_image_options` returns them.
 
     Returns:
-        (B,) rigs, poses, and whether they have converged; float64.
+        (B,) rigs, poses, and whether each has converged; float64.
     """
     guess, pose = prediction.rig.to(torch.float64), prediction.rig_from_object.to(torch.float64)
     wide = factory.to(torch.float64)
@@ -69,7 +69,7 @@ def refine_images_anywhere(
 
 
 def encode_image_options(options: ImageRefinementOptions) -> str:
-    """Write options as `refine_images_anywhere` takes them."""
+    """Encode options as `refine_images_anywhere` takes them."""
     return json.dumps(asdict(options))
 
 
@@ -92,7 +92,9 @@ def _compute(inputs: Tensors, options: str) -> Tensors:
 
 
 def _attach(inputs: Tensors, outputs: Tensors, options: str) -> Tensors:
-    """One more step of the dots towards the images, and one of the rig towards the dots; both are zero by now."""
+    """Take one more step of the dots towards the images, and one of the rig towards the dots. Both are zero at the
+    solution and attach the gradient.
+    """
     problem, known = _problem(inputs, options), Dots(*outputs[8:])
     at_rest = problem.measure(inputs[0], known.uv, known.believed, known.colour, known.light, 1).uv
     uv = known.uv + torch.where(known.believed[..., None], at_rest - at_rest.detach(), 0.0)

@@ -25,7 +25,7 @@ MAP = len(MAP_DEPTHS) // 2
 
 
 def sentences(content: ReportContent) -> tuple[str, ...]:
-    """Say in plain words how well the working volume is known, and where it is not; nothing if nothing is known."""
+    """Describe in plain words how accurate the rig is over the working volume; nothing if that is not known."""
     predicted = content.predicted
     if predicted is None or not math.isfinite(predicted.median_px):
         return ()
@@ -51,7 +51,7 @@ def sentences(content: ReportContent) -> tuple[str, ...]:
 
 
 def advice(content: ReportContent) -> tuple[str, ...]:
-    """What would make the exceptions as good as the rest: snapshots in their view."""
+    """Advise snapshots in the view of the cameras that are less accurate than the rest."""
     predicted = content.predicted
     if predicted is None:
         return ()
@@ -65,9 +65,9 @@ def advice(content: ReportContent) -> tuple[str, ...]:
 
 
 def more_snapshots(seen: int, usual: int, ratio: float) -> int:
-    """How many more snapshots bring a camera to the others.
+    """Estimate how many more snapshots make a camera as accurate as the others.
 
-    As many as it has seen less than they; or fewer, if its variance, which falls with their number, is there before.
+    As many as it has seen fewer than they; or less, if its variance, which falls with their number, gets there earlier.
 
     Args:
         seen: snapshots that took part, in which the camera saw the object.
@@ -112,7 +112,7 @@ def camera_map(predicted: PredictedError, camera: int, image_size: Array, limits
 
 
 def volume_slice(predicted: PredictedError, limits: Array) -> tuple[Markup, str]:
-    """Draw the slice through the middle of the volume over which the error changes most, and say which it is."""
+    """Draw the slice through the middle of the volume over which the error changes most, and name it."""
     mm = predicted.mm.numpy()
     middle = mm.shape[0] // 2
     slices = [mm.take(middle, axis=normal) for normal in range(3)]
@@ -157,7 +157,7 @@ def _cells(error: Array, chosen: Array, left: float, top: float, dx: float, dy: 
 
 
 def _range(values: Array) -> float:
-    """How much values change: the ratio of large to small ones."""
+    """The ratio of large values to small ones."""
     known = values[np.isfinite(values)]
     return float(np.quantile(known, 0.95) / max(np.quantile(known, 0.05), 1e-300)) if len(known) else 0.0
 

@@ -136,7 +136,7 @@ class ReportContent:
     @cached_property
     def observations(self) -> NDArray[np.int64]:
         """Used blobs of each camera: (C,)."""
-        return np.bincount(self.detections.camera[self.used], minlength=len(self.cameras))
+        return self.detections.count_by_camera(self.used)
 
     @cached_property
     def change(self) -> Array | None:
@@ -147,14 +147,14 @@ class ReportContent:
 
     @cached_property
     def aligned_rig(self) -> CameraRig | None:
-        """The recalibrated rig, laid upon the factory's as `gauge` says."""
+        """The recalibrated rig, aligned with the factory's as `gauge` says."""
         if self.recalibrated is None or self.gauge is None:
             return None
         return self.gauge.align(self.recalibrated.to(torch.float64), self.factory.to(torch.float64))
 
     @property
     def reference(self) -> int | None:
-        """Index of the reference camera; None = the rig is laid upon what most cameras agree on."""
+        """Index of the reference camera; None = the rig is aligned with most cameras."""
         return None if self.gauge is None else self.gauge.reference
 
     @cached_property

@@ -20,7 +20,7 @@ from imgcal.fleet import refusals as reasons_of
 from imgcal.io import write_text
 from imgcal.report import svg
 from imgcal.report.svg import Axes
-from imgcal.types import PINHOLE, RigPrior
+from imgcal.types import PARAMETER_KINDS, RigPrior
 
 WORST = 50
 """Cameras that are listed."""
@@ -37,7 +37,7 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Taught:
-    """One kind of rig, and what its devices teach; or why they do not."""
+    """One kind of rig, and the prior learnt from its devices, or why there is none."""
 
     kind: KindOfRig
     learnt: LearntPrior | None
@@ -91,7 +91,7 @@ def _kind(one: Taught, before: RigPrior) -> dict[str, Any]:
     if learnt is None:
         return shown | {"spreads": [], "outliers": [], "trends": [], "charts": []}
     parameters = one.kind.drift.parameters
-    kind_of = np.repeat(list(UNITS), (3, 3, 2, 2, parameters - len(PINHOLE)))
+    kind_of = np.array([kind for kind, part in PARAMETER_KINDS.items() for _ in range(*part.indices(parameters))])
     offsets = standardized_offsets(one.kind.drift, learnt).reshape(len(one.kind.devices), -1, parameters)
     return shown | {
         "spreads": [
@@ -130,7 +130,7 @@ def _finite(values: Sequence[float | None]) -> NDArray[np.float64]:
 
 
 def _histogram(title: str, values: NDArray[np.float64], normal: bool = False) -> Markup:
-    """Draw how values are distributed; beside the unit normal where that is what they should follow."""
+    """Draw the distribution of values, beside the unit normal where they should follow it."""
     values = values[np.isfinite(values)]
     if not len(values):
         return Markup("<p>Nothing to show.</p>")

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import json
 import math
 from collections import Counter
 from dataclasses import dataclass
@@ -17,10 +14,11 @@ import numpy as np
 from markupsafe import Markup
 
 from imgcal.io import write_text
+from imgcal.live_page import content_policy, to_json
 from imgcal.pipeline import MOVED, UNDETERMINED
 from imgcal.report import accuracy, charts, overlay, scene, svg, tables
 from imgcal.report.content import ReportContent
-from imgcal.report.rig_view import Scene, rig_view_script
+from imgcal.report.rig_view import rig_view_script
 from imgcal.report.verdict import judge
 
 LARGEST_SNAPSHOT_TABLE = 400
@@ -52,7 +50,7 @@ def render(content: ReportContent) -> str:
         verdict=judge(content),
         style=Markup(_resource("report.css")),
         scripts=[Markup(script) for script in scripts],
-        policy=_policy(scripts),
+        policy=content_policy(scripts, "'unsafe-inline'", "data:"),
         snapshots=_snapshots(content),
         residuals=_residuals(content),
         coverage=_coverage(content),
@@ -81,22 +79,6 @@ def _template() -> jinja2.Template:
 
 def _resource(name: str) -> str:
     return files("imgcal.report").joinpath("templates", name).read_text(encoding="utf-8")
-
-
-def _policy(scripts: tuple[str, ...]) -> str:
-    """Forbid the page every connection, and every script but those that it carries."""
-    digests = (hashlib.sha256(text.encode()).digest() for text in scripts)
-    hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
-    return (
-        f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data:; "
-        "base-uri 'none'; form-action 'none'"
-    )
-
-
-def _values(scene: Scene) -> Markup:
-    """JSON that stands safely inside `<script>`."""
-    text = json.dumps(scene, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
-    return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
 
 
 def _snapshots(content: ReportContent) -> dict[str, object]:
@@ -141,7 +123,7 @@ def _coverage(content: ReportContent) -> dict[str, object]:
     limits = charts.coverage_limits(content)
     fitted, labelled = content.used.any(), content.labels >= 0
     rows = content.used if fitted else labelled if labelled.any() else np.ones_like(labelled)
-    counts = np.bincount(content.detections.camera[rows], minlength=len(content.cameras))
+    counts = content.detections.count_by_camera(rows)
 
     def words(camera: int) -> str:
         number = f"{svg.group_digits(int(counts[camera]))} blobs"
@@ -194,7 +176,7 @@ def _rig(content: ReportContent) -> dict[str, object]:
     drawn = scene.describe_scene(content)
     snapshots, fiducials = scene.choose_fiducials(content)
     return {
-        "scene": _values(drawn.values),
+        "scene": Markup(to_json(drawn.values)),
         "factors": drawn.factors,
         "start": drawn.start,
         "snapshots": len(snapshots),
@@ -217,7 +199,7 @@ def _overlays(content: ReportContent) -> dict[str, object]:
 
 
 def _subsampling(content: ReportContent) -> list[str]:
-    """Say what is not drawn in full. All numbers and the histogram use everything."""
+    """List what is drawn only in part. All numbers and the histogram use everything."""
     notes = []
     used = int(content.used.sum())
     if used > charts.LARGEST_SCATTER:
@@ -225,7 +207,7 @@ def _subsampling(content: ReportContent) -> list[str]:
             f"The scatter shows {svg.group_digits(charts.LARGEST_SCATTER)} of {svg.group_digits(used)} residuals."
         )
     panel = charts.panel_size(content)
-    if len(content.detections) and int(np.bincount(content.detections.camera).max()) > panel:
+    if int(content.detections.count_by_camera().max()) > panel:
         notes.append(f"The coverage shows at most {panel} observations of each camera.")
     snapshots, fiducials = scene.choose_fiducials(content)
     total = 0 if content.object_points is None else len(content.object_points)
@@ -233,7 +215,6 @@ def _subsampling(content: ReportContent) -> list[str]:
     if len(snapshots) and (len(snapshots) < known or len(fiducials) < total):
         notes.append(f"The rig shows {len(snapshots)} snapshots and {len(fiducials)} of {total} fiducials in each.")
     d = content.detections
-    in_frame = np.bincount(d.camera[d.snapshot == content.frame_snapshot], minlength=1)
-    if int(in_frame.max()) > overlay.blobs_drawn(content):
+    if int(d.count_by_camera(d.snapshot == content.frame_snapshot).max()) > overlay.blobs_drawn(content):
         notes.append(f"The overlays show at most {overlay.blobs_drawn(content)} blobs of each camera.")
     return notes

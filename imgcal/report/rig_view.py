@@ -15,15 +15,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from imgcal.live_page import up_and_forward
 from imgcal.report.svg import Array
 from imgcal.types import CameraRig
 
 Scene = dict[str, Any]
-
-UPRIGHT = 0.5
-"""Length of the mean of the cameras' up directions from which on they agree on what is up."""
-ALONG_AXIS = 0.97
-"""Cosine up to which a direction counts as that of an axis of the rig's frame."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +47,7 @@ def rig_scene(rigs: Sequence[DrawnRig], points: Array | None = None) -> Scene:
     """
     first = rigs[0].steps[0].to(torch.float64)
     length = frustum_length(first, points)
-    up = up_axis(first)
+    up, ahead = up_and_forward(first)
     drawn = [
         {
             "name": rig.name,
@@ -64,7 +60,7 @@ def rig_scene(rigs: Sequence[DrawnRig], points: Array | None = None) -> Scene:
     return {
         "names": list(first.camera_names),
         "up": [round(float(v), 6) for v in up],
-        "forward": [round(float(v), 6) for v in _forward(first, up)],
+        "forward": [round(float(v), 6) for v in ahead],
         "rigs": drawn,
         "groups": [] if points is None else _round(points),
     }
@@ -74,18 +70,6 @@ def rig_scene(rigs: Sequence[DrawnRig], points: Array | None = None) -> Scene:
 def rig_view_script() -> str:
     """The script that defines `RigView`."""
     return files("imgcal.report").joinpath("templates", "rig_view.js").read_text(encoding="utf-8")
-
-
-def up_axis(rig: CameraRig) -> Array:
-    """What is up for most cameras, in the rig's frame: (3,) of length 1; an axis of the frame where one is near.
-
-    Where the cameras do not agree, the frame's own up is taken, that of an image: -y.
-    """
-    mean = -rig.cam_from_rig.rotation[:, 1].double().numpy().mean(axis=0)
-    size = float(np.linalg.norm(mean))
-    if size < UPRIGHT:
-        return np.array([0.0, -1.0, 0.0])
-    return _snap(mean / size)
 
 
 def frustum_length(rig: CameraRig, points: Array | None = None) -> float:
@@ -117,25 +101,6 @@ def frustums(rig: CameraRig, length: float) -> Array:
     corners = [(zero, zero, zero), (left, top, one), (right, top, one), (right, bottom, one), (left, bottom, one)]
     rays = torch.stack([torch.stack(corner, -1) for corner in corners], dim=1) * depth[:, None, None]
     return (rays @ rig.cam_from_rig.rotation + rig.positions[:, None]).detach().cpu().numpy()
-
-
-def _forward(rig: CameraRig, up: Array) -> Array:
-    """Where most cameras look, level: (3,); any level direction where they look up, down, or at each other."""
-    mean = rig.cam_from_rig.rotation[:, 2].double().numpy().mean(axis=0)
-    level = mean - (mean @ up) * up
-    size = float(np.linalg.norm(level))
-    if size > UPRIGHT / 2:
-        return _snap(level / size)
-    axis = np.eye(3)[int(np.argmin(np.abs(up)))] if abs(up[2]) > ALONG_AXIS else np.array([0.0, 0.0, 1.0])
-    level = axis - (axis @ up) * up
-    return np.asarray(level / np.linalg.norm(level))
-
-
-def _snap(direction: Array) -> Array:
-    axis = int(np.argmax(np.abs(direction)))
-    if abs(direction[axis]) < ALONG_AXIS:
-        return direction
-    return np.asarray(np.eye(3)[axis] * np.sign(direction[axis]))
 
 
 def _round(points: Array) -> list[Any]:

@@ -5,20 +5,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from imgcal.geometry import LENS_MODELS
 from imgcal.report import svg
 from imgcal.report.content import ReportContent
+from imgcal.types import PARAMETER_KINDS
 
 MINUS = "\N{MINUS SIGN}"
 
 GROUPS: tuple[tuple[str, slice, tuple[str, ...], float], ...] = (
-    ("focal length (px)", slice(6, 8), ("fx", "fy"), 1.0),
-    ("principal point (px)", slice(8, 10), ("cx", "cy"), 1.0),
-    ("distortion (10⁻³)", slice(10, None), (), 1e3),
-    ("rotation (deg)", slice(0, 3), ("x", "y", "z"), 180 / math.pi),
-    ("position (mm)", slice(3, 6), ("x", "y", "z"), 1.0),
+    ("focal length (px)", PARAMETER_KINDS["focal_length"], ("fx", "fy"), 1.0),
+    ("principal point (px)", PARAMETER_KINDS["principal_point"], ("cx", "cy"), 1.0),
+    ("distortion (10⁻³)", PARAMETER_KINDS["distortion"], (), 1e3),
+    ("rotation (deg)", PARAMETER_KINDS["rotation"], ("x", "y", "z"), 180 / math.pi),
+    ("position (mm)", PARAMETER_KINDS["position"], ("x", "y", "z"), 1.0),
 )
 """Columns: heading, which parameters, their names (none = those of the camera's lens), factor to the unit shown."""
 
@@ -63,7 +62,7 @@ def camera_rows(content: ReportContent) -> list[CameraRow]:
     count = len(content.cameras)
     before = content.rms_by(content.detections.camera, content.residual_before, count)
     after = content.rms_by(content.detections.camera, content.residual_after, count)
-    blobs = np.bincount(content.detections.camera, minlength=count)
+    blobs = content.detections.count_by_camera()
     rows = []
     for i, name in enumerate(content.cameras):
         groups = tuple(_changes(content, i, *group[1:]) for group in GROUPS) if content.change is not None else ()

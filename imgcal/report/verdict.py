@@ -8,21 +8,20 @@ from typing import Literal
 
 import numpy as np
 
-from imgcal.pipeline import MOVED
+from imgcal.pipeline import DOUBTFUL, MOVED
 from imgcal.report.accuracy import advice, length, sentences
 from imgcal.report.charts import duration
 from imgcal.report.content import NOT_IDENTIFIED, ReportContent
 from imgcal.report.svg import group_digits, pixels
-from imgcal.report.unexplained_blobs import unexplained_sentences
 
+CROWDED = 1.0
+"""Blobs without a label, as a share of the used ones, from which the report mentions them."""
 GOOD_CHI2 = 1.5  # above, the residuals are larger than the stated noise
 SMALL_CHI2 = 0.5  # below, the noise was overstated
 MOST_FIGURES = 6  # at the top of the page: one row
 FEW_OBSERVATIONS = 15  # of a camera: fewer than its parameters
-
 ABOUT_OBJECT = ("object:", "estimation: the object", "estimation: fiducial")
 """Refusals that begin so found that the object is not what its file says."""
-
 IDENTITY = {
     "coded": "The fiducials came labelled with the input.",
     "unique": "Every fiducial was recognized, and only one labelling explains what the cameras saw.",
@@ -33,6 +32,49 @@ IDENTITY = {
         "choice, so the rig is valid."
     ),
 }
+_CHECK = "Check the new rig on snapshots that took no part here: imgcal score CAPTURE --rig rig.yaml --object OBJECT."
+_FIRST = "Then use rig.yaml as the factory file from now on."
+_KEEP = "Then use rig.yaml in place of the factory file; keep the factory file for the next recalibration."
+
+
+def unexplained_sentences(content: ReportContent) -> list[tuple[str, str]]:
+    """Reasons for doubt, each with a remedy."""
+    notes = [
+        (
+            f"During the capture {move}: only the snapshots since the last move are used.",
+            "Fasten what has moved. For a better known rig, capture more snapshots now.",
+        )
+        for move in content.moves
+    ]
+    notes += [
+        (f"{words[:1].upper()}{words[1:]}; these took no part.", "Export all frames of that camera again.")
+        for words in content.late
+    ]
+    notes += [
+        (
+            f"{words[:1].upper()}{words[1:]}.",
+            "Capture some more snapshots and calibrate again: a camera that was bumped will be off in all of them.",
+        )
+        for words in content.doubtful
+    ]
+    used = content.observations
+    blobs = content.detections.count_by_camera()
+    if content.unexplained is not None:
+        for camera in np.flatnonzero(content.unexplained > DOUBTFUL * np.maximum(content.unexplained + used, 1)):
+            name = content.cameras[camera]
+            notes.append((
+                f"{name}: {content.unexplained[camera]} blobs may be fiducials and are not where these should be; "
+                f"{used[camera]} are.",
+                f"Look at the overlay of {name}: reflections where the object is hidden are harmless; a pattern beside "
+                "its place means that the camera has moved, or is late.",
+            ))  # fmt: skip
+    crowded = [content.cameras[i] for i in np.flatnonzero(blobs - used > CROWDED * np.maximum(used, 10))]
+    if crowded:
+        notes.append((
+            f"More blobs without a label than with one in {', '.join(crowded[:4])}{' and more' * (len(crowded) > 4)}.",
+            "Cover or mask reflections there.",
+        ))  # fmt: skip
+    return notes
 
 
 @dataclass(frozen=True)
@@ -58,7 +100,7 @@ class Verdict:
 
 
 def judge(content: ReportContent) -> Verdict:
-    """Put the result into words."""
+    """Summarize the result in words."""
     if content.status == "refused" or content.recalibrated is None:
         return _refused_verdict(content)
     reservations = _reservations(content)
@@ -79,11 +121,6 @@ def judge(content: ReportContent) -> Verdict:
     return Verdict("good", headline, found, (), content.unknown, (*further, _CHECK, keep), _figures(content))
 
 
-_CHECK = "Check the new rig on snapshots that took no part here: imgcal score CAPTURE --rig rig.yaml --object OBJECT."
-_FIRST = "Then use rig.yaml as the factory file from now on."
-_KEEP = "Then use rig.yaml in place of the factory file; keep the factory file for the next recalibration."
-
-
 def _improvement(content: ReportContent) -> str:
     after = f"{pixels(content.rms_after)} px"
     if not math.isfinite(content.rms_before):
@@ -92,7 +129,7 @@ def _improvement(content: ReportContent) -> str:
 
 
 def _movement(content: ReportContent) -> tuple[str, ...]:
-    """Say which cameras moved most."""
+    """Name the cameras that moved most."""
     if content.change is None or content.std is None or content.from_scratch:
         return ()
     if len(content.cameras) == 1:
@@ -186,7 +223,7 @@ def _figures(content: ReportContent) -> tuple[KeyFigure, ...]:
 
 def _refused_verdict(content: ReportContent) -> Verdict:
     d = content.detections
-    blobs = np.bincount(d.camera, minlength=len(content.cameras))
+    blobs = d.count_by_camera()
     labelled = int((content.labels >= 0).sum())
     total = len(content.snapshots)
     used = sum(not s.reason for s in content.snapshots)
@@ -208,14 +245,14 @@ def _refused_verdict(content: ReportContent) -> Verdict:
 
 
 def _helpful(content: ReportContent) -> list[str]:
-    """What would help a refused run, as far as the detections show."""
+    """Advise what would help a refused run, as far as the detections show."""
     if content.moves:
         return [
             "Fasten what has moved, and capture again.",
             "Look at the frames of that camera before and after: a hand or a reflection in front of it, or a frame of "
             "another moment, can look like a motion.",
         ]
-    blobs = np.bincount(content.detections.camera, minlength=len(content.cameras))
+    blobs = content.detections.count_by_camera()
     total, labelled = len(content.detections), int((content.labels >= 0).sum())
     blind = [name for name, n in zip(content.cameras, blobs, strict=True) if n == 0]
     steps = []

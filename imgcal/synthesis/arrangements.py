@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
 
 import torch
-from pydantic import Field
 from torch import Tensor
 
 from imgcal.errors import InputError
@@ -14,7 +12,6 @@ from imgcal.geometry import RigidTransform
 from imgcal.synthesis.lens import Lens, Shape
 from imgcal.types import CameraRig, RigPrior, Volume, limits
 
-Millimetres = Annotated[float, Field(ge=-1e6, le=1e6)]
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 USED = 0.5
 """Half the width of the working volume, in parts of the cameras' distance from the point that they look at."""

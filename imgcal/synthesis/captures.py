@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.geometry import RigidTransform
+from imgcal.geometry import NEAREST_DEPTH, RigidTransform, distort_with_jacobian
 from imgcal.synthesis.difficulty import Difficulty, behind_drapes
 from imgcal.synthesis.rigs import Drift, PoseRange, Snapshots, synthesize
-from imgcal.synthesis.spheres import sphere_images
 from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections
 from renderers import ClutterModel, SensorModel, Smear, Spots, infrared_frames, sample_clutter
 
@@ -32,7 +32,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Truth:
-    """What a capture was made from."""
+    """The truth behind a capture."""
 
     rig: CameraRig  # the drifted rig
     rig_from_object: RigidTransform  # (S,)
@@ -125,7 +125,7 @@ def simulate_shots(
 
 
 def join_truths(truths: Sequence[Truth]) -> Truth:
-    """Put objects that move by themselves before one rig into one capture."""
+    """Join captures of one rig, in each of which another object moves by itself."""
     if len(truths) == 1:
         return truths[0]
     visible = None
@@ -160,13 +160,9 @@ def _joined(parts: Sequence[Spots]) -> Spots:
     if len(parts) == 1:
         return parts[0]
     smears = [part.smear for part in parts if part.smear is not None]
-    spots = Spots(
-        uv=torch.cat([part.uv for part in parts], 1),
-        shape=torch.cat([part.shape for part in parts], 1),
-        intensity=torch.cat([part.intensity for part in parts], 1),
-        visible=torch.cat([part.visible for part in parts], 1),
-        depth=torch.cat([part.depth for part in parts], 1),
-    )
+    names = ("uv", "shape", "intensity", "visible", "depth")
+    joined: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts], 1) for name in names}
+    spots = Spots(**joined)
     if not smears:
         return spots
     return replace(
@@ -233,3 +229,34 @@ def _shot(
 def _single(values: Tensor) -> Tensor:
     """Render in single precision."""
     return values.float() if values.is_floating_point() else values
+
+
+def sphere_images(rig: CameraRig, points_rig: Tensor, radius: Tensor) -> Tensor:
+    """Shapes of the images of spheres, to first order in the distortion across a marker.
+
+    Args:
+        rig: (*B) cameras.
+        points_rig: (*B, N, 3) mm, centres of the spheres.
+        radius: (N,) mm.
+
+    Returns:
+        (*B, C, N, 2, 2) pixels^2: A of the boundary (x - centre)^T A^-1 (x - centre) = 1. The centres are those of
+        `rig.project(points_rig, radius)`.
+
+    Source: rays d that touch a sphere at p satisfy (p d)^2 = (|p|^2 - r^2) |d|^2, a conic on the z = 1 plane.
+    """
+    points = rig.cam_from_rig.rotation @ points_rig.unsqueeze(-3).mT + rig.cam_from_rig.translation[..., None]
+    x, y, z = points.unbind(-2)  # (*B, C, N)
+    z = z.clamp_min(NEAREST_DEPTH)
+    squared = radius * radius
+    gap = (z * z - squared).clamp_min(NEAREST_DEPTH)
+    # In the radial direction the ellipse's squared semi-axis is r^2 (|p|^2 - r^2) / gap^2, across it is r^2 / gap.
+    scale = squared / (gap * gap)
+    aa, ab, bb = scale * (gap + x * x), scale * x * y, scale * (gap + y * y)
+    cx, cy = x * z / gap, y * z / gap
+    _, _, jxx, jxy, jyy, _ = distort_with_jacobian(cx, cy, rig.distortion, rig.lens_model)
+    fx, fy = rig.focal_length.unsqueeze(-2).unbind(-1)
+    uu = fx * fx * (jxx * jxx * aa + 2 * jxx * jxy * ab + jxy * jxy * bb)
+    uv = fx * fy * (jxx * jxy * aa + (jxx * jyy + jxy * jxy) * ab + jxy * jyy * bb)
+    vv = fy * fy * (jxy * jxy * aa + 2 * jxy * jyy * ab + jyy * jyy * bb)
+    return torch.stack((uu, uv, uv, vv), dim=-1).unflatten(-1, (2, 2))

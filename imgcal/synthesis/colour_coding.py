@@ -49,7 +49,7 @@ def render_views(
     quantise: bool = False,
     out: Tensor | None = None,
 ) -> Tensor:
-    """Draw what an image network takes: `Views.images`.
+    """Draw the images that an image network takes: `Views.images`.
 
     Differentiable in uv. Without gradients, a reused `out` saves most of the time on a CPU (see `renderers.splat`).
 

@@ -32,7 +32,7 @@ class Corruption(StrictRecord):
 
     @property
     def nothing(self) -> bool:
-        """Tell whether views stay as they are."""
+        """Tell whether views stay unchanged."""
         return not any(getattr(self, field.name) for field in fields(self))
 
     @torch.no_grad()

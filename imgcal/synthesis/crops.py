@@ -103,7 +103,7 @@ def render_crops(scenes: Scenes, generator: torch.Generator) -> CropTruth:
 
 
 def second_look(truth: CropTruth, generator: torch.Generator) -> CropTruth:
-    """Expect the fiducials where a rig that was fitted to a first look has them: near, or all beside their places."""
+    """Expect the fiducials where a rig fitted to a first look has them: near their places, or all shifted."""
     draw = Draw(generator)
     batch = truth.seen.shape[:2]
     apart = truth.expected - truth.place
@@ -156,7 +156,7 @@ def _photograph(place: Tensor, radius: Tensor, draw: Draw) -> tuple[Tensor, Tens
 def degrade_crops(
     crops: Tensor, place: Tensor, radius: Tensor, seen: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Make crops of real frames harder: blurred, moved, dark, noisy, behind drapes, among dots that are no markers.
+    """Make crops of real frames harder: blurred, moved, dark, noisy, behind drapes, among dots that are not markers.
 
     Args:
         crops: (P, S, S) light, in which the ground is about 0 and a marker about 1; NaN outside the image.

@@ -19,7 +19,8 @@ MOMENT = 1e-3  # of the exposure: how far apart two poses are whose difference i
 
 @dataclass(frozen=True)
 class Difficulty:
-    """How frames of a capture are disturbed. Intervals are drawn from uniformly, anew in every snapshot or as said.
+    """How frames of a capture are disturbed. Values are uniform in their intervals, drawn for every snapshot unless
+    stated otherwise.
 
     Examples:
         >>> Difficulty(peak_snr=(1.0, 3.0)).peak_snr

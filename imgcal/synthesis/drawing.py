@@ -27,11 +27,11 @@ class Draw:
         self.generator = generator
 
     def unit(self, *shape: int) -> Tensor:
-        """Even in [0, 1)."""
+        """Uniform in [0, 1)."""
         return torch.rand(shape, generator=self.generator, device=self.generator.device)
 
     def between(self, low: float, high: float, *shape: int) -> Tensor:
-        """Even between two numbers."""
+        """Uniform between two numbers."""
         return low + (high - low) * self.unit(*shape)
 
     def normal(self, *shape: int) -> Tensor:
@@ -43,7 +43,7 @@ class Draw:
         return torch.zeros(shape, device=self.generator.device)
 
     def often(self, share: float, largest: float, *shape: int) -> Tensor:
-        """Nothing in most draws; in a share of them anything up to the largest."""
+        """Zero in most draws; in a share of them uniform up to the largest."""
         return torch.where(self.unit(*shape) < share, self.between(0, largest, *shape), 0.0)
 
     def direction(self, *shape: int, of: int = 3) -> Tensor:

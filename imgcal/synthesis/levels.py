@@ -1,6 +1,6 @@
 """How hard colour-coded images are to read: `LEVELS` 0 to 4, what happens to dots and pixels in each.
 
-A level adds to the one before it. In every image the strength of pixel noise, blur and background is drawn anew, from
+A level adds to the one before it. In every image the strength of pixel noise, blur and background is drawn from
 zero to the number that is named, so that a network meets all that lies between.
 """
 
@@ -53,7 +53,7 @@ class Degradation(StrictRecord):
         options: ImageOptions,
         generator: torch.Generator,
     ) -> tuple[Tensor, Corrupted]:
-        """Draw what an image network is given of labelled points, everything on their device.
+        """Draw the images of labelled points that an image network gets, on the device of the points.
 
         Args:
             views: uv (B, C, N, 2) pixels of the sensor, and seen (B, C, N).

@@ -59,7 +59,7 @@ def render_patches(count: int, generator: torch.Generator) -> Patches:
 
 
 def expose_patches(patches: Patches, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-    """Turn and mirror patches, and give them grounds, contrast and noise: anew at every call.
+    """Turn and mirror patches, and give them grounds, contrast and noise, drawn at every call.
 
     Returns:
         Grey values (M, S, S) up to a factor, expected radii (M,), and offsets (M, 2).
@@ -78,7 +78,7 @@ def expose_patches(patches: Patches, generator: torch.Generator) -> tuple[Tensor
     noise = draw.between(math.log(0.004), math.log(0.3), count).exp()[:, None, None]
     shot = draw.often(0.5, 1.0, count)[:, None, None] * grey.clamp(min=0)
     grey = grey + noise * (1 + shot).sqrt() * draw.normal(*grey.shape)
-    # Who asks knows the radius from the rig, or only from the other blobs of the frame.
+    # The expected radius comes from the rig, or only from the other blobs of the frame.
     doubt = torch.where(draw.unit(count) < 0.5, 0.04, 0.15)
     return grey, patches.radius * (1 + doubt * draw.normal(count)).clamp(0.5, 1.5), offset
 

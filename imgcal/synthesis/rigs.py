@@ -197,13 +197,12 @@ def synthesize(
         >>> snapshots.projection.uv.shape, bool(snapshots.projection.visible.all())
         (torch.Size([16, 10, 8, 2]), True)
     """
-    points, radius = obj.points.to(rig.focal_length), None if obj.radius is None else obj.radius.to(rig.focal_length)
     kept: list[Snapshots] = []
-    missing, tried, failures = count, 0, torch.zeros(rig.num_cameras, device=points.device)
+    missing, tried, failures = count, 0, torch.zeros(rig.num_cameras, device=rig.focal_length.device)
     for _ in range(max_rounds):
         accepted = max(tried - int(failures.amax()), 1) / max(tried, 1)
         batch = count if not kept and not tried else min(math.ceil(1.2 * missing / accepted) + 8, 4 * count + 64)
-        trial = _sample(rig, points, radius, batch, generator, drift, pose_range)
+        trial = _sample(rig, obj, batch, generator, drift, pose_range)
         seen = trial.projection.visible.all(-1)  # (B, C)
         good = seen.all(-1)
         found = int(good.sum())
@@ -246,8 +245,7 @@ def synthesize_at_once(
         drift: how the parameters differ from the factory's; None = not at all.
         pose_range: where the rig may be.
     """
-    points, radius = obj.points.to(rig.focal_length), None if obj.radius is None else obj.radius.to(rig.focal_length)
-    trial = _sample(rig, points, radius, trials, generator, drift, pose_range)
+    trial = _sample(rig, obj, trials, generator, drift, pose_range)
     good = trial.projection.visible.all(-1).all(-1)
     first = torch.argsort((~good).byte(), stable=True)
     return _take(trial, first[torch.arange(count, device=first.device) % good.sum().clamp_min(1)])
@@ -258,8 +256,7 @@ def share_of_good_rigs(
     rig: CameraRig, obj: CalibrationObject, generator: torch.Generator, *, drift: Drift, pose_range: PoseRange
 ) -> float:
     """Estimate, from 1024, how many random rigs see every fiducial in every camera: 0 to 1."""
-    points, radius = obj.points.to(rig.focal_length), None if obj.radius is None else obj.radius.to(rig.focal_length)
-    trial = _sample(rig, points, radius, 1024, generator, drift, pose_range)
+    trial = _sample(rig, obj, 1024, generator, drift, pose_range)
     return float(trial.projection.visible.all(-1).all(-1).float().mean())
 
 
@@ -297,8 +294,7 @@ def sample_rig_from_object(
 
 def _sample(
     rig: CameraRig,
-    points: Tensor,
-    radius: Tensor | None,
+    obj: CalibrationObject,
     count: int,
     generator: torch.Generator,
     drift: Drift | None,
@@ -306,24 +302,21 @@ def _sample(
 ) -> Snapshots:
     if rig.working_distance is None:
         raise InputError(f"rig {rig.name}: found no working_distance, expected one (mm) to place the rig by")
+    points, radius = obj.points.to(rig.focal_length), None if obj.radius is None else obj.radius.to(rig.focal_length)
     poses = sample_rig_from_object(count, rig.working_distance, points.mean(0), pose_range, generator)
     drifted = rig.expand(count) if drift is None else drift.apply(rig, generator, count)
     return Snapshots(drifted, poses, drifted.project_values(poses.apply(points), radius))
 
 
 def _take(snapshots: Snapshots, rows: Tensor) -> Snapshots:
-    p = snapshots.projection
-    projection = Projection(p.uv[rows], p.depth[rows], p.visible[rows])
+    projection = Projection(*(values[rows] for values in vars(snapshots.projection).values()))
     return Snapshots(snapshots.rig[rows], snapshots.rig_from_object[rows], projection)
 
 
 def _concatenate(parts: list[Snapshots]) -> Snapshots:
     rig = CameraRig.cat([part.rig for part in parts])
-    projection = Projection(
-        torch.cat([part.projection.uv for part in parts]),
-        torch.cat([part.projection.depth for part in parts]),
-        torch.cat([part.projection.visible for part in parts]),
-    )
+    columns = zip(*(vars(part.projection).values() for part in parts), strict=True)
+    projection = Projection(*map(torch.cat, columns))
     return Snapshots(rig, RigidTransform.cat([part.rig_from_object for part in parts]), projection)
 
 

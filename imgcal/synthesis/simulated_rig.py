@@ -27,7 +27,7 @@ DARK = 6.0  # grey value of a covered camera
 
 
 class SimulatedRig:
-    """A rig with its truth, at any moment.
+    """A simulated rig and its true values at any moment.
 
     Examples:
         >>> import imgcal
@@ -67,7 +67,7 @@ class SimulatedRig:
         return replace(self._base, focal_length=self._base.focal_length * (1 + WARM * self._warmth * self._share))
 
     def bump(self, camera: int, turn_deg: float = 0.3, way_mm: float = 0.0) -> None:
-        """Turn and shift a camera, about an axis and in a direction of their own."""
+        """Turn and shift a camera, about a random axis and in a random direction."""
         step = torch.zeros(self._base.num_cameras, self._base.num_parameters, dtype=torch.float64)
         axis, way = torch.randn(2, 3, generator=self._generator, dtype=torch.float64)
         step[camera, :3] = axis / axis.norm() * math.radians(turn_deg)

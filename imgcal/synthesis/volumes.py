@@ -28,7 +28,7 @@ BODY = 0.3
 MOMENT = 1e-3
 """Seconds between the two poses whose difference is the velocity."""
 DEPTHS = (0.3, 10.0)
-"""Where a volume is looked for that no file gives: depths in parts of the largest distance between two cameras."""
+"""Where a volume is searched for if no file gives one: depths in parts of the largest distance between two cameras."""
 DRAWS = 20_000
 TURNS = 1.5
 """Radians, standard deviation of each component of the rotation vectors between which an object turns."""

@@ -13,7 +13,7 @@ from imgcal.training.state import TrainingState, random_states, restore_random_s
 
 
 def gather_state(run: Run) -> TrainingState:
-    """Gather the state; all processes must call this together, and the main one's is whole."""
+    """Gather the state; all processes must call this together, and only the main one's result is complete."""
     gathered = {
         name: run.accelerator.gather(state.to(run.accelerator.device)[None])
         for name, state in random_states(run.generator, run.dropout).items()
@@ -44,10 +44,10 @@ def gather_state(run: Run) -> TrainingState:
 
 
 def restore(run: Run, state: TrainingState) -> None:
-    """Continue from a state.
+    """Continue a run from a state.
 
     Raises:
-        InputError: it is that of another number of processes, or of another rig or object in a file of that name.
+        InputError: the state has another number of processes, or a rig or object file with other content.
     """
     values, tensors, index = state.values, state.tensors, run.accelerator.process_index
     if values["processes"] != run.accelerator.num_processes:

@@ -1,4 +1,4 @@
-"""Fresh synthetic rigs for every training step, made on the training device."""
+"""Synthetic rigs, generated for every training step on the training device."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from imgcal.synthesis import (
 )
 from imgcal.types import CalibrationObject, CameraRig, Prediction, Views
 
-SPARE = 1.25  # trials beyond those that are needed in the mean
+SPARE = 1.25  # factor on the expected number of trials
 
-# Numbers of `imgcal.synthesis.LEVELS`.
+# Indices into `imgcal.synthesis.LEVELS`.
 Levels = Annotated[list[Annotated[int, Field(ge=0, lt=len(LEVELS))]], Field(max_length=64)]
 
 
 @dataclass(frozen=True)
 class RigBatch:
-    """The input of a network, and the answer it should give."""
+    """Inputs of a network and their ground truth."""
 
     views: Views  # (B,)
     truth: Prediction  # (B,) float32
 
     def tensors(self) -> dict[str, Tensor]:
-        """All tensors by name, to be saved."""
+        """All tensors by name, for saving."""
         rig, pose = self.truth.rig, self.truth.rig_from_object
         named = {
             "uv": self.views.uv,
@@ -58,7 +58,7 @@ class RigBatch:
 
 @dataclass(frozen=True)
 class Source:
-    """Makes batches: `show(sample(count, generator), generator)`."""
+    """Make batches: `show(sample(count, generator), generator)`."""
 
     factory: CameraRig  # float32, on the training device
     obj: CalibrationObject  # float32, on the training device
@@ -66,12 +66,12 @@ class Source:
     pose_range: PoseRange
     corruption: Corruption = Corruption()
     images: ImageOptions | None = None  # None = the network takes points
-    levels: tuple[int, ...] = ()  # numbers of `LEVELS`: equal shares of a batch's images are degraded so
-    good: float | None = None  # share of rigs that see everything; None = look, which waits for the device
-    canvas: dict[int, Tensor] = field(default_factory=dict)  # images that are drawn over, by number of rigs: CPU only
+    levels: tuple[int, ...] = ()  # indices of `LEVELS` for degrading equal shares of a batch's images
+    good: float | None = None  # share of rigs that see everything; None = check each batch, which waits for the device
+    canvas: dict[int, Tensor] = field(default_factory=dict)  # reused image memory by number of rigs: CPU only
 
     def sample(self, count: int, generator: torch.Generator) -> Snapshots:
-        """Make `count` random rigs; the generator is on the training device."""
+        """Draw `count` random rigs; the generator is on the training device."""
         if self.good is not None:
             trials = math.ceil(SPARE * count / self.good) + 32
             return synthesize_at_once(
@@ -80,7 +80,7 @@ class Source:
         return synthesize(self.factory, self.obj, count, generator, drift=self.drift, pose_range=self.pose_range)
 
     def show(self, made: Snapshots, generator: torch.Generator) -> RigBatch:
-        """Make the network's input. Images are valid until the next call."""
+        """Make the network's inputs. Images are valid until the next call."""
         truth = Prediction(made.rig, made.rig_from_object)
         views, size = Views(uv=made.projection.uv, seen=made.projection.visible), self.factory.image_size
         if self.levels and self.images is not None:
@@ -95,7 +95,7 @@ class Source:
         return RigBatch(Views(images=images), truth)
 
     def _canvas(self, uv: Tensor) -> Tensor | None:
-        """Memory to draw on: drawing over it is much faster on a CPU than asking for new."""
+        """Memory for images: on a CPU, reusing it is much faster than allocating it."""
         if self.images is None or uv.device.type != "cpu":
             return None
         count, size = len(uv), self.images.size
@@ -112,12 +112,12 @@ def draw_levels(
     levels: Sequence[int],
     generator: torch.Generator,
 ) -> tuple[Tensor, Views]:
-    """Draw images of points, (B, C, N, 2), in equal shares of the batch by the numbers of `LEVELS`.
+    """Draw images of points, (B, C, N, 2), in equal shares of the batch at the given indices of `LEVELS`.
 
-    Where a batch cannot be shared out evenly, chance says whose turn it is: over many batches, shares are equal.
+    Where a batch cannot be divided evenly, the remainder is assigned at random: over many batches, shares are equal.
 
     Returns:
-        Images (B, C, 3, size, size), and the views as they are drawn.
+        Images (B, C, 3, size, size), and the views as drawn.
     """
     assert views.uv is not None and views.seen is not None
     if len(views.uv) % len(levels):
@@ -138,6 +138,6 @@ def draw_levels(
 def object_to(
     obj: CalibrationObject, device: torch.device | str, dtype: torch.dtype = torch.float32
 ) -> CalibrationObject:
-    """Move an object to a device and another floating-point type."""
+    """Move an object to a device and floating-point type."""
     radius = None if obj.radius is None else obj.radius.to(device, dtype)
     return replace(obj, points=obj.points.to(device, dtype), colours=obj.colours.to(device, dtype), radius=radius)

@@ -12,33 +12,33 @@ from imgcal.training.data import RigBatch, Source
 from imgcal.training.losses import RefinedLoss
 from imgcal.types import Prediction
 
-WORST = 200.0  # pixels: where the error of a refined rig stops to count
+WORST = 200.0  # pixels: refined rigs with larger errors do not count
 
 
 def end_to_end_loss(
     prediction: Prediction, batch: RigBatch, source: Source, prior_std: Tensor, config: RefinedLoss
 ) -> Tensor | float:
-    """Weigh every fiducial as the network says, estimate the rig, and compare it with the truth.
+    """Weight every fiducial with the network's output, estimate the rig, and compare it with the truth.
 
     Args:
         prediction: (B,) last pass, with `log_sigma`.
-        batch: what the network saw, and the truth.
+        batch: the network's inputs, and the truth.
         source: the factory rig and the object.
         prior_std: (C, K) of the drift, the prior of the estimate.
-        config: weight and noise; a weight of zero costs nothing.
+        config: weight and noise; with weight zero, nothing is computed.
 
     Returns:
         Mean log(1 + RE) of the refined rigs times the weight; its gradient reaches `log_sigma` by the implicit function
         theorem. Rigs whose estimate did not converge do not count.
 
     Raises:
-        InputError: a network without weights of the fiducials, or without points.
+        InputError: the network predicts no weights of fiducials, or takes no points.
     """
     if not config.weight:
         return 0.0
     if prediction.log_sigma is None or batch.views.uv is None:
         raise InputError(
-            "loss: refined: found a network that weighs no points, expected a point variant with "
+            "loss: refined: found a network that does not weight points, expected a point variant with "
             "`change: {trunk: {trust: true}}`"
         )
     with torch.autocast(batch.views.uv.device.type, enabled=False):

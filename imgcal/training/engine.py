@@ -1,7 +1,6 @@
 """The training loop: accelerate (one process or several, CPU or GPU), exact resume.
 
-It knows tasks only. It writes nothing and leaves torch's default generators alone: what it has to tell goes to
-`Callbacks`.
+It only knows tasks. It writes no files and leaves torch's default generators alone; it reports through `Callbacks`.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from imgcal.training.optimization import Schedule, freeze, learning, make_averag
 from imgcal.training.run import Best, Pending, Run
 from imgcal.training.state import TrainingState
 
-# Steps until a GPU is asked for the numbers of the first: asking waits for it. A CPU has them at once.
+# Delay in steps before a GPU's numbers are read, because reading waits for the GPU. On a CPU there is no delay.
 LAG = 50
 
 
@@ -39,30 +38,30 @@ def train(
     """Train the network of an experiment.
 
     Args:
-        experiment: what to train, on what, for how long.
-        callbacks: receive the progress; None = none.
-        state: go on from this one, which `Callbacks.on_checkpoint` was given.
-        should_stop: asked after every step of the main process; True = make a checkpoint and return early.
+        experiment: the network, its data and the length of the training.
+        callbacks: receive the progress; None = no callbacks.
+        state: continue from this state, as passed to `Callbacks.on_checkpoint`.
+        should_stop: called after every step of the main process; True = make a checkpoint and return early.
 
     Returns:
-        The run as it ended; `is_finished(run, run.seconds)` tells whether it came to its end.
+        The run in its final state; `is_finished(run, run.seconds)` tells whether it is complete.
 
     Raises:
         InputError: unusable experiment, or a state that does not belong to it.
         DivergedError: the loss or its gradient is not finite.
-        RefusedError: as the run ends, the error of its result in validation is not finite, or its weights are not.
+        RefusedError: at the end, the validation error of the result or its weights are not finite.
     """
     run = prepare(experiment, state)
-    told = callbacks if callbacks is not None and run.accelerator.is_main_process else Callbacks()
-    told.on_start(run)
+    listener = callbacks if callbacks is not None and run.accelerator.is_main_process else Callbacks()
+    listener.on_start(run)
     try:
-        _take_steps(run, told, should_stop)
+        _take_steps(run, listener, should_stop)
     finally:
-        told.on_end(run)
+        listener.on_end(run)
     return run
 
 
-def _take_steps(run: Run, told: Callbacks, should_stop: Callable[[], bool]) -> None:
+def _take_steps(run: Run, listener: Callbacks, should_stop: Callable[[], bool]) -> None:
     """Train until the end, or until a stop is requested."""
     due = run.experiment.training
     seconds, stop = run.seconds, False
@@ -71,23 +70,23 @@ def _take_steps(run: Run, told: Callbacks, should_stop: Callable[[], bool]) -> N
         run.schedule.set_progress(progress(run, seconds))
         train_step(run)
         seconds, stop = _agree(run, should_stop())
-        told.on_step(run, seconds)
+        listener.on_step(run, seconds)
         last = stop or is_finished(run, seconds)
         extra = run.step % due.log_every != 0
         if last or not extra:
-            logged = _log(run, told, logged, seconds, extra)
+            logged = _log(run, listener, logged, seconds, extra)
         extra = run.step % due.validate_every != 0
         if last or not extra:
-            validate(run, told, extra)
+            validate(run, listener, extra)
         last = last or is_finished(run, seconds)
         if last and not stop:
             _check_result(run)
         if last or run.step % due.save_every == 0:
-            save(run, told)
+            save(run, listener)
 
 
 def prepare(experiment: Experiment, state: TrainingState | None = None) -> Run:
-    """Build everything a run needs: untrained, or as it was when a state was made."""
+    """Build everything that a run needs, either new or from a state."""
     settings = experiment.training
     # Without a GPU, accelerate joins several processes only if `cpu` is set.
     accelerator = Accelerator(cpu=settings.device == "cpu" or not torch.accelerator.is_available())
@@ -127,7 +126,7 @@ def prepare(experiment: Experiment, state: TrainingState | None = None) -> Run:
 
 
 def stream_seeds(seed: int, process: int) -> tuple[int, int]:
-    """Seeds of a process's two streams of random numbers, which know nothing of each other: data, and its layers'.
+    """Seeds of a process's two independent streams of random numbers: for its data and for its layers.
 
     Examples:
         >>> stream_seeds(1, 2)
@@ -138,7 +137,7 @@ def stream_seeds(seed: int, process: int) -> tuple[int, int]:
 
 
 def _micro_batch_size(settings: TrainingConfig, processes: int) -> int:
-    """The part of a batch that a process feeds to its network at once."""
+    """Number of samples that a process feeds to its network at once."""
     parts = processes * settings.accumulate
     if settings.batch_size % parts:
         of = f"the {processes} processes" + ("" if settings.accumulate == 1 else f" and {settings.accumulate} parts")
@@ -147,7 +146,7 @@ def _micro_batch_size(settings: TrainingConfig, processes: int) -> int:
 
 
 def train_step(run: Run) -> None:
-    """Take one step; only what makes the batch waits for the device, and every `LAG` steps `check_finite`."""
+    """Take one step; only making the batch waits for the device, and `check_finite` every `LAG` steps."""
     if len(run.pending) >= (1 if run.accelerator.device.type == "cpu" else LAG):
         check_finite(run)
     parts = run.experiment.training.accumulate
@@ -168,7 +167,7 @@ def train_step(run: Run) -> None:
 
 
 def _backward(run: Run, parts: int) -> dict[str, Tensor]:
-    """Add the gradient of one part of a batch; returns its loss and other numbers by name, () each."""
+    """Add the gradient of one part of a batch; return its loss and other numbers by name, () each."""
     if run.experiment.training.compile == "graphs":
         torch.compiler.cudagraph_mark_step_begin()
     batch = run.task.batch(run.batch_size, run.generator)
@@ -177,21 +176,21 @@ def _backward(run: Run, parts: int) -> dict[str, Tensor]:
     loss = run.judge(answer, batch, run.step)
     run.accelerator.backward(loss.total / parts)
     numbers = {"loss": loss.total.detach(), **loss.means}
-    # Copies: with CUDA graphs, the next step writes where these lie.
+    # Copy them: with CUDA graphs, the next step overwrites this memory.
     return dict(zip(numbers, torch.stack(list(numbers.values())).unbind(), strict=True))
 
 
 def autocast(run: Run) -> torch.autocast:
-    """Autocast as the experiment says, for networks only; they keep their geometry out of it."""
+    """Autocast as configured, for networks only; they exclude their geometry from it."""
     enabled = run.experiment.training.precision == "bf16"
     return torch.autocast(run.accelerator.device.type, torch.bfloat16, enabled=enabled)
 
 
 def check_finite(run: Run) -> None:
-    """Stop if the loss or the gradient of a step since the last check was not finite.
+    """Stop if the loss or the gradient of any step since the last check was not finite.
 
     Raises:
-        DivergedError: with the batch, made again; the last checkpoint is from before.
+        DivergedError: with the batch, generated again; the last checkpoint is from before.
     """
     if not run.pending:
         return
@@ -212,7 +211,7 @@ def check_finite(run: Run) -> None:
 
 @torch.no_grad()
 def validation(run: Run, network: nn.Module) -> dict[str, float]:
-    """Judge a network as its task does, in evaluation mode."""
+    """Validate a network with its task, in evaluation mode."""
 
     def predict(batch: Any) -> Any:
         with autocast(run):
@@ -227,17 +226,17 @@ def validation(run: Run, network: nn.Module) -> dict[str, float]:
             learning(network)
 
 
-def validate(run: Run, told: Callbacks, extra: bool) -> None:
-    """Report the errors of the weights that would be the result now; see `_record`."""
+def validate(run: Run, listener: Callbacks, extra: bool) -> None:
+    """Report the errors of the current result weights; see `_record`."""
     check_finite(run)
     if run.accelerator.is_main_process and (found := validation(run, run.candidate)):
-        _record(run, told, {"step": run.step, **found}, extra)
+        _record(run, listener, {"step": run.step, **found}, extra)
     if run.experiment.training.patience is not None:
         _keep_best(run, extra)
 
 
 def _keep_best(run: Run, extra: bool) -> None:
-    """Remember the weights if they are the best so far; all processes must call this together, the main one decides.
+    """Remember the weights if they are the best so far. All processes must call this together; the main one decides.
 
     An `extra` validation only chooses the result, so that a resumed training equals an uninterrupted one.
     """
@@ -245,7 +244,7 @@ def _keep_best(run: Run, extra: bool) -> None:
     if run.accelerator.is_main_process and judged not in metrics and not extra:
         raise InputError(f"training: patience: found no {judged}; set validation_rigs to 1 or more")
     error = metrics.get(judged, math.inf)
-    error = error if math.isfinite(error) else math.inf  # any number is better
+    error = error if math.isfinite(error) else math.inf  # any finite number is better
     if run.accelerator.num_processes > 1:
         error = float(broadcast(torch.tensor(error, dtype=torch.float64, device=run.accelerator.device)))
     if extra:
@@ -264,7 +263,7 @@ def _check_result(run: Run) -> None:
     """Refuse to end with an unusable network.
 
     Raises:
-        RefusedError: the validation of what would be the result is not finite, or its weights are not.
+        RefusedError: the result's validation error or its weights are not finite.
     """
     network, metrics = run.chosen
     value = metrics.get(run.task.judged, 0.0)
@@ -279,16 +278,16 @@ def _check_result(run: Run) -> None:
         )
 
 
-def save(run: Run, told: Callbacks) -> None:
-    """Pass on the state, and the network that would be the result now; all processes must call this together."""
+def save(run: Run, listener: Callbacks) -> None:
+    """Pass on the state and the current result network; all processes must call this together."""
     check_finite(run)
     state = gather_state(run)
     if run.accelerator.is_main_process:
-        told.on_checkpoint(run, state, run.task.result(*run.chosen))
+        listener.on_checkpoint(run, state, run.task.result(*run.chosen))
 
 
 def progress(run: Run, seconds: float) -> float:
-    """How much of the run is done, 0 to 1, by steps or by time, whichever is further."""
+    """Finished share of the run, 0 to 1, by steps or by time, whichever is larger."""
     settings = run.experiment.training
     by_steps = 0.0 if settings.steps is None else run.step / settings.steps
     by_time = 0.0 if settings.minutes is None else seconds / (60 * settings.minutes)
@@ -296,14 +295,14 @@ def progress(run: Run, seconds: float) -> float:
 
 
 def is_finished(run: Run, seconds: float) -> bool:
-    """Tell whether the run has ended or stopped improving."""
+    """Check whether the run has ended or stopped improving."""
     patience = run.experiment.training.patience
     exhausted = run.best is not None and patience is not None and run.best.since >= patience
     return exhausted or progress(run, seconds) >= 1
 
 
 def _account(run: Run, rows: list[dict[str, Tensor]]) -> None:
-    """Keep the numbers of the log and the schedule: means over the parts of a batch."""
+    """Store the numbers for the log and the schedule: means over the parts of a batch."""
     row = rows[0] if len(rows) == 1 else {name: torch.stack([part[name] for part in rows]).mean() for name in rows[0]}
     total = row["loss"]
     run.window.append(row)
@@ -318,7 +317,7 @@ def _account(run: Run, rows: list[dict[str, Tensor]]) -> None:
 
 
 def _agree(run: Run, stop: bool) -> tuple[float, bool]:
-    """The main process's clock and stop request, shared with all processes."""
+    """Share the main process's clock and stop request with all processes."""
     if run.accelerator.num_processes == 1:
         return run.seconds, stop
     mine = torch.tensor([run.seconds, float(stop)], dtype=torch.float64, device=run.accelerator.device)
@@ -326,17 +325,17 @@ def _agree(run: Run, stop: bool) -> tuple[float, bool]:
     return seconds, bool(stopping)
 
 
-def _record(run: Run, told: Callbacks, row: dict[str, Any], extra: bool) -> None:
-    """Keep plain values and pass them on. An `extra` row is written because the run ends here, for now."""
+def _record(run: Run, listener: Callbacks, row: dict[str, Any], extra: bool) -> None:
+    """Store plain values and pass them on. An `extra` row is only reported because the run ends here, for now."""
     run.latest |= row
     run.told = row if run.told.get("step") != run.step else run.told | row
     if not extra:
         run.metrics |= row
-    told.on_metrics(run, row, not extra)
+    listener.on_metrics(run, row, not extra)
 
 
-def _log(run: Run, told: Callbacks, logged: tuple[int, float], seconds: float, extra: bool) -> tuple[int, float]:
-    """Report the means since the last report; returns where the next means begin."""
+def _log(run: Run, listener: Callbacks, logged: tuple[int, float], seconds: float, extra: bool) -> tuple[int, float]:
+    """Report the means since the last report; return the start of the next interval."""
     names = tuple(run.window[0])
     means = torch.stack([torch.stack([row[name] for row in run.window]).mean() for name in names])
     if not extra:
@@ -347,5 +346,5 @@ def _log(run: Run, told: Callbacks, logged: tuple[int, float], seconds: float, e
     row["lr"] = max(group["lr"] for group in run.optimizer.param_groups)
     row[f"{run.task.unit}_per_s"] = steps * run.experiment.training.batch_size / max(duration, 1e-9)
     row["seconds"] = seconds
-    _record(run, told, row, extra)
+    _record(run, listener, row, extra)
     return run.step, seconds

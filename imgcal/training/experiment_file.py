@@ -1,4 +1,4 @@
-"""Experiment files: YAML, `format: imgcal-experiment/1`; the key `task` says what is trained, and which keys it has."""
+"""Experiment files: YAML, `format: imgcal-experiment/1`; the key `task` selects the training and its keys."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from imgcal.training.rigs import RigExperiment
 
 FORMAT = "imgcal-experiment/1"
 
-# By the key `task`; a file without it is about rigs.
+# By the key `task`; its default is "rig".
 KINDS: dict[str, type[Experiment]] = {
     "rig": RigExperiment,
     "infrared": InfraredExperiment,
@@ -36,7 +36,7 @@ KINDS: dict[str, type[Experiment]] = {
     "positions": PositionsExperiment,
 }
 
-# Keys as people write them: first what it is about.
+# Order of the keys, as people write them: the subject first.
 ORDER = ("format", "name", "description", "paper", "task", "rig", "object", "poses", "drift", "network", "images")
 
 Kind = TypeVar("Kind", bound=Experiment)
@@ -52,13 +52,13 @@ def load_experiment(
     """Read an experiment.
 
     Args:
-        path: a YAML file, or the bare name of a shipped experiment when there is no such file. Files that it names are
-            looked for in the current folder, then beside it.
+        path: a YAML file, or the bare name of a shipped experiment if there is no such file. Files that it names are
+            looked up in the current folder, then in its own folder.
         changes: `key.key=value`, values in YAML; the last one wins.
-        kind: which it must be; `Experiment` = any.
+        kind: required kind; `Experiment` = any.
 
     Raises:
-        InputError: one line with the file or the change, what was found and what was expected.
+        InputError: one line with the file or the change, the value found and the expected one.
 
     Examples:
         >>> experiment = load_experiment("table1-row13", ["training.batch_size=8"])
@@ -79,7 +79,7 @@ def parse_experiment(content: Mapping[str, Any], where: str) -> Experiment:
     """Validate the plain values of an experiment; errors begin with `where`.
 
     Raises:
-        InputError: one line with the place, what was found and what was expected.
+        InputError: one line with the place, the value found and the expected one.
     """
     task = content.get("task", "rig")
     if not isinstance(task, str) or task not in KINDS:
@@ -89,7 +89,7 @@ def parse_experiment(content: Mapping[str, Any], where: str) -> Experiment:
 
 
 def change_experiment(experiment: Kind, *changes: str) -> Kind:
-    """Set values of an experiment: `training.steps=100`, `drift={rotation_deg: 0.5}`; validated when all are set."""
+    """Set values of an experiment: `training.steps=100`, `drift={rotation_deg: 0.5}`; validated after all are set."""
     if not changes:
         return experiment
     content = written_values(experiment)
@@ -99,7 +99,7 @@ def change_experiment(experiment: Kind, *changes: str) -> Kind:
 
 
 def written_values(experiment: Experiment) -> dict[str, Any]:
-    """The plain values of the blocks that were given, without defaults where a block knows what it was given."""
+    """Plain values of an experiment as given, without defaults where a block records which values were given."""
     return experiment.model_dump(exclude_unset=True)
 
 
@@ -110,19 +110,19 @@ def resolved_text(experiment: Experiment) -> str:
 
 
 def save_experiment(experiment: Experiment, path: str | Path) -> None:
-    """Write an experiment with all its values, so that it stays the same when a default changes."""
+    """Write an experiment with all its values, so that it is independent of later changes to defaults."""
     write_text(path, resolved_text(experiment))
 
 
 def _find_file(name: Any, folder: Path) -> Any:
-    """The path of a file that an experiment in `folder` names; the name as it is where no file lies there."""
+    """Path of a file that an experiment in `folder` names; the unchanged name if there is no such file."""
     if not isinstance(name, str) or Path(name).exists() or not (folder / name).is_file():
         return name
     return str(folder / name)
 
 
 def _resolve(model: StrictModel) -> dict[str, Any]:
-    """All values but those that are None because nothing was given: a None that switches something off stays."""
+    """All values except missing ones that are None by default; a None that disables a default is kept."""
     fields = type(model).model_fields
     values = {name: value for name, value in model if value is not None or fields[name].default is not None}
     return {name: _plain(value) for name, value in values.items()}

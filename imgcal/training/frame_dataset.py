@@ -1,4 +1,4 @@
-"""Crops of a user's own frames in which every marker's place is known, to train networks on: one file a split."""
+"""Crops of your own frames with known marker positions, for training networks: one file per split."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ ADAPTATION = (
     "optimizer.lr=1.0e-3",
     "optimizer.ema=0.98",
 )
-"""A short training that ends where held-out frames gain no more: some minutes of one core."""
+"""A short training that ends when held-out frames improve no further: some minutes on one core."""
 LARGEST_SHIFT = 14.0
-"""Crop pixels, each axis, by which a camera that has drifted is off: a window of the network reaches 22."""
+"""Crop pixels, each axis: largest shift of a camera that has drifted; a window of the network reaches 22."""
 NARROW = 3.0
 """Crop pixels, standard deviation of the shift of most cameras."""
 
@@ -41,24 +41,25 @@ NARROW = 3.0
 class FrameDataset:
     """Crops of frames with the projections of an object's fiducials: M crops, up to N fiducials each.
 
-    Light is measured from the ground of a crop in units of its markers: the ground is about 0, a marker about 1.
+    Brightness is relative to the background of a crop, in units of its markers: the background is about 0, a marker
+    about 1.
     """
 
     crops: Tensor  # (M, S, S) float16, NaN outside the image
-    place: Tensor  # (M, N, 2) float32, crop pixels: where the calibrated rig has the fiducials
+    place: Tensor  # (M, N, 2) float32, crop pixels: fiducials projected with the calibrated rig
     sigma: Tensor  # (M, N) float32, crop pixels: standard deviation of each axis of `place`
     radius: Tensor  # (M, N) float32, crop pixels, of the markers' images
     depth: Tensor  # (M, N) float32, distance from the camera's plane over the mean of all fiducials, minus 1
-    asked: Tensor  # (M, N) bool: a fiducial, in the crop; else only padding
+    asked: Tensor  # (M, N) bool: a fiducial in the crop; otherwise only padding
     seen: Tensor  # (M, N) bool: the frame shows the marker
-    camera: Tensor  # (M,) int64, number in the rig
-    snapshot: Tensor  # (M,) int64, number in the capture
+    camera: Tensor  # (M,) int64, index in the rig
+    snapshot: Tensor  # (M,) int64, index in the capture
 
     def __len__(self) -> int:
         return len(self.crops)
 
     def select(self, rows: Tensor) -> FrameDataset:
-        """Keep the crops of these rows."""
+        """Select crops by row."""
         return FrameDataset(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def to(self, device: torch.device) -> FrameDataset:
@@ -66,7 +67,7 @@ class FrameDataset:
         return FrameDataset(*(getattr(self, field.name).to(device) for field in fields(self)))
 
     def save(self, path: str | Path, about: Mapping[str, Any]) -> None:
-        """Write a file in one step; `about` are plain values that say where the crops are from."""
+        """Write a file in one step; `about` has plain values that describe the origin of the crops."""
         tensors = {field.name: getattr(self, field.name) for field in fields(self)}
         write_tensors(path, tensors, FORMAT, {"about": json.dumps(about)})
 
@@ -128,10 +129,10 @@ def load_patches(folder: str | Path) -> tuple[PatchDataset, PatchDataset]:
 
 
 def load_frames(path: str | Path) -> FrameDataset:
-    """Read crops that `FrameDataset.save` wrote.
+    """Load crops that `FrameDataset.save` wrote.
 
     Raises:
-        InputError: no such file, another one, or tensors that do not belong together.
+        InputError: no such file, another kind of file, or inconsistent tensors.
     """
     tensors, _ = read_tensors(path, FORMAT)
     names = [field.name for field in fields(FrameDataset)]
@@ -154,7 +155,7 @@ def load_frames(path: str | Path) -> FrameDataset:
 
 
 def load_splits(folder: str | Path) -> tuple[FrameDataset, FrameDataset]:
-    """Read a dataset of `imgcal harvest`: the training crops and the held-out crops.
+    """Load a dataset of `imgcal harvest`: the training crops and the held-out crops.
 
     Raises:
         InputError: see `load_frames`; or crops of different sizes.
@@ -169,7 +170,7 @@ def load_splits(folder: str | Path) -> tuple[FrameDataset, FrameDataset]:
 
 
 def turn(crops: FrameDataset, generator: torch.Generator) -> FrameDataset:
-    """Turn and mirror all crops alike, by a multiple of 90 degrees that is drawn: markers look the same either way."""
+    """Rotate and mirror all crops together, by a random multiple of 90 degrees: markers look the same either way."""
     quarters, mirrored = (int(n) for n in torch.randint(0, 4, (2,), generator=generator, device=generator.device))
     light, place, last = crops.crops, crops.place, crops.crops.shape[-1] - 1
     if mirrored % 2:
@@ -194,12 +195,12 @@ def thin(crops: FrameDataset, most: int, generator: torch.Generator) -> FrameDat
 
 
 def expect_elsewhere(crops: FrameDataset, generator: torch.Generator, near: bool) -> Queries:
-    """Ask for the fiducials where a rig that has drifted would expect them.
+    """Build queries for the fiducials at the positions that a drifted rig would predict.
 
     Args:
         crops: M crops.
         generator: source of randomness.
-        near: as a rig that was fitted to a first look expects them.
+        near: smaller errors, as of a rig that was fitted to a first look.
     """
     count, device = len(crops), crops.place.device
 
@@ -211,7 +212,7 @@ def expect_elsewhere(crops: FrameDataset, generator: torch.Generator, near: bool
 
     asked = crops.asked[..., None].to(crops.place)
     centre = (crops.place * asked).sum(1, keepdim=True) / asked.sum(1, keepdim=True).clamp(min=1)
-    spread = torch.where(unit(count, 1, 1) < 0.3, 0.15, 0.02)  # turned or tilted a lot, or a little
+    spread = torch.where(unit(count, 1, 1) < 0.3, 0.15, 0.02)  # rotated or tilted a lot, or a little
     strain = spread * normal(count, 2, 2) * (0.2 if near else 1.0)
     wide = unit(count, 1, 1) < 0.5
     shift = torch.where(wide, LARGEST_SHIFT * (2 * unit(count, 1, 2) - 1), NARROW * normal(count, 1, 2))
@@ -224,10 +225,10 @@ def expect_elsewhere(crops: FrameDataset, generator: torch.Generator, near: bool
 
 
 def adaptation(name: str, folder: str | Path) -> list[str]:
-    """Return the changes of an experiment that train its shipped network further on frames of one's own.
+    """Return changes to an experiment that train its shipped network further on your own frames.
 
     Args:
-        name: of the experiment.
+        name: name of the experiment.
         folder: a dataset of `imgcal harvest`.
 
     Examples:

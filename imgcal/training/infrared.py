@@ -1,4 +1,4 @@
-"""What the query network is trained for: the right cell, the offset in it, how sure it is, and whether it is seen."""
+"""Losses of the query network: the correct cell, the offset in it, its standard deviation, and visibility."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from torch.nn import functional
 from imgcal.networks import Evidence, Queries
 from imgcal.synthesis import CropTruth
 
-NEIGHBOUR = 2.5  # crop pixels, each way: cells that must know the offset
+NEIGHBOUR = 2.5  # crop pixels, each axis: cells this near learn the offset
 
 
 @dataclass(frozen=True)
 class QueryLosses:
-    """Parts of the loss, each a mean over what it concerns: ()."""
+    """Parts of the loss, each a mean over the valid entries: ()."""
 
     cell: Tensor  # cross-entropy over the cells of a window, nats
-    offset: Tensor  # crop pixels, absolute error of an axis
-    likelihood: Tensor  # negative logarithm of the offset's likelihood, of an axis, by the predicted sigma
-    presence: Tensor  # binary cross-entropy of `present`: to be seen, and in its window
+    offset: Tensor  # crop pixels, absolute error per axis
+    likelihood: Tensor  # negative log likelihood of the offset, per axis, with the predicted sigma
+    presence: Tensor  # binary cross-entropy of `present`: visible, and in its window
 
     @property
     def total(self) -> Tensor:
-        """The weighted sum that is trained."""
+        """The weighted sum to minimize."""
         return self.cell + 0.5 * self.offset + 0.3 * self.likelihood + 0.5 * self.presence
 
 
 def make_queries(truth: CropTruth) -> Queries:
-    """Ask for all fiducials of rendered crops: (P, N), P = B C; what is expected outside the crop is not asked for."""
+    """Build queries for all fiducials of rendered crops: (P, N), P = B C; the ones outside the crop are invalid."""
     inside = ((truth.expected > -0.5) & (truth.expected < truth.placement.size - 0.5)).all(-1) & truth.radius.isfinite()
     asked = inside & (truth.radius > 0)
     parts = (truth.expected, truth.radius, truth.depth, asked)
@@ -38,17 +38,17 @@ def make_queries(truth: CropTruth) -> Queries:
 
 
 def query_losses(evidence: Evidence, asked: Tensor, place: Tensor, seen: Tensor) -> QueryLosses:
-    """Compare evidence with where the markers are.
+    """Compare evidence with the true marker positions.
 
     Args:
         evidence: of (P, N) queries.
-        asked: (P, N) bool, queries that count.
+        asked: (P, N) bool, the valid queries.
         place: (P, N, 2) crop pixels, the truth.
-        seen: (P, N) bool: the marker is to be seen.
+        seen: (P, N) bool: the marker is visible.
     """
     shape = evidence.logits.shape
     step = evidence.cells[0, 0, 0, 1, 0] - evidence.cells[0, 0, 0, 0, 0]
-    along = (place - evidence.cells[:, :, 0, 0]) / step  # cells from the first one's middle
+    along = (place - evidence.cells[:, :, 0, 0]) / step  # cells from the first one's centre
     inside = ((along > -0.5) & (along < shape[-1] - 0.5)).all(-1)
     good = (asked & seen & inside).to(evidence.logits.dtype)
     column, row = along.round().clamp(0, shape[-1] - 1).long().unbind(-1)
@@ -61,7 +61,7 @@ def query_losses(evidence: Evidence, asked: Tensor, place: Tensor, seen: Tensor)
         return (torch.where(good > 0, values, 0.0)).sum() / good.sum().clamp(min=1)
 
     cell = mean(-at(evidence.logits.flatten(2).log_softmax(-1)))
-    # A neighbour of the right cell must know where it is, too: it may be the one that is taken.
+    # Neighbours of the correct cell must learn the offset, too, because one of them may be chosen.
     apart = place[:, :, None, None] - evidence.cells
     near = ((apart.abs() < NEIGHBOUR).all(-1) & (good > 0)[..., None, None]).to(apart.dtype)
     error = (evidence.offset - apart).abs()
@@ -76,7 +76,7 @@ def query_losses(evidence: Evidence, asked: Tensor, place: Tensor, seen: Tensor)
 
 
 def evidence_at_best(evidence: Evidence) -> tuple[Tensor, Tensor, Tensor]:
-    """Where each fiducial most probably is: place (P, N, 2) crop pixels, sigma (P, N), and probability (P, N)."""
+    """Most probable position of each fiducial: place (P, N, 2) crop pixels, sigma (P, N), and probability (P, N)."""
     flat = evidence.logits.flatten(2)
     probability, best = flat.softmax(-1).max(-1)
     places = (evidence.cells + evidence.offset).flatten(2, 3)

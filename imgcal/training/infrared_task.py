@@ -1,4 +1,4 @@
-"""The task of infrared crops: crops in, where each fiducial is out; any rig and any object."""
+"""The task of infrared crops: from crops to fiducial positions, for any rig and any object."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ from imgcal.training.frame_dataset import FrameDataset, expect_elsewhere, load_s
 from imgcal.training.infrared import evidence_at_best, make_queries, query_losses
 from imgcal.training.task import Loss, Task
 
-SECOND_LOOKS = 0.5  # share of the batches, as after a rig was fitted to a first look
+SECOND_LOOKS = 0.5  # share of the batches that simulate a second look, after a rig was fitted to a first one
 VALIDATION_SEED = 20_000_003
-CAMERAS = 2  # crops a rig: more rigs and objects instead of more cameras
+CAMERAS = 2  # crops per rig: more rigs and objects instead of more cameras
 FIDUCIALS = (5, 12)  # of the objects
 FIDUCIALS_AT_ONCE = 16  # that are asked for in a crop of a real frame
 NEAR = 2.0  # crop pixels within which a place is right
 
 
 class InfraredExperiment(Experiment):
-    """A network that finds fiducials in monochrome crops; it is for no rig and no object, so the file names none."""
+    """A network that finds fiducials in monochrome crops, for any rig and object, so the file names neither."""
 
     task: Literal["infrared"] = "infrared"
     network: InfraredConfig = InfraredConfig()
-    frames: Annotated[str, Field(min_length=1)] | None = None  # folder that `imgcal harvest` wrote: frames of your own
-    frames_share: Fraction = 0.5  # share of the batches that are of these, made harder; the others are rendered
+    frames: Annotated[str, Field(min_length=1)] | None = None  # folder from `imgcal harvest`: your own frames
+    frames_share: Fraction = 0.5  # share of the batches from these frames, made harder; the others are rendered
 
     def make_task(self, device: torch.device, batch_size: int, weights: torch.Generator, fresh: bool) -> InfraredTask:
         """Build the network and its source of crops; see `Experiment.make_task`."""
@@ -50,7 +50,7 @@ class InfraredExperiment(Experiment):
 
 @dataclass(frozen=True)
 class CropBatch:
-    """Crops, what is asked of them, and what is there: P = rigs times cameras, N fiducials."""
+    """Crops, queries and the truth: P = rigs times cameras, N fiducials."""
 
     crops: Tensor  # (P, S, S), normalized
     queries: Queries  # (P, N)
@@ -65,7 +65,7 @@ class CropBatch:
 
 
 class InfraredTask(Task[CropBatch, Evidence]):
-    """Random rigs that look at random objects, in crops as bad as cameras deliver them."""
+    """Random rigs and random objects, in crops with the defects of real cameras."""
 
     unit = "crops"
     judged = "validation_missed"
@@ -75,8 +75,8 @@ class InfraredTask(Task[CropBatch, Evidence]):
         "validation_missed": "validation missed {:.3f}",
     }
     network: InfraredNetwork
-    own: FrameDataset | None = None  # crops of real frames to learn from
-    held_out: FrameDataset | None = None  # crops of other moments, to validate on
+    own: FrameDataset | None = None  # crops of real frames for training
+    held_out: FrameDataset | None = None  # crops of other snapshots, for validation
 
     def __init__(
         self,
@@ -86,11 +86,10 @@ class InfraredTask(Task[CropBatch, Evidence]):
         weights: torch.Generator,
         fresh: bool,
     ) -> None:
-        """Build it; see `Experiment.make_task`.
+        """Build the task; see `Experiment.make_task`.
 
         Raises:
-            InputError: a batch, or a validation, that is no whole number of rigs, or weights to begin with that cannot
-                be used.
+            InputError: a batch or a validation that is no whole number of rigs, or initial weights that cannot be used.
         """
         counts = {"batch_size": batch_size, "validation_rigs": experiment.training.validation_rigs}
         if wrong := [name for name, count in counts.items() if count % CAMERAS]:
@@ -111,14 +110,14 @@ class InfraredTask(Task[CropBatch, Evidence]):
             self._check_size(experiment.frames)
 
     def _check_size(self, folder: str) -> None:
-        """Raise `InputError` where the crops of a dataset are not of the network's size."""
+        """Raise `InputError` if the crops of a dataset do not have the network's size."""
         assert self.own is not None
         found, expected = self.own.crops.shape[-1], self.network.config.crop
         if found != expected:
-            raise InputError(f"{folder}: found crops of {found} pixels, expected {expected} as the network takes them")
+            raise InputError(f"{folder}: found crops of {found} pixels, expected {expected} for this network")
 
     def batch(self, count: int, generator: torch.Generator) -> CropBatch:
-        """Make crops of random rigs and objects; all objects of a batch have as many fiducials."""
+        """Make crops of random rigs and objects; all objects of a batch have the same number of fiducials."""
         low, high = FIDUCIALS
         host = host_generator(generator)
         if self.own is not None and float(torch.rand((), generator=host)) < self.share:
@@ -142,7 +141,7 @@ class InfraredTask(Task[CropBatch, Evidence]):
         return CropBatch(normalize_crops(light), queries, crops.place, seen, window)
 
     def predict(self, network: nn.Module, batch: CropBatch) -> Evidence:
-        """Say where the fiducials are."""
+        """Locate the fiducials."""
         return network(batch.crops, batch.queries, batch.window)
 
     def loss(self, answer: Evidence, batch: CropBatch, step: int) -> Loss:
@@ -159,7 +158,7 @@ class InfraredTask(Task[CropBatch, Evidence]):
         return Loss(parts.total, {name: value.detach() for name, value in means.items()})
 
     def validate(self, predict: Callable[[CropBatch], Evidence]) -> dict[str, float]:
-        """Right of the visible, wrong of the claimed, and the offsets' NEES, on crops that are always the same."""
+        """Correct share of the visible, wrong share of the claimed, and the offsets' NEES, on fixed crops."""
         if not self.sizes:
             return {}
         generator = torch.Generator(self.device).manual_seed(VALIDATION_SEED)
@@ -173,7 +172,7 @@ class InfraredTask(Task[CropBatch, Evidence]):
         }
 
     def _validation(self, generator: torch.Generator) -> Iterator[CropBatch]:
-        """Make the crops to validate on: of held-out frames, harder, where there are any; else rendered ones."""
+        """Make validation crops: from held-out frames, made harder, if there are any; otherwise rendered ones."""
         for size in self.sizes:
             if self.held_out is None:
                 yield self.batch(size, generator)
@@ -182,15 +181,15 @@ class InfraredTask(Task[CropBatch, Evidence]):
                 yield self._batch_of_frames(self.held_out.select(rows), generator)
 
     def result(self, network: nn.Module, metrics: Mapping[str, Any]) -> InfraredCheckpoint:
-        """Weights and configuration."""
-        assert isinstance(network, InfraredNetwork)  # `self.network`, or the mean of what it was
+        """Return weights and configuration."""
+        assert isinstance(network, InfraredNetwork)  # `self.network`, or its running mean
         return InfraredCheckpoint(network, metrics)
 
 
 def _counts(answer: Evidence, batch: CropBatch) -> Tensor:
-    """Count fiducials that are found right, visible, claimed wrongly and claimed, and sum the NEES of the right: (5,).
+    """Count correct, visible, wrongly claimed and claimed fiducials, and sum the NEES of the correct ones: (5,).
 
-    Sums, so that those of several batches can be added.
+    These are sums, so that those of several batches can be added.
     """
     place, sigma, probability = evidence_at_best(answer)
     squared = (place - batch.place).square().sum(-1)
@@ -201,6 +200,6 @@ def _counts(answer: Evidence, batch: CropBatch) -> Tensor:
 
 
 def _shares(counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Share of right among the visible, of wrong among the claimed, and the mean NEES of the right ones: () each."""
+    """Correct share of the visible, wrong share of the claimed, and mean NEES of the correct ones: () each."""
     right, visible, wrong, claimed, nees = counts.unbind()
     return right / visible.clamp(min=1), wrong / claimed.clamp(min=1), nees / (2 * right).clamp(min=1)

@@ -1,7 +1,7 @@
-"""Training data out of a calibrated capture: the rig and the object's poses say where every marker is in every frame.
+"""Training data from a calibrated capture: the rig and the object's poses predict every marker in every frame.
 
-A snapshot's pose comes from all cameras together, so frames in which detection failed get labels, too. What a network
-then learns is the user's own markers, lamps, lenses and walls.
+A snapshot's pose comes from all cameras together, so frames in which detection failed get labels, too. A network then
+learns your own markers, lamps, lenses and walls.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from imgcal.training.frame_dataset import FrameDataset, PatchDataset
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 
 COPIES = 3
-"""Crops of each place, each with another corner and another reduction."""
+"""Crops per place, each with another corner and another scale."""
 TURN_DEG, ASIDE = 1.5, 0.01
 """Standard deviations of the poses that crops are placed by: degrees, and parts of the distance to the object."""
 BESIDE = 3.0
@@ -44,13 +44,13 @@ BRIGHTEST = 3
 SNAPSHOTS_LOOKED_AT = 20
 """Snapshots that tell how markers usually look."""
 LARGEST_SIGMA = 1.0
-"""Crop pixels: a projection that is known less well is no label."""
+"""Crop pixels: largest standard deviation of a projection that serves as a label."""
 FARTHEST = 4.0
-"""Standard deviations (and 1.5 pixels) from its projection at which a measured marker is another one's."""
+"""Standard deviations (plus 1.5 pixels) from its projection beyond which a measured marker is another one."""
 HELD_OUT = 5
-"""One stretch of so many snapshots in a row of stretches is held out."""
+"""One of so many stretches of snapshots in a row is held out."""
 LEAST_SNAPSHOTS = 5
-"""Snapshots that can be split; of fewer, cameras are held out."""
+"""Smallest number of snapshots that can be split; with fewer, cameras are held out."""
 
 
 def harvest(
@@ -66,26 +66,26 @@ def harvest(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> tuple[FrameDataset, FrameDataset]:
-    """Cut labelled crops out of the frames of a calibrated rig.
+    """Cut labelled crops from the frames of a calibrated rig.
 
     Args:
-        frames: those of a snapshot by its number: camera name -> (H, W).
+        frames: maps the index of a snapshot to its frames: camera name -> (H, W).
         detections: blobs of all snapshots, cameras as in the rig.
-        rig: the calibrated rig, held fixed.
+        rig: the calibrated rig, which stays fixed.
         obj: the object.
-        options: how sure the labels must be that poses come from.
-        detection: how blobs were found.
-        sight: who looks at frames of which blobs decide nothing; None = such snapshots give no crops.
-        size: crop pixels, each way.
-        seed: of the crops' places.
+        options: requirements on the labels that determine poses.
+        detection: options with which blobs were found.
+        sight: looks at frames whose blobs are inconclusive; None = such snapshots give no crops.
+        size: crop pixels, width and height.
+        seed: for the placement of crops.
         progress: wraps the loops over snapshots.
 
     Returns:
-        Crops to learn from, and crops that are held out: of other snapshots, never neighbours in time; of other cameras
-        where there are fewer than five snapshots.
+        Crops for training, and held-out crops: from other snapshots, never neighbours in time; from other cameras if
+        there are fewer than five snapshots.
 
     Raises:
-        RefusedError: no snapshot can be decided, no pose fits, or one of the two would be empty.
+        RefusedError: no snapshot is conclusive, no pose fits, or one of the two would be empty.
     """
     made = cut_labelled(
         frames, detections, rig, obj, options, detection=detection, sight=sight, size=size, seed=seed,
@@ -138,7 +138,7 @@ def cut_labelled(
 def fit_poses(
     labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
 ) -> tuple[Observations, RigidTransform]:
-    """Fit the object's pose in every decided snapshot, the rig held fixed: observations (S, C, N), poses (S,).
+    """Fit the object's pose in every conclusive snapshot, with a fixed rig: observations (S, C, N), poses (S,).
 
     Raises:
         RefusedError: no pose fits.
@@ -147,7 +147,7 @@ def fit_poses(
     fixed = torch.zeros(*rig.distortion.shape[:-1], rig.num_parameters, dtype=rig.distortion.dtype)
     fit = estimate(observations, rig, obj.taken_as_exact(), poses, prior_std=fixed, options=options.estimation)
     if not bool(fit.converged):
-        raise RefusedError("harvest: in some snapshot no pose of the object fits; check the rig and the object")
+        raise RefusedError("harvest: no pose of the object fits in at least one snapshot; check the rig and the object")
     return observations, fit.rig_from_object
 
 
@@ -159,19 +159,19 @@ def find_visible(
     labels: Observations,
     detection: DetectionOptions,
 ) -> tuple[Tensor, Tensor]:
-    """Find which projected fiducials a frame shows, and how well each projection is known.
+    """Find which projected fiducials a frame shows, and the accuracy of each projection.
 
     Args:
         frames: of the snapshot.
         rig: the calibrated rig.
         obj: the object.
         pose: (1,) of the object.
-        labels: (1, C, N) what was identified.
-        detection: how blobs were found.
+        labels: (1, C, N) the identified fiducials.
+        detection: options with which blobs were found.
 
     Returns:
-        Whether a marker is there (C, N), and the standard deviation (C, 1) in pixels: the RMS distance of the labels of
-        the camera from the projections; of all cameras where one has none.
+        Whether a marker is visible (C, N), and the standard deviation (C, 1) in pixels: the RMS distance of the
+        camera's labels from the projections; for a camera without labels, that of all cameras.
     """
     expected = Expectation.of(rig, obj, pose)
     uv, known = expected.uv[0], labels.seen[0]
@@ -303,7 +303,7 @@ def split(crops: Part, snapshots: int, cameras: int) -> tuple[Part, Part]:
         held_out = number % HELD_OUT == HELD_OUT - 1
         gap = max(stretch // 10, 1) if stretch > 1 else 0
         within = crops.snapshot % stretch
-        # What borders on a held-out stretch belongs to neither.
+        # Snapshots next to a held-out stretch belong to neither.
         beside = ((number % HELD_OUT == HELD_OUT - 2) & (within >= stretch - gap)) | (
             (number % HELD_OUT == 0) & (number > 0) & (within < gap)
         )
@@ -313,7 +313,7 @@ def split(crops: Part, snapshots: int, cameras: int) -> tuple[Part, Part]:
         train = ~held_out
     if not bool(train.any() and held_out.any()):
         raise RefusedError(
-            f"harvest: found {int(train.sum())} crops to learn from and {int(held_out.sum())} to hold out in "
+            f"harvest: found {int(train.sum())} training crops and {int(held_out.sum())} held-out crops in "
             f"{snapshots} snapshots of {cameras} cameras, expected some of both: capture more snapshots"
         )
     return crops.select(train), crops.select(held_out)
@@ -330,7 +330,7 @@ def _cut(
     size: int,
     generator: torch.Generator,
 ) -> FrameDataset:
-    """Cut the crops of a snapshot, placed as a pose near the true one would place them."""
+    """Cut the crops of a snapshot, placed with a pose near the true one."""
     turn = np.deg2rad(TURN_DEG) * torch.randn(1, 3, generator=generator, dtype=torch.float64)
     far = (rig.positions - pose.translation).norm(dim=-1).mean()
     aside = ASIDE * far * torch.randn(1, 3, generator=generator, dtype=torch.float64)
@@ -351,7 +351,7 @@ def _cut(
 
 
 def _normalize_light(light: Tensor, place: Tensor, shown: Tensor) -> tuple[Tensor, Tensor]:
-    """Measure light (T, S, S) from its ground, in units of the median marker; say where there are enough markers."""
+    """Normalize brightness (T, S, S) by background and median marker; also return which crops have enough markers."""
     size = light.shape[-1]
     ground = light.flatten(1).nanmedian(1).values.nan_to_num()
     where = place.round().clamp(0, size - 1).long()
@@ -365,14 +365,14 @@ def _normalize_light(light: Tensor, place: Tensor, shown: Tensor) -> tuple[Tenso
 
 
 def _join(parts: list[FrameDataset]) -> FrameDataset:
-    """Put crops after one another, with as many fiducials as the largest has."""
+    """Concatenate crops, padded to the largest number of fiducials."""
     most = max((part.place.shape[1] for part in parts), default=0)
 
-    def padded(values: Tensor) -> Tensor:
+    def pad(values: Tensor) -> Tensor:
         if values.ndim < 2 or values.dtype == torch.float16:
             return values
         rest = [0, 0] * (values.ndim - 2)
         return functional.pad(values, [*rest, 0, most - values.shape[1]])
 
     names = [field.name for field in fields(FrameDataset)]
-    return FrameDataset(*(torch.cat([padded(getattr(part, name)) for part in parts]) for name in names))
+    return FrameDataset(*(torch.cat([pad(getattr(part, name)) for part in parts]) for name in names))

@@ -1,6 +1,6 @@
 """Training losses: stateless functions of predicted and true cameras; the projection goes through kornia.
 
-Everything is computed in float32 or better, whatever autocast is on: bf16 would round a coordinate of 1234.567 to 1232.
+Everything is computed in float32 or better even under autocast: bf16 would round a coordinate of 1234.567 to 1232.
 
 Source: paper section 4.3, its supplementary section "Less Effective Strategies", and our own robust preset.
 """
@@ -21,24 +21,24 @@ from imgcal.io import StrictModel
 from imgcal.nn import project_fiducials, rms_per_axis
 from imgcal.types import CalibrationObject, CameraRig, Prediction, pack21
 
-# Parameters of smaller spread (rad, mm, pixels, pixels, 1) are fixed: float32 cannot tell their offsets from rounding.
+# Parameters of smaller prior standard deviation (rad, mm, pixels, pixels) count as fixed, because of float32 rounding.
 LEAST_SPREAD = (1e-6,) * 3 + (1e-3,) * 3 + (1e-3,) * 2 + (1e-3,) * 2
-LEAST_SPREAD_OF_LENS = 1e-7  # and each of its coefficients
+LEAST_SPREAD_OF_LENS = 1e-7  # for each lens coefficient
 
 Weight = Annotated[float, Field(allow_inf_nan=False, ge=0, le=1e9)]
 Positive = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e9)]
 
 
 class RobustLoss(StrictModel):
-    """Weights of our own preset: log(1 + RE) for the last pixels, the clamped RE for the middle, rotations for far."""
+    """Weights of our own preset: log(1 + RE) for small errors, the clamped RE for medium, rotations for large ones."""
 
     gamma: Annotated[float, Field(gt=0, le=1)] = 0.7  # weight of pass t of T: gamma^(T - 1 - t)
     log_re: Weight = 1.0  # of log(1 + RE / 1 px)
     re: Weight = 0.02  # of the RE, per pixel
-    re_limit: Positive = 200.0  # pixels: where the RE stops to count
+    re_limit: Positive = 200.0  # pixels: limit of the RE
     geodesic: Weight = 1.0  # of the cameras' rotation error, per rad
     offsets: Weight = 0.1  # of the mean squared error of the rig's parameters, in units of the drift's spread
-    offsets_limit: Positive = 10.0  # in units of the spread: where an offset stops to count
+    offsets_limit: Positive = 10.0  # in units of the spread: limit of an offset's error
 
 
 class PaperLoss(StrictModel):
@@ -51,7 +51,7 @@ class PaperLoss(StrictModel):
 
 
 class ExtraLoss(StrictModel):
-    """Weights of what the paper tried as well and found less effective; 0 = off."""
+    """Weights of losses that the paper tried and found less effective; 0 = off."""
 
     log_cosh: Weight = 0.0  # of log cosh of the differences of a camera's numbers
     distortion: Weight = 0.0  # of the absolute distortion coefficients
@@ -62,10 +62,10 @@ class ExtraLoss(StrictModel):
 
 
 class RefinedLoss(StrictModel):
-    """End-to-end training: the RE after MAP refinement, through the solution, trains the weights of the fiducials."""
+    """End-to-end training: the RE after MAP refinement is differentiated to train the weights of the fiducials."""
 
     weight: Weight = 0.0  # of log(1 + RE of the refined rig / 1 px); 0 = off
-    sigma: Positive = 0.1  # pixels, noise of a fiducial that is fully trusted
+    sigma: Positive = 0.1  # pixels, noise of a fiducial with full weight
 
 
 class LossConfig(StrictModel):
@@ -80,7 +80,7 @@ class LossConfig(StrictModel):
 
 @dataclass(frozen=True)
 class LossTerms:
-    """What is minimized, and the error that people read."""
+    """The quantity to minimize, and errors for the log."""
 
     total: Tensor  # () with its graph
     re: Tensor  # (B,) pixels, RE of the last pass, without graph
@@ -99,12 +99,12 @@ def compound(
     """Compare every pass of a network with the truth.
 
     Args:
-        predictions: one (B,) prediction a pass, coarse to fine.
+        predictions: one (B,) prediction per pass, coarse to fine.
         truth: (B,).
         obj: the object whose fiducials are projected.
-        config: which terms, how heavy.
+        config: terms and their weights.
         step: steps already taken, for the paper's two stages.
-        prior_std: (C, K) prior standard deviation of each parameter (`Drift.std`); without one they do not count.
+        prior_std: (C, K) prior standard deviation of each parameter (`Drift.std`); fixed parameters do not count.
         weights: parameters of the network, for the L1 regularizer.
     """
     with torch.autocast(truth.rig.focal_length.device.type, enabled=False):
@@ -133,12 +133,12 @@ def reprojection_rmse(difference: Tensor) -> Tensor:
 
 
 def parameter_rmse(predicted: CameraRig, truth: CameraRig, lambda_scale: float = 1000.0) -> Tensor:
-    """L_diff: RMSE over the paper's 16 + D numbers a camera.
+    """L_diff: RMSE over the paper's 16 + D numbers per camera.
 
     Args:
         predicted: (B,) cameras in the object's frame.
         truth: (B,) cameras in the object's frame.
-        lambda_scale: factor on rotation and distortion, whose numbers are small beside mm and pixels.
+        lambda_scale: factor on rotation and distortion, whose numbers are small compared with mm and pixels.
     """
     return _root(_scaled_difference(predicted, truth, lambda_scale).square().mean())
 
@@ -149,16 +149,16 @@ def geodesic(predicted: CameraRig, truth: CameraRig) -> Tensor:
 
 
 def offsets_error(predicted: CameraRig, truth: CameraRig, prior_std: Tensor, limit: float) -> Tensor:
-    """Mean squared error of the rig's parameters in units of their spread.
+    """Mean squared error of the rig's parameters in units of their prior standard deviations.
 
     Args:
         predicted: (*B) rigs.
         truth: (B,) rigs.
-        prior_std: (C, K); parameters of a spread below `least_spread` do not count.
-        limit: in units of the spread: where an error stops to count.
+        prior_std: (C, K); parameters below `least_spread` do not count.
+        limit: limit of an error, in these units.
 
     Returns:
-        (*B); zero when no parameter has a spread.
+        (*B); zero if all parameters are fixed.
     """
     free = prior_std > least_spread(prior_std)
     scale = torch.where(free, prior_std, torch.ones_like(prior_std)).reciprocal() * free
@@ -167,12 +167,12 @@ def offsets_error(predicted: CameraRig, truth: CameraRig, prior_std: Tensor, lim
 
 
 def least_spread(like: Tensor) -> Tensor:
-    """Spread (K,) that a parameter must have to count, of those (C, K) of a rig."""
+    """Smallest prior standard deviation (K,) of a free parameter, for the (C, K) of a rig."""
     return like.new_tensor((*LEAST_SPREAD, *(LEAST_SPREAD_OF_LENS,) * (like.shape[-1] - len(LEAST_SPREAD))))
 
 
 def log_cosh(predicted: CameraRig, truth: CameraRig, lambda_scale: float = 1000.0) -> Tensor:
-    """Mean of log cosh of the differences of these numbers: a smooth absolute value."""
+    """Mean log cosh of the differences of these numbers: a smooth absolute value."""
     size = _scaled_difference(predicted, truth, lambda_scale).abs()
     return (size + torch.nn.functional.softplus(-2 * size) - math.log(2)).mean()
 
@@ -228,7 +228,7 @@ def _paper_terms(
 
 
 def _extra_terms(cameras: CameraRig, true_cameras: CameraRig, config: LossConfig) -> Tensor:
-    """(T,) losses of the regularizers that are switched on."""
+    """(T,) losses of the enabled regularizers."""
     extra = config.extra
     terms = cameras.focal_length.new_zeros(len(cameras.focal_length))
     if extra.log_cosh:
@@ -247,7 +247,7 @@ def _extra_terms(cameras: CameraRig, true_cameras: CameraRig, config: LossConfig
 
 
 def _stack_passes(predictions: Sequence[Prediction]) -> Prediction:
-    """Put passes on an axis of their own, in float32 or better: (T, B)."""
+    """Stack passes on an axis of their own, in float32 or better: (T, B)."""
     return Prediction.combine(predictions, _stack)
 
 
@@ -257,7 +257,7 @@ def _stack(tensors: list[Tensor]) -> Tensor:
 
 
 def _scaled_difference(predicted: CameraRig, truth: CameraRig, lambda_scale: float) -> Tensor:
-    """Differences of the 16 + D numbers a camera, (*B, C, 16 + D), rotation and distortion times `lambda_scale`."""
+    """Differences of the 16 + D numbers per camera, (*B, C, 16 + D), rotation and distortion times `lambda_scale`."""
     difference = pack21(predicted) - pack21(truth)
     scale = difference.new_ones(difference.shape[-1])
     scale[:9] = scale[16:] = lambda_scale
@@ -265,5 +265,5 @@ def _scaled_difference(predicted: CameraRig, truth: CameraRig, lambda_scale: flo
 
 
 def _root(mean_square: Tensor) -> Tensor:
-    """Square root whose gradient at zero is zero instead of infinite."""
+    """Square root with zero gradient at zero instead of an infinite one."""
     return mean_square.clamp_min(1e-20).sqrt()

@@ -1,4 +1,4 @@
-"""The task of measuring: patches in, the centres of their markers out."""
+"""The task of measuring: from patches to the centres of their markers."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class MeasurerExperiment(Experiment):
 
 @dataclass(frozen=True)
 class PatchBatch:
-    """Patches and what is in them: M."""
+    """Patches and their ground truth: M."""
 
     patches: Tensor  # (M, 24, 24), normalized
     radius: Tensor  # (M,) patch pixels, expected
@@ -55,7 +55,7 @@ class PatchBatch:
 
     @property
     def seen(self) -> Tensor:
-        """Whether there is a marker: (M,) bool."""
+        """Whether the patch has a marker: (M,) bool."""
         return self.kind != BlobKind.FALSE
 
     def tensors(self) -> dict[str, Tensor]:
@@ -64,7 +64,7 @@ class PatchBatch:
 
 
 class MeasurerTask(Task[PatchBatch, Measured]):
-    """Random markers: whole, half hidden, smeared, merged, half lit, in any noise."""
+    """Random markers: whole, half hidden, motion-blurred, merged, half lit, with any noise."""
 
     unit = "patches"
     judged = "validation_error_px"
@@ -80,7 +80,7 @@ class MeasurerTask(Task[PatchBatch, Measured]):
         weights: torch.Generator,
         fresh: bool,
     ) -> None:
-        """Build it; see `Experiment.make_task`."""
+        """Build the task; see `Experiment.make_task`."""
         with drawing_from(weights):
             network = Measurer(experiment.network)
         starts = experiment.training.starts
@@ -107,15 +107,15 @@ class MeasurerTask(Task[PatchBatch, Measured]):
         return _expose(pool.select(rows), generator)
 
     def predict(self, network: nn.Module, batch: PatchBatch) -> Measured:
-        """Measure."""
+        """Measure the markers."""
         return network(batch.patches, batch.radius)
 
     def loss(self, answer: Measured, batch: PatchBatch, step: int) -> Loss:
-        """Error of the centres, their likelihood under the predicted sigma, and what the blobs show."""
+        """Error of the centres, their likelihood under the predicted sigma, and classification of the blobs."""
         seen = batch.seen.to(answer.offset.dtype)
         count = seen.sum().clamp(min=1)
         error = answer.offset - batch.offset
-        # A square near zero, where most of the information is, and no pull of hopeless patches.
+        # Quadratic near zero, where most of the information is; linear beyond, to limit hopeless patches.
         off = (
             functional.smooth_l1_loss(error, torch.zeros_like(error), beta=0.2, reduction="none").mean(-1) * seen
         ).sum()
@@ -127,7 +127,7 @@ class MeasurerTask(Task[PatchBatch, Measured]):
         return Loss(total, {"error_px": rms.detach(), "verdict": verdict.detach()})
 
     def validate(self, predict: Callable[[PatchBatch], Measured]) -> dict[str, float]:
-        """Mean absolute error of an axis and NEES of markers that stand alone, and wrong verdicts; always the same."""
+        """Mean absolute error per axis and NEES of single markers, and wrong classifications, on fixed patches."""
         if not self.sizes:
             return {}
         generator = torch.Generator(self.device).manual_seed(VALIDATION_SEED)
@@ -146,14 +146,14 @@ class MeasurerTask(Task[PatchBatch, Measured]):
         }
 
     def result(self, network: nn.Module, metrics: Mapping[str, Any]) -> MeasurerCheckpoint:
-        """Weights and configuration."""
-        assert isinstance(network, Measurer)  # `self.network`, or the mean of what it was
+        """Return weights and configuration."""
+        assert isinstance(network, Measurer)  # `self.network`, or its running mean
         return MeasurerCheckpoint(network, metrics)
 
 
 @lru_cache(maxsize=4)
 def _pool(count: int, seed: int, device: torch.device) -> Patches:
-    """Render patches, always the same: once for all trainings of a process."""
+    """Render a fixed set of patches, once for all trainings of a process."""
     with torch.no_grad():
         return render_patches(count, torch.Generator(device).manual_seed(seed))
 

@@ -19,10 +19,10 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 def make_optimizer(network: nn.Module, config: OptimizerConfig) -> torch.optim.Optimizer:
-    """Make Adam or AdamW; every group of the network's parameters may have its own learning rate.
+    """Create Adam or AdamW; every group of the network's parameters may have its own learning rate.
 
     Args:
-        network: may have `parameter_groups()`, a mapping of names to parameters; without, all are the group `network`.
+        network: may have `parameter_groups()`, a mapping of names to parameters; otherwise all are the group `network`.
         config: learning rates by group, weight decay of matrices.
 
     Raises:
@@ -45,7 +45,7 @@ def make_optimizer(network: nn.Module, config: OptimizerConfig) -> torch.optim.O
 
 
 def group_parameters(network: nn.Module) -> dict[str, list[nn.Parameter]]:
-    """Group the trainable parameters of a network; what its `parameter_groups()` leaves out is the group `rest`."""
+    """Group the trainable parameters of a network; those that `parameter_groups()` omits are the group `rest`."""
     given: Callable[[], Mapping[str, Iterable[nn.Parameter]]] | None = getattr(network, "parameter_groups", None)
     groups = {"network": network.parameters()} if given is None else given()
     named = {name: [p for p in parameters if p.requires_grad] for name, parameters in groups.items()}
@@ -55,7 +55,7 @@ def group_parameters(network: nn.Module) -> dict[str, list[nn.Parameter]]:
 
 
 def freeze(network: nn.Module, names: Iterable[str]) -> None:
-    """Let groups of a network keep their weights.
+    """Freeze the weights of some groups of a network.
 
     Raises:
         InputError: an unknown group, or nothing is left to train.
@@ -70,7 +70,7 @@ def freeze(network: nn.Module, names: Iterable[str]) -> None:
 
 
 def learning(network: nn.Module) -> nn.Module:
-    """Put a network into training mode, but frozen layers of batch normalization: their running means are weights."""
+    """Put a network into training mode, except frozen batch normalization: its running means count as weights."""
     network.train()
     for module in network.modules():
         own = list(module.parameters(recurse=False))
@@ -80,7 +80,7 @@ def learning(network: nn.Module) -> nn.Module:
 
 
 def layer_scales(network: nn.Module, decay: float | None) -> dict[nn.Parameter, float]:
-    """Factor of the rate of each parameter of the encoders within a network, timm's or ours: decay^(layers after it).
+    """Learning-rate factor of each parameter of a network's encoders, timm's or ours: decay^(layers after it).
 
     Raises:
         InputError: there is no such encoder.
@@ -97,14 +97,14 @@ def layer_scales(network: nn.Module, decay: float | None) -> dict[nn.Parameter, 
 
 
 def _layers(encoder: Any) -> list[list[nn.Parameter]]:
-    """Parameters of a timm model, layer by layer; nothing for any other module."""
+    """Parameters of a timm model, layer by layer; empty for any other module."""
     if hasattr(encoder, "group_matcher"):
         from timm.models._manipulate import group_with_matcher
 
         named = dict(encoder.named_parameters())
         numbers = group_with_matcher(iter(named.items()), encoder.group_matcher(coarse=False), reverse=True)
         return [[named[name] for name in numbers if numbers[name] == layer] for layer in sorted({*numbers.values()})]
-    if hasattr(encoder, "feature_info") and isinstance(encoder, nn.ModuleDict):  # a model that gives its stages' maps
+    if hasattr(encoder, "feature_info") and isinstance(encoder, nn.ModuleDict):  # a model that returns its stages' maps
         return [parameters for stage in encoder.children() if (parameters := list(stage.parameters()))]
     return []
 
@@ -117,7 +117,7 @@ def _check_names(names: Iterable[str], groups: Iterable[str], key: str) -> None:
 
 
 class Schedule:
-    """Sets the learning rates of an optimizer, by the progress of the run or by a plateau of the loss."""
+    """Set the learning rates of an optimizer by the progress of the run or by a plateau of the loss."""
 
     def __init__(self, optimizer: torch.optim.Optimizer, config: ScheduleConfig) -> None:
         self.optimizer = optimizer
@@ -129,23 +129,23 @@ class Schedule:
         )
 
     def set_progress(self, progress: float) -> None:
-        """Set the learning rates of a step that begins at a progress of 0 to 1."""
+        """Set the learning rates of a step at a progress from 0 to 1."""
         if self.config.kind == "cosine":
             factor = cosine(progress, self.config)
             for group in self.optimizer.param_groups:
                 group["lr"] = group["initial_lr"] * factor
 
     def judge(self, loss: float) -> None:
-        """Take in the mean loss of the last `every` steps; on a plateau, learning rates fall."""
+        """Process the mean loss of the last `every` steps; on a plateau, learning rates decrease."""
         if self.plateau is not None:
             self.plateau.step(loss)
 
     def state(self) -> dict[str, Any]:
-        """Plain values that `restore` needs."""
+        """Return plain values for `restore`."""
         return {} if self.plateau is None else self.plateau.state_dict()
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue another schedule; learning rates are part of the optimizer's state."""
+        """Continue from another schedule's state; learning rates are part of the optimizer's state."""
         if self.plateau is not None:
             self.plateau.load_state_dict(state)
 
@@ -159,7 +159,7 @@ def cosine(progress: float, config: ScheduleConfig) -> float:
 
 
 def make_average(network: Module) -> Module:
-    """Copy a network whose weights are to become the running mean of the other's."""
+    """Copy a network for the running mean of its weights."""
     average = copy.deepcopy(network)
     average.requires_grad_(False)
     return average
@@ -167,10 +167,10 @@ def make_average(network: Module) -> Module:
 
 @torch.no_grad()
 def update_average(average: nn.Module, network: nn.Module, step: int, decay: float) -> None:
-    """Update the running mean with the weights of a step. It forgets the first, bad ones faster.
+    """Update the running mean with the weights of a step. Early weights are forgotten faster.
 
-    The decay is min(decay, (1 + step) / (10 + step)); the step is a plain number, so that no device is waited for
-    (torch.optim.swa_utils counts in a tensor).
+    The decay is min(decay, (1 + step) / (10 + step)). The step is a plain number, so that there is no need to wait for
+    the device (torch.optim.swa_utils counts in a tensor).
     """
     share = 1 - min(decay, (1 + step) / (10 + step))
     torch._foreach_lerp_(list(average.parameters()), list(network.parameters()), share)
@@ -179,13 +179,13 @@ def update_average(average: nn.Module, network: nn.Module, step: int, decay: flo
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """Moments and step counts, by `<number of the parameter>.<name>`."""
+    """Moments and step counts, by `<index of the parameter>.<name>`."""
     state = optimizer.state_dict()["state"]
     return {f"{index}.{name}": value for index, entry in state.items() for name, value in entry.items()}
 
 
 def optimizer_settings(optimizer: torch.optim.Optimizer) -> list[dict[str, Any]]:
-    """Plain values of each group, learning rates among them."""
+    """Plain values of each group, including learning rates."""
     return optimizer.state_dict()["param_groups"]
 
 
@@ -197,7 +197,7 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, Tenso
         state.setdefault(int(index), {})[name] = value
     groups = [{**group, "betas": tuple(group["betas"])} for group in settings]
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    for number, entry in state.items():  # in the parameter's memory order, as the optimizer's own are
+    for number, entry in state.items():  # copies into the parameter's memory layout, like the optimizer's own
         like = parameters[number]
         entry |= {n: torch.empty_like(like).copy_(t) for n, t in entry.items() if t.shape == like.shape and t.ndim}
     optimizer.load_state_dict({"state": state, "param_groups": groups})

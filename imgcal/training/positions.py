@@ -1,6 +1,6 @@
-"""The task of positions: one colour-coded image in, where each fiducial is out. What an encoder learns first.
+"""The task of positions: from one colour-coded image to fiducial positions. Encoders are trained on this first.
 
-Dots lie anywhere: neither rig nor object is in the images, so that what is learnt serves all of them that have as many
+Dots lie anywhere. The images depend on no rig and no object, so the result serves all objects with the same number of
 colours.
 """
 
@@ -35,20 +35,20 @@ from imgcal.types import Views
 VALIDATION_SEED = 20_000_004
 CENTRES = 0.09  # of the width of an image: standard deviation of the centre of its dots
 SPREADS = ((0.04, 0.15), (0.05, 0.2))  # of it, along u and v: smallest and largest standard deviation of the dots
-PAIRED, APART = 0.25, 0.012  # share of dots that lie beside another one; how far, in widths of the image, each axis
-FINE = 0.3  # weight of the exact positions beside the rough ones
-NEAR = 4.5  # pixels, each axis: half of what the exact position is looked for in
-FOUND = 1.0  # pixels: a fiducial that is farther from its place is lost
+PAIRED, APART = 0.25, 0.012  # share of dots next to another one; their distance in widths of the image, each axis
+FINE = 0.3  # weight of the precise positions relative to the rough ones
+NEAR = 4.5  # pixels, each axis: half the side of the crop for the precise position
+FOUND = 1.0  # pixels: a fiducial with a larger error is lost
 
 
 class PositionsExperiment(Experiment, NetworkSpec):
-    """The encoder and the locator of an image variant: the blocks of `NetworkSpec`, and how hard the images are."""
+    """Encoder and locator of an image variant: the blocks of `NetworkSpec`, and the difficulty of the images."""
 
     model_config = ConfigDict(extra="forbid")
 
     task: Literal["positions"]
-    rig: str  # shipped name or path: what the file's network is for; not in the images
-    object: str  # shipped name or path: the number of its fiducials and their colours count
+    rig: str  # shipped name or path: rig of the network in the file; does not affect the images
+    object: str  # shipped name or path: only the number of its fiducials and their colours matter
     levels: Annotated[Levels, Field(min_length=1)] = Field(
         default=[0, 1, 2, 3, 4]
     )  # difficulty levels of the images, in equal shares
@@ -60,14 +60,14 @@ class PositionsExperiment(Experiment, NetworkSpec):
 
 @dataclass(frozen=True)
 class PositionBatch:
-    """Single images, and where their dots are."""
+    """Single images, and the positions of their dots."""
 
     images: Tensor  # (I, 3, H, W)
     uv: Tensor  # (I, N, 2) pixels of the image; any finite value where there is no dot
     seen: Tensor  # (I, N) bool
 
     def tensors(self) -> dict[str, Tensor]:
-        """All tensors by name, to be saved."""
+        """All tensors by name, for saving."""
         return vars(self)
 
 
@@ -87,7 +87,7 @@ class PositionsTask(Task[PositionBatch, Located]):
         weights: torch.Generator,
         fresh: bool,
     ) -> None:
-        """Build it; see `Experiment.make_task`."""
+        """Build the task; see `Experiment.make_task`."""
         self.experiment, self.batch_size = experiment, batch_size
         self.rig, obj = load_rig(experiment.rig), load_object(experiment.object)
         self.files = {"rig": rig_text(self.rig, experiment.rig), "object": object_text(obj, experiment.object)}
@@ -103,20 +103,20 @@ class PositionsTask(Task[PositionBatch, Located]):
         self.image_size = torch.full((1, 2), self.options.size, device=device)
 
     def batch(self, count: int, generator: torch.Generator) -> PositionBatch:
-        """Draw dots that lie anywhere."""
+        """Draw dots at random positions."""
         return self._draw(count, self.experiment.levels, generator)
 
     def predict(self, network: nn.Module, batch: PositionBatch) -> Located:
-        """Say where they are."""
+        """Locate the dots."""
         return network(batch.images)
 
     def loss(self, answer: Located, batch: PositionBatch, step: int) -> Loss:
-        """Cross-entropy of the cells, and Laplace's likelihood of the exact position where it is looked for."""
+        """Cross-entropy of the cells, and Laplace likelihood of the precise positions within their crops."""
         coarse, fine = coarse_loss(answer, batch), fine_loss(answer, batch)
         return Loss(coarse + FINE * fine, {"coarse": coarse.detach(), "fine": fine.detach()})
 
     def validate(self, predict: Callable[[PositionBatch], Located]) -> dict[str, float]:
-        """By level and for all: median error (px of the image), and the share of dots that is not found."""
+        """By level and for all: median error (px of the image), and the share of lost dots."""
         count = -(-self.experiment.training.validation_rigs // len(self.experiment.levels))
         if not count:
             return {}
@@ -133,7 +133,7 @@ class PositionsTask(Task[PositionBatch, Located]):
         return medians | lost | {name: value / len(lost) for name, value in means.items()}
 
     def result(self, network: nn.Module, metrics: Mapping[str, Any]) -> Checkpoint:
-        """The whole image network, whose trunk is untrained: `training.init_from` of others takes what it needs."""
+        """Return the whole image network with an untrained trunk: `training.init_from` of others uses what it needs."""
         whole = build_network(
             drop_pretrained(self.experiment), self.rig, self.true_obj, torch.Generator().manual_seed(0)
         )
@@ -149,9 +149,9 @@ class PositionsTask(Task[PositionBatch, Located]):
 
 
 def random_dots(count: int, fiducials: int, size: int, generator: torch.Generator) -> Views:
-    """Scatter dots over images of `size` pixels: (count, 1, fiducials, 2), those that fall outside are not seen.
+    """Scatter dots over images of `size` pixels: (count, 1, fiducials, 2); those outside are not seen.
 
-    Some lie beside others, as dots of two faces of an object do that is seen from above.
+    Some lie next to others, like dots on two faces of an object in a view from above.
     """
     device = generator.device
     centre = torch.randn(count, 1, 1, 2, generator=generator, device=device)
@@ -167,9 +167,9 @@ def random_dots(count: int, fiducials: int, size: int, generator: torch.Generato
 
 
 def coarse_loss(found: Located, batch: PositionBatch) -> Tensor:
-    """Cross-entropy of each fiducial's cells, and of being nowhere; a dot between cells belongs to the four around it.
+    """Cross-entropy of each fiducial's cells and of absence; a dot between cells belongs to the four around it.
 
-    The share of each is bilinear, so that the centre of mass is the dot.
+    The shares are bilinear, so that the centre of mass is the dot.
     """
     height, width = found.logits.shape[-2:]
     cells, pixels = batch.uv.new_tensor((width, height)), batch.uv.new_tensor(batch.images.shape[:-3:-1])
@@ -186,7 +186,7 @@ def coarse_loss(found: Located, batch: PositionBatch) -> Tensor:
 
 
 def fine_loss(found: Located, batch: PositionBatch) -> Tensor:
-    """Mean negative log likelihood, by Laplace's distribution, of exact positions of dots near where is looked."""
+    """Mean negative Laplace log likelihood of precise positions, for dots within their crops."""
     near = batch.seen & ((batch.uv - found.near).abs() <= NEAR).all(-1)
     error = torch.where(near[..., None], found.uv - batch.uv, 0.0).abs().sum(-1)
     each = error * (-found.log_scale).exp() + 2 * found.log_scale

@@ -1,4 +1,4 @@
-"""The task of rigs: what all cameras see of the object in, the whole rig out."""
+"""The task of rigs: from the views of all cameras to the whole rig."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from imgcal.training.losses import LossConfig, compound
 from imgcal.training.task import Loss, Task
 from imgcal.types import CalibrationObject, CameraRig, Prediction
 
-# Seed of what must not depend on how long the training takes: validation rigs.
+# Seed for validation rigs, which must not depend on the length of the training.
 VALIDATION_SEED = 20_000_003
 
-LEAST_GOOD = 0.01  # of random rigs must see everything
+LEAST_GOOD = 0.01  # smallest share of random rigs that see everything
 
 Passes = tuple[Prediction, ...]
 
 
 class RigExperiment(Experiment, NetworkSpec):
-    """A network that says what a whole rig is, from what its cameras see of the object."""
+    """A network that predicts a whole rig from its cameras' views of the object."""
 
     model_config = ConfigDict(extra="forbid")
 
-    task: Literal["rig"] = "rig"  # what the network says
+    task: Literal["rig"] = "rig"  # what the network predicts
     rig: str  # factory rig: shipped name or path
     object: str  # calibration object: shipped name or path
-    corruption: Corruption = Corruption()  # what goes wrong in the views during training
+    corruption: Corruption = Corruption()  # defects of the views during training
     levels: Levels = Field(
         default=[]
     )  # of image variants: difficulty of the images, in equal shares, instead of `corruption`
@@ -59,10 +59,10 @@ class RigExperiment(Experiment, NetworkSpec):
 
 
 def checkpoint_experiment(spec: NetworkSpec) -> RigExperiment:
-    """Read all of what a network was trained by: `Checkpoint.experiment`.
+    """Convert `Checkpoint.experiment` to the complete experiment of a network.
 
     Raises:
-        InputError: it is no experiment of this version.
+        InputError: it is not an experiment of this version.
     """
     if isinstance(spec, RigExperiment):
         return spec
@@ -70,7 +70,7 @@ def checkpoint_experiment(spec: NetworkSpec) -> RigExperiment:
 
 
 class RigTask(Task[RigBatch, Passes]):
-    """Random rigs, and a loss of every pass of a network."""
+    """Random rigs, and a loss for every pass of a network."""
 
     unit = "rigs"
     judged = "validation_re_px"
@@ -80,7 +80,7 @@ class RigTask(Task[RigBatch, Passes]):
     def __init__(
         self, experiment: RigExperiment, device: torch.device, batch_size: int, weights: torch.Generator, fresh: bool
     ) -> None:
-        """Build it; see `Experiment.make_task`."""
+        """Build the task; see `Experiment.make_task`."""
         self.experiment = experiment
         self.factory, self.obj = experiment.load_rig(), experiment.load_object()  # float64
         spec = experiment if fresh else drop_pretrained(experiment)
@@ -98,7 +98,7 @@ class RigTask(Task[RigBatch, Passes]):
             network.image_options,
             tuple(experiment.levels),
         )
-        if device.type != "cpu":  # a batch must not wait for it; a CPU has no reason to draw more than it needs
+        if device.type != "cpu":  # avoids waiting for the device; a CPU need not draw more than it uses
             self.source = replace(self.source, good=self._share_of_good(device))
         self.prior_std = experiment.drift.std(self.factory).to(device, torch.float32)  # (C, K)
         fixed = torch.Generator(device).manual_seed(VALIDATION_SEED)
@@ -110,15 +110,15 @@ class RigTask(Task[RigBatch, Passes]):
         rig, obj, drift, poses = self.source.factory, self.source.obj, self.source.drift, self.source.pose_range
         found = share_of_good_rigs(rig, obj, fixed, drift=drift, pose_range=poses)
         if found < LEAST_GOOD:
-            self.source.sample(1, fixed)  # says which camera misses the object
+            self.source.sample(1, fixed)  # its error names the camera that misses the object
         return max(found, LEAST_GOOD)
 
     def batch(self, count: int, generator: torch.Generator) -> RigBatch:
-        """Make random rigs, and what their cameras see."""
+        """Make random rigs and their views."""
         return self.source.show(self.source.sample(count, generator), generator)
 
     def predict(self, network: nn.Module, batch: RigBatch) -> Passes:
-        """Say what the rigs are, pass by pass."""
+        """Predict the rigs, pass by pass."""
         return network(batch.views)
 
     def loss(self, answer: Passes, batch: RigBatch, step: int) -> Loss:
@@ -132,7 +132,7 @@ class RigTask(Task[RigBatch, Passes]):
         return Loss(terms.total + refined, {"re_px": passes[-1], **earlier})
 
     def validate(self, predict: Callable[[RigBatch], Passes]) -> dict[str, float]:
-        """RE in pixels of the last pass, on rigs that are always the same."""
+        """RE in pixels of the last pass, on fixed rigs."""
         if not self.validation:
             return {}
         generator = torch.Generator(self.prior_std.device).manual_seed(VALIDATION_SEED)
@@ -146,18 +146,18 @@ class RigTask(Task[RigBatch, Passes]):
         return rms_per_axis(found - true)
 
     def result(self, network: nn.Module, metrics: Mapping[str, Any]) -> Checkpoint:
-        """Weights with their rig, object and experiment."""
-        assert isinstance(network, Network)  # `self.network`, or the mean of what it was
+        """Return weights with their rig, object and experiment."""
+        assert isinstance(network, Network)  # `self.network`, or its running mean
         return Checkpoint(network, self.factory, self.obj, self.experiment, metrics)
 
 
 def _check_difficulty(experiment: RigExperiment, network: Network) -> None:
-    """Refuse what would have no effect.
+    """Refuse settings without effect.
 
     Raises:
-        InputError: levels of images for a network that takes points, or beside `corruption`.
+        InputError: levels of images for a network that takes points, or together with `corruption`.
     """
     if experiment.levels and network.image_options is None:
         raise InputError(f"levels: found {experiment.levels}, but the network {experiment.network.preset} takes points")
     if experiment.levels and not experiment.corruption.nothing:
-        raise InputError("levels: found them beside `corruption`, expected one of the two: levels corrupt points, too")
+        raise InputError("levels: found together with `corruption`, expected one of them: levels corrupt points, too")

@@ -1,4 +1,4 @@
-"""The state of a run in a file, so that a killed run goes on exactly where it was."""
+"""The state of a run in a file, so that a killed run continues exactly where it stopped."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from imgcal.training.experiment import Experiment
 
 FORMAT = "imgcal-training/1"
 
-# What may differ between a run and its continuation: how long it takes and what it tells, not what it computes.
+# Keys that may change in a continuation: they affect its length and reports, not what it computes.
 FREE = {("name",), ("description",), ("paper",)} | {
     ("training", name)
     for name in ("steps", "minutes", "log_every", "validate_every", "validation_rigs", "patience", "save_every")
@@ -36,7 +36,7 @@ class TrainingState:
 
 
 def save_state(path: str | Path, state: TrainingState) -> None:
-    """Write a state in one step; on a full disk the previous one survives.
+    """Write a state in one step; if the disk is full, the previous one survives.
 
     Raises:
         InputError: the file cannot be written.
@@ -47,21 +47,21 @@ def save_state(path: str | Path, state: TrainingState) -> None:
 
 
 def load_state(path: str | Path, experiment: Experiment) -> TrainingState:
-    """Read a state to go on with.
+    """Load a state for a continuation.
 
     Raises:
-        InputError: not such a file, damaged, a pickle, or the state of another experiment.
+        InputError: not a state, a damaged file, a pickle, or the state of another experiment.
     """
     tensors, texts = read_tensors(path, FORMAT)
     try:
         values, saved = read_json(texts["values"]), read_json(texts["experiment"])
         if not isinstance(values, dict) or not isinstance(saved, dict):
             raise ValueError("no mapping")
-        # Keys that are newer than the state have their defaults.
+        # Keys newer than the state get their defaults.
         saved = type(experiment).model_validate(saved, strict=False).model_dump(mode="json")
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: found no readable state in it: the file is damaged") from error
-    named = {name: saved.get(name) for name in values.get("files", {})}  # their content is compared, not their place
+    named = {name: saved.get(name) for name in values.get("files", {})}  # compares their content, not their paths
     difference = first_difference(saved, experiment.model_dump(mode="json") | named)
     if difference:
         key, was, now = difference
@@ -76,7 +76,7 @@ def load_state(path: str | Path, experiment: Experiment) -> TrainingState:
 def first_difference(
     saved: Mapping[str, Any], found: Mapping[str, Any], place: tuple[str, ...] = ()
 ) -> tuple[str, Any, Any] | None:
-    """Find the first value that differs and must not: its key, what it was, what it is."""
+    """Find the first value that differs but must not: its key, the old and the new value."""
     for name in (*saved, *(name for name in found if name not in saved)):
         here = (*place, name)
         was, now = saved.get(name), found.get(name)
@@ -92,7 +92,7 @@ def first_difference(
 
 
 def random_states(generator: torch.Generator, dropout: Iterable[torch.Generator]) -> dict[str, Tensor]:
-    """States of the data's generator, and by device of those from which layers draw."""
+    """States of the data's generator, and of the layers' generators by device."""
     return {"data": generator.get_state()} | {own.device.type: own.get_state() for own in dropout}
 
 

@@ -10,6 +10,7 @@ from .placement import CROP_MARGIN, PATCH_SIZE, CropPlacement
 from .posterior import RigPosterior
 from .prediction import Prediction, Views
 from .rig import (
+    PARAMETER_KINDS,
     PARAMETER_NAMES,
     PARAMETERS,
     PINHOLE,
@@ -28,6 +29,7 @@ __all__ = [
     "MOST_LIGHTS",
     "MOST_PIXELS",
     "PARAMETERS",
+    "PARAMETER_KINDS",
     "PARAMETER_NAMES",
     "PATCH_SIZE",
     "PINHOLE",

@@ -14,7 +14,7 @@ from imgcal.errors import InputError
 
 BoardKind = Literal["charuco", "aprilgrid", "checkerboard", "circles"]
 WARP = 0.002
-"""Of the longer side: deflection in its middle, one standard deviation, of a board of which nothing is said."""
+"""Of the longer side: deflection in its middle, one standard deviation, of a board whose file does not say."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Board:
 
     @property
     def warp_std(self) -> float:
-        """What each deflection may be off, mm."""
+        """Standard deviation of each deflection, mm."""
         return WARP * float(np.ptp(self._flat, axis=0).max()) if self.warp is None else self.warp
 
     @cached_property

@@ -1,4 +1,4 @@
-"""A camera that did not stand still while a rig was in use: what is said about it, wherever it was noticed."""
+"""`MovedCamera`: a camera that moved while the rig was in use, in whichever way that was found."""
 
 from __future__ import annotations
 

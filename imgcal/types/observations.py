@@ -79,6 +79,15 @@ class Detections:
         """Mark the blobs whose centres may be used: (M,) bool."""
         return (self.flags & int(UNUSABLE)) == 0
 
+    @property
+    def labelled(self) -> NDArray[np.bool_]:
+        """Mark the blobs with a label: (M,) bool."""
+        return self.fiducial >= 0
+
+    def count_by_camera(self, rows: NDArray[np.bool_] | slice = slice(None)) -> NDArray[np.int64]:
+        """Count the blobs of each camera: (C,); `rows` marks those that count."""
+        return np.bincount(self.camera[rows], minlength=len(self.camera_names))
+
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Detections:
         """Keep the given rows (mask or indices); names of cameras and snapshots stay."""
         return replace(

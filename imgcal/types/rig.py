@@ -38,6 +38,14 @@ PINHOLE = (
 """Free parameters of a camera before its lens: rotation (3, rad), position (3, mm), focal length (2, pixels), principal
 point (2, pixels). The K parameters of a rig's cameras are these and the D coefficients of `distortion`. Rotation:
 cam_from_rig = exp(w) cam_from_rig0. Position: of the camera in the rig."""
+PARAMETER_KINDS = {
+    "rotation": slice(0, 3),
+    "position": slice(3, 6),
+    "focal_length": slice(6, 8),
+    "principal_point": slice(8, 10),
+    "distortion": slice(10, None),
+}
+"""Where each kind of value, as a rig file's `prior` names it, stands among the parameters of a camera."""
 
 
 def parameter_names(lens_models: Sequence[str], width: int | None = None) -> tuple[str, ...]:
@@ -390,11 +398,5 @@ class CameraRig:
 
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> CameraRig:
         """Change the floating-point type, move to a device, or both."""
-        return replace(
-            self,
-            focal_length=self.focal_length.to(dtype=dtype, device=device),
-            principal_point=self.principal_point.to(dtype=dtype, device=device),
-            distortion=self.distortion.to(dtype=dtype, device=device),
-            cam_from_rig=self.cam_from_rig.to(dtype=dtype, device=device),
-            image_size=self.image_size.to(device=device),
-        )
+        moved = self.map_tensors(lambda tensor, _: tensor.to(dtype=dtype, device=device))
+        return replace(moved, image_size=self.image_size.to(device=device))

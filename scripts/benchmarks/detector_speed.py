@@ -23,7 +23,7 @@ import tyro
 
 from imgcal import DetectionOptions, load_object, load_rig
 from imgcal.association import IdentityOptions, Proposer, judge
-from imgcal.cli.memory import keep_memory
+from imgcal.cli.common import keep_memory
 from imgcal.detection import detect_snapshot
 from imgcal.matching import MatchedFilter, matched_filter, refinement
 from imgcal.pipeline import learned_proposer

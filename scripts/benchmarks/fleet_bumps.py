@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from torch import Tensor
 
 from imgcal.fleet import KINDS, DriftInformation, outlier_cameras
 from imgcal.io import load_object, load_rig
-from imgcal.types import RigPrior
+from imgcal.types import PARAMETER_KINDS, PARAMETERS, RigPrior
 from scripts.benchmarks.fleet_prior import NOISE, SNAPSHOTS, TRUE, recalibrated, simulate
 from scripts.output import ROOT, command, fill, markdown, read_json, surroundings, write_json
 
@@ -29,7 +28,7 @@ RESULT, PAGE = ROOT / "docs" / "benchmarks" / "fleet_bumps.json", ROOT / "docs" 
 SIZES = (4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 12.0, 15.0)  # standard deviations of what can be seen
 SPREADS = (6.0, 8.0, 10.0, 15.0, 30.0)  # of rotation, as in `fleet_prior`
 THRESHOLD = 5.0
-ENDS = (0, 3, 6, 8, 10, 15)  # of the kinds of value among a camera's parameters
+PARTS = [range(PARAMETERS)[part] for part in PARAMETER_KINDS.values()]  # of a camera's parameters, by kind of value
 
 
 @dataclass(frozen=True)
@@ -74,11 +73,11 @@ def direction(count: int, cameras: int, kind: int | None, generator: torch.Gener
     """Cameras (count), and random directions (count, P) within a kind of value of each, in true spreads."""
     camera = torch.randint(cameras, (count,), generator=generator)
     kinds = torch.randint(len(KINDS), (count,), generator=generator) if kind is None else torch.full((count,), kind)
-    found = torch.zeros(count, cameras, ENDS[-1], dtype=torch.float64)
+    found = torch.zeros(count, cameras, PARAMETERS, dtype=torch.float64)
     for row in range(count):
-        part = slice(ENDS[int(kinds[row])], ENDS[int(kinds[row]) + 1])
-        drawn = torch.randn(part.stop - part.start, generator=generator, dtype=torch.float64)
-        found[row, camera[row], part] = drawn / drawn.norm()
+        part = PARTS[int(kinds[row])]
+        drawn = torch.randn(len(part), generator=generator, dtype=torch.float64)
+        found[row, camera[row], list(part)] = drawn / drawn.norm()
     return camera, found.flatten(1)
 
 
@@ -89,7 +88,7 @@ def measure(options: Options) -> dict[str, Any]:
     information, _ = recalibrated(fleet, factory, obj, RigPrior())
     generator = torch.Generator().manual_seed(options.seed)
     unit = torch.tensor([getattr(TRUE, kind) for kind in KINDS], dtype=torch.float64)
-    widths = torch.tensor([b - a for a, b in pairwise(ENDS)])
+    widths = torch.tensor(list(map(len, PARTS)))
     std = unit.repeat_interleave(widths).repeat(factory.num_cameras)
 
     def named(scale: float, visible: bool, kind: int | None) -> dict[str, Any]:

@@ -22,10 +22,9 @@ from torch import Tensor
 from imgcal import Calibration, PipelineOptions, RefusedError, calibrate, load_object, load_rig
 from imgcal.association import to_observations
 from imgcal.estimation import estimate, relative_difference
-from imgcal.estimation.variance_components import KINDS
 from imgcal.evaluation.true_error import true_error
 from imgcal.fleet import StoredResults, workers
-from imgcal.types import CameraRig, RigPrior
+from imgcal.types import PARAMETER_KINDS, CameraRig, RigPrior
 from scripts.benchmarks.honesty_attacks import ATTACKS, BENT, Attack
 from scripts.benchmarks.honesty_prediction import Case
 from scripts.output import ROOT, WORK, command, fill, markdown, read_json, surroundings, write_json
@@ -54,7 +53,7 @@ def judged(case: Case, attack: Attack, captures: int, seed: int) -> dict[str, An
     prior = case.rig.prior or RigPrior()
     wide = RigPrior(*(attack.drift * value for value in vars(prior).values()))
     outcomes: Counter[str] = Counter()
-    squares: dict[str, list[float]] = {kind: [] for kind in (*KINDS, "joint")}
+    squares: dict[str, list[float]] = {kind: [] for kind in (*PARAMETER_KINDS, "joint")}
     inside: list[float] = []
     for _ in range(captures):
         true = case.obj
@@ -101,7 +100,7 @@ def _normalize(found: Calibration, truth: CameraRig, squares: dict[str, list[flo
     std = covariance.diagonal().clamp_min(0).sqrt()
     free = std > 1e-12
     ratio = torch.where(free, error / std.clamp_min(1e-30), torch.nan).view(-1, 15)
-    for kind, part in KINDS.items():
+    for kind, part in PARAMETER_KINDS.items():
         squares[kind].append(float(ratio[:, part].square().nanmean()))
     inside.append(float((ratio[ratio.isfinite()].abs() < 1.96).double().mean()))
     correlation = (covariance / (std[:, None] * std))[free][:, free]
@@ -255,7 +254,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
     for row in result["rows"]:
         if row["attack"] == "as said":
             nees = row.get("nees", {})
-            cells = [f"{nees[kind]:.2f}" for kind in (*KINDS, "joint")] if nees else ["-"] * 6
+            cells = [f"{nees[kind]:.2f}" for kind in (*PARAMETER_KINDS, "joint")] if nees else ["-"] * 6
             honest.append([
                 row["rig"], str(row["snapshots"]), f"{row['tolerance_mm']:g}", str(row["captures"]), *cells,
                 f"{100 * row['within_95']:.1f} %" if nees else "-", str(row["silent"]), str(row["refused"]),
@@ -263,7 +262,8 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
         else:
             counts = attacked.setdefault(row["attack"], {1: Counter(), 20: Counter()})[row["snapshots"]]
             counts.update({name: row[name] for name in ("right", "said", "silent", "refused")})
-    head = ["rig", "snapshots", "tolerance, mm", "captures", *(kind.replace("_", " ") for kind in KINDS), "joint"]
+    kinds = [kind.replace("_", " ") for kind in PARAMETER_KINDS]
+    head = ["rig", "snapshots", "tolerance, mm", "captures", *kinds, "joint"]
     names = ("right", "said", "silent", "refused")
     rows = [[name, *(" / ".join(str(by[s][n]) for n in names) for s in (1, 20))] for name, by in attacked.items()]
     wands = [

@@ -25,7 +25,7 @@ from imgcal.detection import detect
 from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform
 from imgcal.live_page.demonstration import AGED
-from imgcal.live_page.viewing_volume import viewing_volume
+from imgcal.live_page.rig_drawing import viewing_volume
 from imgcal.monitoring import RigBelief
 from imgcal.online import Event, ImageQuality, RigKeeper, RigState
 from imgcal.synthesis import SimulatedRig

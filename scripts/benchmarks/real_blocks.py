@@ -22,17 +22,10 @@ from imgcal.association import associate
 from imgcal.estimation import camera_covariance, rigid_motion
 from imgcal.io import load_detections
 from imgcal.pipeline import Calibration, fit_labelled
-from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError
+from imgcal.types import PARAMETER_KINDS, CalibrationObject, CameraRig, Detections, MovedError
 from scripts.output import ROOT, command, surroundings, write_json
 
 CAPTURE = "wand-ten-cameras-stream"
-KINDS = {
-    "rotation": slice(0, 3),
-    "position": slice(3, 6),
-    "focal_length": slice(6, 8),
-    "principal_point": slice(8, 10),
-    "distortion": slice(10, None),
-}
 GATE = 1.6
 """Most chi2 per degree of freedom of focal lengths and positions."""
 ROUNDS = 20
@@ -93,7 +86,7 @@ def chi2_by_kind(rigs: Sequence[CameraRig], covariances: Sequence[Tensor]) -> di
     own = torch.stack([(project @ covariance @ project.mT).diagonal() for covariance in covariances])
     mean = (left / own).sum(0) / (1 / own).sum(0)
     chi2 = ((left - mean).square() / own).sum(0).unflatten(0, (cameras, width)) / (len(rigs) - 1)
-    return {kind: float(chi2[:, part].mean()) for kind, part in KINDS.items()}
+    return {kind: float(chi2[:, part].mean()) for kind, part in PARAMETER_KINDS.items()}
 
 
 def measure(blocks: Sequence[Block]) -> dict[str, Any]:

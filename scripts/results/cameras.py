@@ -6,7 +6,6 @@ Writes out/results/cameras.html, which needs nothing else.
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass, replace
 from html import escape
@@ -20,6 +19,7 @@ from imgcal.errors import InputError
 from imgcal.evaluation import BASELINES, Conditions, Given, Method, load_models, reprojection_error
 from imgcal.evaluation.protocol import draw
 from imgcal.io import load_object, load_rig, write_text
+from imgcal.live_page import to_json
 from imgcal.report import DrawnRig, rig_scene, rig_view_script
 from imgcal.synthesis import RelativeDrift
 from imgcal.training import checkpoint_experiment
@@ -79,7 +79,7 @@ def predict(method: Method, given: Given, refined: bool) -> Prediction:
 def drawn(truth: CameraRig, predicted: CameraRig, fiducials: Tensor, title: str) -> str:
     """Make a page of cameras (B, C) in the object's frame, and the object (N, 3)."""
     rigs = [DrawnRig("true", "--ghost", (_one_rig(truth),)), DrawnRig("predicted", "--after", (_one_rig(predicted),))]
-    scene = json.dumps(rig_scene(rigs, fiducials[None].double().numpy())).replace("<", "\\u003c")
+    scene = to_json(rig_scene(rigs, fiducials[None].double().numpy()))
     return PAGE.format(title=escape(title), script=rig_view_script(), scene=scene)
 
 

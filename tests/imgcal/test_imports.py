@@ -11,7 +11,6 @@ from types import ModuleType
 import pytest
 
 import imgcal
-from imgcal.cli import arguments
 from imgcal.cli.main import COMMANDS
 
 HEAVY = {"torch", "numba", "cv2", "scipy", "kornia", "timm", "tensorboard", "accelerate", "matplotlib"}
@@ -66,10 +65,3 @@ def test_what_the_tool_promises() -> None:
         assert not isinstance(getattr(imgcal, name), ModuleType), name
     with pytest.raises(AttributeError, match="nothing"):
         _ = imgcal.nothing
-
-
-def test_the_list_of_commands_says_what_the_commands_say() -> None:
-    for name, (_, summary) in COMMANDS.items():
-        command = getattr(arguments, name.capitalize())
-        text = " ".join(command.__doc__.split("\n\n")[0].split())
-        assert text.startswith(summary), name

@@ -4,7 +4,7 @@ import torch
 from imgcal.association.ambiguities import conflicts, differ, lattice_shifts, near_symmetries, relabel
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io import load_object
-from imgcal.io.resources import data_path
+from imgcal.io.names import data_path
 from imgcal.types.calibration_object import CalibrationObject
 
 

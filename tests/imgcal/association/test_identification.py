@@ -8,7 +8,7 @@ from imgcal.association import IdentityOptions, identify, relocalize, track
 from imgcal.errors import InputError
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io import load_object, load_rig
-from imgcal.io.resources import data_path
+from imgcal.io.names import data_path
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift, RelativeDrift, Snapshots, synthesize
 from imgcal.types.calibration_object import CalibrationObject

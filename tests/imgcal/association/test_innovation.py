@@ -14,7 +14,7 @@ from imgcal.estimation import levenberg_marquardt_cpu
 from imgcal.estimation.levenberg_marquardt import Solution
 from imgcal.estimation.linearization import Problem, State, linearize, pose_at, retract, rig_at
 from imgcal.io import load_object, load_rig
-from imgcal.io.resources import data_path
+from imgcal.io.names import data_path
 from imgcal.synthesis.rigs import synthesize
 from imgcal.types.observations import Detections
 from imgcal.types.rig import RigPrior

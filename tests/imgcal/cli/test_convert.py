@@ -58,7 +58,7 @@ def test_nothing_is_guessed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert run(capsys, "T4", "--to", "colmap", "--out", folder)[0] == 0
     code, _, error = run(capsys, folder, "--out", tmp_path / "rig.yaml")
     assert code == 2
-    assert "its unit of length is not said in the file" in error
+    assert "the file does not state its unit of length" in error
     assert not (tmp_path / "rig.yaml").exists()
     assert run(capsys, folder, "--out", tmp_path / "rig.yaml", "--unit", "0.5m")[0] == 0
     half = load_rig(tmp_path / "rig.yaml").positions

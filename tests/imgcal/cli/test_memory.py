@@ -7,7 +7,7 @@ import pytest
 FAULTS = """
 import resource
 import numpy as np
-from imgcal.cli.memory import keep_memory
+from imgcal.cli.common import keep_memory
 {kept}
 for number in range(12):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt

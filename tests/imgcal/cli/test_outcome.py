@@ -3,8 +3,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from imgcal.cli.findings import Findings
-from imgcal.cli.outcome import predicted_line, print_outcome
+from imgcal.cli.outcome import Findings, predicted_line, print_outcome
 from imgcal.estimation import Gauge
 from imgcal.pipeline import Coverage, Motion
 

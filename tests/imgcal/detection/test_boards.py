@@ -54,11 +54,11 @@ def test_sigma_is_the_scatter_of_the_corners():
 @pytest.mark.parametrize(
     ("kind", "change", "words"),
     [
-        ("charuco", {"dictionary": "DICT_5X5_50"}, "its markers are of DICT_4X4"),
-        ("charuco", {"columns": 7, "rows": 5}, "do not lie as on this board"),
+        ("charuco", {"dictionary": "DICT_5X5_50"}, "its markers are from DICT_4X4"),
+        ("charuco", {"columns": 7, "rows": 5}, "but not in the layout of this board"),
         ("charuco", {"inverted": True}, "expected inverted: false"),
         ("aprilgrid", {"columns": 3, "rows": 3}, "expected 0 to 8"),
-        ("checkerboard", {"columns": 7, "rows": 6}, "a board of (8x7|7x8) squares is seen, expected 7x6"),
+        ("checkerboard", {"columns": 7, "rows": 6}, "a board of (8x7|7x8) squares is visible, expected 7x6"),
     ],
 )
 def test_says_why_a_board_is_not_found(kind, change, words):

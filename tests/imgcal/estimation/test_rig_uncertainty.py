@@ -127,7 +127,7 @@ def test_nothing_in_view_says_nothing(rig, points):
     assert found.pixel_error(points).isnan().all()
     assert found.point_error(points, torch.ones(3, len(points), dtype=torch.bool)).isnan().all()
     motion = rigid_motion(rig, points.mean(0))
-    with pytest.raises(RefusedError, match="too little of the working volume"):
+    with pytest.raises(RefusedError, match="see too little of the working volume"):
         aligned_covariance(covariance, motion, torch.zeros_like(covariance))
 
 

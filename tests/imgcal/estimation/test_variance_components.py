@@ -108,7 +108,7 @@ def test_what_does_not_come_to_rest_is_refused_after_forty_fits(monkeypatch) -> 
         rig, obj, table = hard(seed)
         with pytest.raises(RefusedError) as refusal:
             calibrate(table, rig, obj)
-        said = f"have not come to rest after {variance_components.ROUNDS} fits" in str(refusal.value)
+        said = f"do not converge in {variance_components.ROUNDS} fits" in str(refusal.value)
         assert max(counts) == variance_components.ROUNDS if said else max(counts) > 10
         endless += said
         counts.clear()

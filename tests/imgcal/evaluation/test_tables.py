@@ -7,8 +7,7 @@ import torch
 from imgcal.evaluation import EncoderCheck, Evaluation, Method, Protocol, Row, Scores, evaluate, network_method, sweep
 from imgcal.evaluation.methods import keep_factory_rig
 from imgcal.evaluation.plots import draw_latency, draw_sweep, draw_training
-from imgcal.evaluation.summary import Facts, Summary, as_values
-from imgcal.evaluation.tables import Table, as_tables, describe, markdown, write
+from imgcal.evaluation.tables import Facts, Summary, Table, as_tables, as_values, describe, markdown, write
 from imgcal.evaluation.timing import Latency
 from tests.imgcal.evaluation.conftest import Fake, straight_down
 

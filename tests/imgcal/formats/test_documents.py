@@ -4,7 +4,9 @@ from pathlib import Path
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats.documents import MOST_BYTES, parse_document, parse_xml, read_bytes, read_document
+from imgcal.formats.documents import parse_document, parse_xml, read_document
+from imgcal.io import read_bytes
+from imgcal.io.names import MOST_BYTES
 
 HERE = Path("file")
 

@@ -11,7 +11,7 @@ from imgcal.errors import InputError
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io.capture import Capture, open_capture, open_input, save_capture_settings
 from imgcal.io.frames import Frame, write_frame
-from imgcal.io.resources import data_path
+from imgcal.io.names import data_path
 from imgcal.types.observations import Detections
 from imgcal.types.rig import CameraRig
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.io.atomic import write_text
-from imgcal.io.publication import DEAD_AFTER, PREFIX, PREVIOUS, is_unfinished, keep_previous, publishing
+from imgcal.io.atomic import DEAD_AFTER, PREFIX, PREVIOUS, is_unfinished, keep_previous, publishing, write_text
 
 NAMES = ("report", "rig", "result")
 OLD = {"report": "old", "rig": "old", "result": "old", "mine": "untouched"}

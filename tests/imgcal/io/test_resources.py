@@ -3,8 +3,8 @@ from pathlib import Path
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.io import load_object, load_rig, open_capture, open_input, resources
-from imgcal.io.resources import data_path, sample_path, shipped_names
+from imgcal.io import load_object, load_rig, names, open_capture, open_input
+from imgcal.io.names import data_path, sample_path, shipped_names
 
 
 def test_what_ships_is_there_and_can_be_read() -> None:
@@ -21,7 +21,7 @@ def test_what_ships_is_there_and_can_be_read() -> None:
 def test_an_installed_package_carries_its_data(tmp_path: Path, monkeypatch) -> None:
     room = tmp_path / "imgcal" / "io"
     room.mkdir(parents=True)
-    monkeypatch.setattr(resources, "__file__", str(room / "resources.py"))
+    monkeypatch.setattr(names, "__file__", str(room / "names.py"))
     assert data_path("rigs", "a.yaml") == tmp_path / "data" / "rigs" / "a.yaml"  # a checkout: beside the package
     (tmp_path / "imgcal" / "data").mkdir()
     assert data_path("rigs", "a.yaml") == tmp_path / "imgcal" / "data" / "rigs" / "a.yaml"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from imgcal.io.silence import silence_stderr
+from imgcal.io.frames import silence_stderr
 
 
 def test_native_words_go_nowhere_and_come_back_after(capfd) -> None:

@@ -3,9 +3,9 @@ import itertools
 import pytest
 import yaml
 
-from imgcal.io import yaml_values
-from imgcal.io.resources import data_path
-from imgcal.io.yaml_values import MOST_DEPTH, read_values
+from imgcal.io import yaml_file
+from imgcal.io.names import data_path
+from imgcal.io.yaml_file import MOST_DEPTH, read_values
 
 
 @pytest.mark.parametrize("path", sorted(data_path().rglob("*.yaml")), ids=lambda path: path.stem)
@@ -88,9 +88,9 @@ def bomb(first: str, step: str) -> str:
 @pytest.mark.parametrize("text", [bomb("[x]", "[{}]"), bomb("{x: 1}", "{{<<: [{}]}}"), "[" + "x," * 2000 + "]"])
 def test_bombs_are_counted_and_not_built(text, monkeypatch):
     built = []
-    monkeypatch.setattr(yaml_values, "MOST_VALUES", 1000)
-    add = yaml_values._Builder._add
-    monkeypatch.setattr(yaml_values._Builder, "_add", lambda *given: built.append(1) or add(*given))
+    monkeypatch.setattr(yaml_file, "MOST_VALUES", 1000)
+    add = yaml_file._Builder._add
+    monkeypatch.setattr(yaml_file._Builder, "_add", lambda *given: built.append(1) or add(*given))
     with pytest.raises(yaml.MarkedYAMLError, match="more than 1,000 values"):
         read_values(text.encode())
     assert len(built) <= 1000

@@ -4,7 +4,7 @@ import contextlib
 import socket
 import time
 
-from imgcal.live_page.connections import HEADER_SECONDS, MOST_CONNECTIONS, MOST_OF_ONE_ADDRESS
+from imgcal.live_page.process import HEADER_SECONDS, MOST_CONNECTIONS, MOST_OF_ONE_ADDRESS
 from tests.imgcal.live_page.pages import Stream
 
 

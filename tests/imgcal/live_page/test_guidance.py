@@ -6,7 +6,7 @@ import torch
 
 from imgcal.live_page.contents import belief_message, rig_message
 from imgcal.live_page.guidance import compare, compute_guidance, information_gain
-from imgcal.live_page.viewing_volume import viewing_volume
+from imgcal.live_page.rig_drawing import viewing_volume
 from imgcal.monitoring import RigBelief, absorb
 from imgcal.types.observations import Observations
 from tests.imgcal.live_page.pages import made_state

@@ -10,7 +10,7 @@ from imgcal.live_page.address import Address
 from imgcal.live_page.commands import Command
 from imgcal.live_page.contents import event_message, greeting, picture_message, state_message
 from imgcal.live_page.page_state import MOST_VISITED, PageState
-from imgcal.live_page.viewing_volume import viewing_volume
+from imgcal.live_page.rig_drawing import viewing_volume
 from tests.imgcal.live_page.pages import ACTIONS, alarm, made_state
 
 

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from imgcal.io import load_rig
-from imgcal.live_page.rig_drawing import arrangement, forward, upright
-from imgcal.live_page.viewing_volume import viewing_volume
+from imgcal.live_page.rig_drawing import arrangement, forward, upright, viewing_volume
 from tests.imgcal.live_page.pages import dome
 
 

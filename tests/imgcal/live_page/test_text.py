@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from imgcal.live_page.text import round_values, stream_event, to_json
+from imgcal.live_page.page import round_values, stream_event, to_json
 
 
 def test_numbers_are_short_and_what_is_none_is_null():

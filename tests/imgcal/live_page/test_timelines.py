@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from imgcal.live_page.timelines import SPANS, Timelines, camera_changes, camera_sigmas
+from imgcal.live_page.page_state import SPANS, Timelines, camera_changes, camera_sigmas
 
 
 def test_a_day_takes_no_more_than_its_points():

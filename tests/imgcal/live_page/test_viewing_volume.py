@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from imgcal.io import load_rig
-from imgcal.live_page.viewing_volume import viewing_volume
+from imgcal.live_page.rig_drawing import viewing_volume
 from imgcal.types.volume import Volume
 from tests.imgcal.live_page.pages import dome
 

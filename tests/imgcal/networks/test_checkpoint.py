@@ -253,7 +253,7 @@ def test_warm_start_takes_what_fits(made, path, experiment):
     assert torch.equal(network.trunk[0].bias, made[1].trunk[0].bias)
     assert torch.equal(network.trunk[0].weight, trunk)
     assert torch.equal(network.prior_std, prior_std)  # buffers belong to the new rig and drift
-    with pytest.raises(InputError, match="no parameter that fits"):
+    with pytest.raises(InputError, match="no parameter that matches"):
         warm_start(path, torch.nn.Linear(3, 4))
 
 
@@ -275,7 +275,7 @@ def test_a_model_file_imports_nothing_of_somebodys_unless_it_is_trusted(path, mo
 def test_image_networks_that_read_hues_are_refused_by_that_name(path):
     tensors, texts = read_tensors(path, FORMAT)
     write_tensors(path, {**tensors, "belief.weight": torch.zeros(1)}, FORMAT, texts)
-    with pytest.raises(InputError, match="reads positions by hue, of an earlier version"):
+    with pytest.raises(InputError, match="reads positions by hue, from an earlier version"):
         load_checkpoint(path)
 
 

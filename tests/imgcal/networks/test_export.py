@@ -103,7 +103,7 @@ def test_other_networks_say_the_same(runtime, tmp_path, kind):
 
 def test_a_file_that_is_no_such_network_is_refused(tmp_path):
     for path, said in (
-        (model_file("cnn-O10-cube8"), "found a network of images"),
+        (model_file("cnn-O10-cube8"), "found an image network"),
         (tmp_path / "none.safetensors", "No such file"),
         (Path(__file__), "not a safetensors file"),
     ):

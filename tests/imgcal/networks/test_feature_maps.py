@@ -64,13 +64,13 @@ def test_an_encoder_of_somebodys_is_used():
         (f"{HERE}:Coarse", {}, "expected features of shape (1, F, 56, 56): a stride of 4"),
         (f"{HERE}:NoModule", {}, "expected a subclass of torch.nn.Module"),
         (f"{HERE}:OfGrey", {}, ": fails on images of shape (1, 3, 224, 224): RuntimeError: Given groups=1"),
-        (f"{HERE}:Particular", {}, ": cannot be made of its options: KeyError: 'features'"),
+        (f"{HERE}:Particular", {}, ": cannot be built with its options: KeyError: 'features'"),
         (f"{HERE}:Nothing", {}, ", which cannot be imported: AttributeError"),
         ("no.such.module:Mine", {}, "backbone: found `no.such.module:Mine`, which cannot be imported"),
-        (f"{HERE}:Mine", {"depth": 3}, "cannot be made of its options"),
-        ("cnn", {"embed_dim": 16}, "cannot be made of its options"),
+        (f"{HERE}:Mine", {"depth": 3}, "cannot be built with its options"),
+        ("cnn", {"embed_dim": 16}, "cannot be built with its options"),
         ("vit", {"embed_dim": 8192, "depth": 100}, "weights, expected at most"),
-        ("vit", {"embed_dim": 10, "num_heads": 4}, "cannot be made of its options"),
+        ("vit", {"embed_dim": 10, "num_heads": 4}, "cannot be built with its options"),
     ],
 )
 def test_what_does_not_fit_is_one_line(backbone, options, message):

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from imgcal.refinement import refine_images
-from imgcal.refinement.label_swaps import colours_at, find_swapped_labels
+from imgcal.refinement.render_and_compare import colours_at, find_swapped_labels
 from imgcal.types.prediction import Prediction
 from renderers import palette, splat
 

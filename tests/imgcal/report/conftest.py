@@ -11,7 +11,7 @@ import torch
 from imgcal.estimation import EstimationOptions, Gauge, estimate
 from imgcal.estimation.accuracy import predicted_error
 from imgcal.io import load_object, load_rig
-from imgcal.io.resources import data_path
+from imgcal.io.names import data_path
 from imgcal.report import ReportContent, SnapshotSummary
 from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, sample_rig_from_object, synthesize
 from imgcal.types.observations import Detections, Observations

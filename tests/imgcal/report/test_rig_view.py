@@ -13,8 +13,9 @@ import torch
 
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import load_rig
+from imgcal.live_page import up_and_forward
 from imgcal.report import DrawnRig, rig_scene, rig_view_script
-from imgcal.report.rig_view import frustum_length, frustums, up_axis
+from imgcal.report.rig_view import frustum_length, frustums
 from tests.imgcal.report.browser import measured
 
 if TYPE_CHECKING:
@@ -45,20 +46,20 @@ def test_drawn_cameras_are_smaller_than_the_distance_between_neighbours(name: st
 
 def test_up_is_what_is_up_for_most_cameras() -> None:
     ring = load_rig("room10")  # looks inward and down, z of its frame is up
-    np.testing.assert_array_equal(up_axis(ring), [0, 0, 1])
-    np.testing.assert_array_equal(up_axis(load_rig("T4")), [0, -1, 0])
+    np.testing.assert_array_equal(up_and_forward(ring)[0], [0, 0, 1])
+    np.testing.assert_array_equal(up_and_forward(load_rig("T4"))[0], [0, -1, 0])
     turn = RigidTransform(rotation_from_vector(torch.tensor([[0.6, 0.0, 0.0]]).double()), torch.zeros(1, 3).double())
     tilted = replace(ring, cam_from_rig=ring.cam_from_rig @ turn.inverse())
-    np.testing.assert_allclose(up_axis(tilted), turn.rotation[0] @ torch.tensor([0.0, 0.0, 1.0]).double(), atol=0.02)
-    looking_down = replace(ring, cam_from_rig=_all_around_an_axis(10))
-    np.testing.assert_array_equal(up_axis(looking_down), [0, -1, 0])
+    up, _ = up_and_forward(tilted)
+    np.testing.assert_allclose(up, turn.rotation[0] @ torch.tensor([0.0, 0.0, 1.0]).double(), atol=0.02)
 
 
-def _all_around_an_axis(count: int) -> RigidTransform:
-    """Cameras that look along z, each turned about that axis in another way: none agrees with another on what is up."""
-    turns = torch.zeros(count, 3, dtype=torch.float64)
-    turns[:, 2] = torch.arange(count) * 2 * torch.pi / count
-    return RigidTransform(rotation_from_vector(turns), torch.zeros(count, 3, dtype=torch.float64))
+def test_cameras_that_look_down_and_are_rolled_every_way_are_above_what_they_see() -> None:
+    angles = torch.arange(10).double() * 2 * torch.pi / 10
+    turns, places = torch.zeros(10, 3).double(), torch.zeros(10, 3).double()
+    turns[:, 2], places[:, 0] = angles, 500.0  # on a ring, each looks along z of the rig's frame
+    looking_down = replace(load_rig("room10"), cam_from_rig=RigidTransform(rotation_from_vector(turns), places))
+    np.testing.assert_array_equal(up_and_forward(looking_down)[0], [0, 0, -1])
 
 
 def test_forward_is_level() -> None:

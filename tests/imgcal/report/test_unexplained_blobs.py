@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from imgcal.report import ReportContent
-from imgcal.report.unexplained_blobs import unexplained_sentences
-from imgcal.report.verdict import judge
+from imgcal.report.verdict import judge, unexplained_sentences
 
 
 def test_nothing_is_said_where_all_is_explained(content: ReportContent) -> None:

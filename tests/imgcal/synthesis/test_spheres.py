@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from imgcal.synthesis.spheres import sphere_images
+from imgcal.synthesis.captures import sphere_images
 
 
 def outline(centre, radius, count=400):

@@ -165,7 +165,7 @@ def test_a_continuation_without_patience_ends_with_its_last_weights(line):
 
 
 def test_patience_needs_validations(line):
-    with pytest.raises(InputError, match="training: found patience 3 and validation_rigs 0, expected some to go by"):
+    with pytest.raises(InputError, match="training: found patience 3 and validation_rigs 0, expected at least 1"):
         line("training.patience=3", "training.validation_rigs=0")
 
 

@@ -115,7 +115,7 @@ def test_snapshots_that_are_held_out_have_no_neighbours_among_the_others(snapsho
 
 
 def test_a_single_camera_and_snapshot_cannot_be_split() -> None:
-    with pytest.raises(RefusedError, match="0 crops to learn from and 1 to hold out in 1 snapshots of 1 cameras"):
+    with pytest.raises(RefusedError, match="0 training crops and 1 held-out crops in 1 snapshots of 1 cameras"):
         split(made(1, 1), 1, 1)
 
 

@@ -47,7 +47,7 @@ def test_levels_that_would_have_no_effect_are_refused(experiment, monkeypatch):
         task_of(experiment("levels=[0, 1]"))
     monkeypatch.setattr("imgcal.networks.factory.build", ToyOfImages)
     task_of(experiment("levels=[0, 1]"))
-    with pytest.raises(InputError, match="levels: found them beside `corruption`, expected one of the two"):
+    with pytest.raises(InputError, match="levels: found together with `corruption`, expected one of them"):
         task_of(experiment("levels=[0, 1]", "corruption.noise=1"))
 
 
