@@ -1,15 +1,19 @@
 """Candidate poses of planar objects with so many fiducials that not all triples can be tried.
 
 Seen from a distance, a plane's image is an affine image. Whitened (shifted and stretched to zero mean and unit
-covariance) blobs and fiducials therefore differ by a rotation only, so one angle is all there is to search.
+covariance) blobs and fiducials therefore differ by a rotation only, so one angle is all there is to search. That
+needs nearly all of the plane in view. A lattice is grown from a few neighbours, whatever hides the rest.
 """
 
 from __future__ import annotations
+
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from imgcal.association.ambiguities import lattice_shifts
 from imgcal.association.blobs import PaddedBlobs
 from imgcal.association.hypotheses import Poses
 from imgcal.types import CalibrationObject, CameraRig
@@ -18,6 +22,25 @@ Floats = NDArray[np.float64]
 
 ANGLES = 180  # angles to try; half a step moves the rim of the pattern by 1/60 of its width
 GROWN = 12  # number of best angles to refine to homographies
+
+Cells = dict[tuple[int, int], int]
+"""Blob by its column and row in a lattice."""
+
+NEIGHBOURS = 8  # of a blob, among which its steps are looked for
+LEAST_ANGLE = 0.5  # sine between the two steps
+REACH = 0.25  # steps that a blob may be off where its neighbours expect it
+LEAST_AROUND = 5  # of the eight cells around a blob, for a lattice to be grown from there
+LEAST_SHARE = 0.15  # of the fiducials, that a lattice must show
+SEEDS = 12  # blobs that lattices are grown from
+STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+TURNS = [
+    np.array(entries).reshape(2, 2)
+    for entries in product((-1, 0, 1), repeat=4)
+    if abs(entries[0] * entries[3] - entries[1] * entries[2]) == 1
+]
+"""Steps of the image in steps of the object: turned, mirrored, or along a diagonal that is foreshortened."""
+CLOSE = 0.9  # of the best placement's fiducials, that another one must show
+MOST_PLACEMENTS = 16  # of a lattice, that poses are made of
 
 
 def planar_poses(blobs: PaddedBlobs, rig: CameraRig, camera: int, obj: CalibrationObject) -> Poses:
@@ -35,14 +58,15 @@ def planar_poses(blobs: PaddedBlobs, rig: CameraRig, camera: int, obj: Calibrati
     focal = float(rig.focal_length[camera].mean())
     count = blobs.count[camera]
     ordinary = _ordinary(blobs.radius[camera, :count])
-    seen = _drop_strays(blobs.ideal[camera, :count][ordinary].astype(np.float64) / focal)
+    every = blobs.ideal[camera, :count][ordinary].astype(np.float64) / focal
+    seen = _drop_strays(every)
     points = obj.points.double().cpu().numpy()
     centroid = points.mean(0)
     axes = np.linalg.svd(points - centroid)[2]
     axes[2] = np.cross(axes[0], axes[1])
     flat = (points - centroid) @ axes[:2].T
     tree = cKDTree(seen)
-    homographies = []
+    homographies = _lattice_homographies(flat, _lattice_steps(obj, axes), every)
     for turn in (1.0, -1.0):  # the front of the plane, and its back
         for angle in _best_angles(_whiten(flat * [1, turn])[0], _whiten(seen)[0]):
             homography = _grow(flat, tree, _affinity(flat * [1, turn], seen, angle) @ np.diag([1, turn, 1]))
@@ -139,3 +163,145 @@ def _pose(homography: Floats) -> tuple[Floats, Floats]:
     x, y, translation = (homography / scale).T
     u, _, vh = np.linalg.svd(np.stack((x, y, np.cross(x, y)), axis=1))
     return u @ np.diag([1, 1, np.linalg.det(u @ vh)]) @ vh, translation
+
+
+def _lattice_steps(obj: CalibrationObject, axes: Floats) -> Floats | None:
+    """Two steps (2, 2) of the object's lattice in its plane; None = it is no lattice."""
+    shifts = [shift.translation @ axes[:2].T for shift in lattice_shifts(obj)]
+    for other in shifts[1:]:
+        first = shifts[0]
+        if abs(first[0] * other[1] - first[1] * other[0]) > LEAST_ANGLE * np.linalg.norm(first) * np.linalg.norm(other):
+            return np.stack((first, other))
+    return None
+
+
+def _lattice_homographies(flat: Floats, steps: Floats | None, seen: Floats) -> list[Floats]:
+    """Find homographies under which blobs are fiducials of a planar lattice, most fiducials first.
+
+    Args:
+        flat: (N, 2) fiducials in their plane.
+        steps: (2, 2) two steps of the lattice, one a row; None = it is no lattice.
+        seen: (M, 2) blobs of one camera, on the plane z = 1.
+
+    Returns:
+        Maps (3, 3) from `flat` to blobs, of different placements; none where no lattice shows.
+    """
+    if steps is None or len(seen) < NEIGHBOURS + 1:
+        return []
+    numbers = np.rint((flat - flat[0]) @ np.linalg.inv(steps)).astype(np.int64)
+    tree, taken, found = cKDTree(seen), np.zeros(len(seen), dtype=bool), []
+    for blob, frame in _seeds(seen, tree):
+        if taken[blob]:
+            continue
+        cells = _spread(_follow(seen, tree, blob, frame), seen, tree)
+        taken[list(cells.values())] = True
+        if len(cells) >= max(NEIGHBOURS, LEAST_SHARE * len(flat)):
+            found.append(cells)
+    placed = [each for cells in found for each in _place(cells, numbers)]
+    placed.sort(key=lambda each: -len(each[0]))
+    return [
+        _fit_homography(flat[fiducial], seen[blob])
+        for fiducial, blob in placed[:MOST_PLACEMENTS]
+        if len(fiducial) >= CLOSE * len(placed[0][0])
+    ]
+
+
+def _seeds(seen: Floats, tree: cKDTree) -> list[tuple[int, Floats]]:
+    """Blobs with their two steps (2, 2), those with the fullest neighbourhood first."""
+    near = tree.query(seen, k=NEIGHBOURS + 1)[1]
+    ranked = []
+    for blob, others in enumerate(near):
+        steps = seen[others[1:]] - seen[blob]
+        length = np.linalg.norm(steps, axis=1)
+        best: tuple[int, float, Floats] | None = None
+        for i, j in zip(*np.triu_indices(len(steps), 1), strict=True):
+            across = abs(steps[i, 0] * steps[j, 1] - steps[i, 1] * steps[j, 0])
+            if across < LEAST_ANGLE * length[i] * length[j]:
+                continue
+            frame = np.stack((steps[i], steps[j]))
+            around = np.array([c for c in product((-1, 0, 1), repeat=2) if c != (0, 0)]) @ frame + seen[blob]
+            there = int((tree.query(around)[0] < REACH * min(length[i], length[j])).sum())
+            rank = (there, -float(length[i] + length[j]))
+            if there >= LEAST_AROUND and (best is None or rank > best[:2]):
+                best = (*rank, frame)
+        if best is not None:
+            ranked.append((-best[0], blob, best[2]))
+    ranked.sort(key=lambda each: each[:2])
+    # Spread over the image, so that clutter around one of them does not decide.
+    return [(blob, frame) for _, blob, frame in ranked[:: max(len(ranked) // SEEDS, 1)]]
+
+
+def _follow(seen: Floats, tree: cKDTree, blob: int, frame: Floats) -> Cells:
+    """Follow steps from blob to blob; each carries its own two steps (2, 2), which change slowly."""
+    cells: Cells = {(0, 0): blob}
+    frames = {(0, 0): frame}
+    open_cells, used = [(0, 0)], {blob}
+    while open_cells:
+        cell = open_cells.pop(0)
+        here, steps = seen[cells[cell]], frames[cell]
+        for direction in STEPS:
+            there = (cell[0] + direction[0], cell[1] + direction[1])
+            if there in cells:
+                continue
+            step = direction @ steps
+            distance, other = tree.query(here + step)
+            if distance > REACH * np.linalg.norm(step) or other in used:
+                continue
+            cells[there], own = int(other), steps.copy()
+            used.add(int(other))
+            axis = 0 if direction[0] else 1
+            own[axis] = 0.5 * (own[axis] + sum(direction) * (seen[other] - here))
+            frames[there] = own
+            open_cells.append(there)
+    return cells
+
+
+def _spread(cells: Cells, seen: Floats, tree: cKDTree) -> Cells:
+    """Fit a homography to the cells and look where it puts all others, also beyond what hides some."""
+    for _ in range(3):
+        if len(cells) < NEIGHBOURS:
+            return cells
+        numbers, blobs = np.array(list(cells)), np.array(list(cells.values()))
+        homography = _fit_homography(numbers.astype(np.float64), seen[blobs])
+        low, high = numbers.min(0) - 2, numbers.max(0) + 3
+        every = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True))), -1).reshape(-1, 2)
+        place = _apply(homography, every)
+        size = np.linalg.norm(_apply(homography, every + np.array(STEPS[0])) - place, axis=1)
+        size = np.minimum(size, np.linalg.norm(_apply(homography, every + np.array(STEPS[1])) - place, axis=1))
+        distance, other = tree.query(place)
+        good = distance < REACH * size
+        # A blob that two cells claim is of the nearer one.
+        order = np.argsort(distance, kind="stable")
+        order = order[good[order]]
+        order = order[np.sort(np.unique(other[order], return_index=True)[1])]
+        cells = {(int(every[k, 0]), int(every[k, 1])): int(other[k]) for k in order}
+    return cells
+
+
+def _place(cells: Cells, numbers: NDArray[np.int64]) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Lay the object's lattice on the grown one every way that shows most fiducials: fiducials and their blobs."""
+    seen, blobs = np.array(list(cells)), np.array(list(cells.values()))
+    index = {(int(i), int(j)): fiducial for fiducial, (i, j) in enumerate(numbers)}
+    placements: list[tuple[int, NDArray[np.int64], bytes]] = []
+    for turn in TURNS:
+        turned, back = seen @ turn, np.rint(np.linalg.inv(turn)).astype(np.int64)
+        shifts = (numbers[:, None] - turned).reshape(-1, 2)
+        low, wide = shifts.min(0), int(np.ptp(shifts[:, 1])) + 1
+        counts = np.bincount((shifts[:, 0] - low[0]) * wide + shifts[:, 1] - low[1])
+        for code in np.flatnonzero(counts >= CLOSE * counts.max()).tolist():
+            shift = low + np.array(divmod(code, wide))
+            covered = np.unique((numbers - shift) @ back, axis=0).tobytes()
+            placements.append((int(counts[code]), turned + shift, covered))
+    most, covers, result = max(count for count, _, _ in placements), set(), []
+    for count, where, covered in placements:
+        if count < CLOSE * most or covered in covers:
+            continue  # turns of a symmetric object onto itself are one
+        covers.add(covered)
+        fiducial = np.array([index.get((int(i), int(j)), -1) for i, j in where])
+        result.append((fiducial[fiducial >= 0], blobs[fiducial >= 0]))
+    return result
+
+
+def _apply(homography: Floats, points: Floats) -> Floats:
+    image = np.c_[points, np.ones(len(points))] @ homography.T
+    return np.asarray(image[:, :2] / image[:, 2:])

@@ -58,6 +58,8 @@ class Proposal:
     rig_from_object: RigidTransform | None
     margin: float  # log odds against the best distinct labelling (other pose, rotation, shift, or chance)
     reason: str = ""  # reason to decline; empty = a proposal
+    otherwise: Callable[[], Proposal] | None = None  # the next proposal, to judge where this one is refused
+    found_by: str = ""  # the proposer, where it is another one than was asked
 
     @classmethod
     def decline(cls, snapshot: Snapshot, reason: str, margin: float = 0.0) -> Proposal:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import reduce
 from operator import add
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.association.ambiguities import conflicts
-from imgcal.association.hypotheses import FiducialTriples, blob_triples, single_camera_poses
+from imgcal.association.hypotheses import FiducialTriples, Poses, blob_triples, single_camera_poses
 from imgcal.association.planar import planar_poses
 from imgcal.association.verification import Fits, Scene, refine, start
 from imgcal.association.voting import match, predict_ideal, vote
@@ -34,6 +34,7 @@ class Search:
     triples: FiducialTriples
     bounds: tuple[float, float]  # see `_bounds`
     hypotheses: int = 0  # number so far; for planar objects, the equivalent in time
+    planar: dict[int, Poses] = field(default_factory=dict)  # by camera: they are the same in every round
 
     def run_round(self, hypotheses: int, generator: np.random.Generator) -> Fits | None:
         """Make hypotheses, let the rig vote within the bounds, and fit the best ones; None = no result."""
@@ -41,7 +42,7 @@ class Search:
         cameras = np.array(list(self.likely))
         if scene.obj.planar and scene.obj.num_fiducials > MANY:
             chosen = generator.permutation(cameras)[:2]
-            poses = reduce(add, (planar_poses(scene.blobs, scene.rig, camera, scene.obj) for camera in chosen))
+            poses = reduce(add, (self._planar_poses(camera) for camera in chosen.tolist()))
             self.hypotheses += PLANAR_EFFORT * len(chosen)
         else:
             number = int(np.clip(hypotheses // len(self.triples.triples), 1, TRIPLES))
@@ -62,6 +63,11 @@ class Search:
         labels = match(scene.blobs, predicted[best], votes.shift[best], 1.25 * tolerance)
         best, labels = distinct(scene.obj, best, labels)
         return refine(scene, start(scene, poses.select(best), labels))
+
+    def _planar_poses(self, camera: int) -> Poses:
+        if camera not in self.planar:
+            self.planar[camera] = planar_poses(self.scene.blobs, self.scene.rig, camera, self.scene.obj)
+        return self.planar[camera]
 
 
 def distinct(

@@ -144,13 +144,14 @@ class Tracker:
         snapshot = Snapshot(
             sight.frames(number), blobs, self.rig, self.obj, self.prior_std, known, sight.detection, sight.masks
         )
-        identity, found = self._judge(sight, snapshot)
-        identity, found_by = self._adopt(identity), sight.proposer.name
+        identity, found, found_by = self._judge(sight, snapshot)
+        identity = self._adopt(identity)
         if not identity.accepted and not sight.where_blobs_fail:
             told = self._identify(blobs)
             if told.accepted and told.rig_from_object is not None:
-                there, at = self._judge(sight, replace(snapshot, candidates=(told.rig_from_object,)))
+                there, at, by = self._judge(sight, replace(snapshot, candidates=(told.rig_from_object,)))
                 if there.accepted:
+                    found_by = by
                     identity, found = replace(there, status=told.status, alternatives=told.alternatives), at
                 else:
                     identity, found, found_by = told, blobs, "classical"
@@ -158,14 +159,19 @@ class Tracker:
         concluded, labels = self._conclude(identity, found, name)
         return replace(concluded, found_by=found_by), labels, found
 
-    def _judge(self, sight: Sight, snapshot: Snapshot) -> tuple[Identity, Detections]:
-        """Run a proposer, and judge its proposal."""
-        proposal, near = sight.proposer.propose(snapshot), False
-        if snapshot.candidates and proposal.rig_from_object is not None:
-            known, found = snapshot.candidates[0].rotation, proposal.rig_from_object.rotation
-            near = bool(geodesic_angle(known, found) < NEARLY_KNOWN)
+    def _judge(self, sight: Sight, snapshot: Snapshot) -> tuple[Identity, Detections, str]:
+        """Run a proposer; judge its proposal, or the one behind it where that is refused, and name who made it."""
+        proposal = sight.proposer.propose(snapshot)
         error = float(np.hypot(self.options.identity_error, self._tolerance_px(snapshot.blobs)))
-        return judge(proposal, snapshot, self.options.identity, error=error, pose_known=near)
+        while True:
+            near = False
+            if snapshot.candidates and proposal.rig_from_object is not None:
+                known, found = snapshot.candidates[0].rotation, proposal.rig_from_object.rotation
+                near = bool(geodesic_angle(known, found) < NEARLY_KNOWN)
+            identity, blobs = judge(proposal, snapshot, self.options.identity, error=error, pose_known=near)
+            if identity.accepted or proposal.otherwise is None:
+                return identity, blobs, proposal.found_by or sight.proposer.name
+            proposal = proposal.otherwise()
 
     def _conclude(self, identity: Identity, blobs: Detections, name: str) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
         labels, pose = identity.labels, identity.rig_from_object

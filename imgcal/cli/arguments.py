@@ -344,10 +344,13 @@ class Harvest:
 
     The object's pose in a snapshot comes from all cameras, so that frames in which detection fails are labelled, too.
     Writes OUT/train.safetensors, OUT/held_out.safetensors (other snapshots, never their neighbours; of fewer than five
-    snapshots, other cameras) and OUT/README.md, which says what is in them.
+    snapshots, other cameras), the same for patches of single markers (train_patches, held_out_patches), and
+    OUT/README.md, which says what is in them.
     Example: imgcal harvest my_capture --rig out/rig.yaml --object object.csv --out dataset
     then: imgcal train ir-cnn --from dataset --out adapted
-    and: imgcal calibrate my_capture --rig factory.yaml --object object.csv --detector adapted --out out2
+    and: imgcal train measurer-cnn --from dataset --out measurer
+    and: imgcal calibrate my_capture --rig factory.yaml --object object.csv --detector adapted --measurer measurer
+    --out out2
     """
 
     capture: Annotated[Path, tyro.conf.Positional]  #: capture folder, or a shipped sample (sample:O10)

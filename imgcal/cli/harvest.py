@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
+from collections.abc import Iterable, Sequence
 
 from imgcal.cli import arguments
 from imgcal.cli.common import check_folder, open_rig, parse_range, progress, read_detections
+from imgcal.errors import RefusedError
 from imgcal.io import load_object, open_capture, publishing, write_text
 from imgcal.pipeline import capture_sight
-from imgcal.training import CARD, HELD_OUT, TRAIN, FrameDataset, harvest
+from imgcal.training import (
+    CARD,
+    HELD_OUT,
+    HELD_OUT_PATCHES,
+    TRAIN,
+    TRAIN_PATCHES,
+    FrameDataset,
+    PatchDataset,
+    cut_labelled,
+    split,
+)
 from imgcal.types import CalibrationObject, CameraRig
 
 CARD_TEXT = """# Crops of real frames
@@ -30,7 +41,16 @@ its markers, NaN outside the image; `place` (M, N, 2) crop pixels where the cali
 `seen` (M, N) markers that the frame shows; `camera`, `snapshot` (M,).
 
 To adapt a network: `imgcal train ir-cnn --from {folder} --out adapted`.
+
+{patches}
 """
+
+
+PATCHES_TEXT = """`train_patches.safetensors` ({train}) and `held_out_patches.safetensors` ({held_out}) are for the
+measurer: `imgcal train measurer-cnn --from {folder} --out measurer`. Tensors (M patches): `light` (M, 24, 24) above
+the ground of the patch in units of its marker; `radius` (M,) and `offset` (M, 2) of the marker, patch pixels, from
+the middle of the patch; `camera`, `snapshot` (M,)."""
+NO_PATCHES = "No marker is known so well that the measurer could learn from it: there are no patches."
 
 
 class Harvest(arguments.Harvest):
@@ -47,18 +67,38 @@ class Harvest(arguments.Harvest):
         sight = None
         if self.detector != "classical" and obj.board is None:
             sight = capture_sight(capture, self.detector, self.detection, first)
-        bar = partial(progress, label="harvesting")
-        splits = harvest(
+
+        def bar(snapshots: Iterable[int], total: int) -> Iterable[int]:
+            return progress(snapshots, total, "harvesting")
+
+        crops, patches = cut_labelled(
             lambda snapshot: capture.frames_of(first + snapshot), detections, rig, obj,
             detection=self.detection, sight=sight, size=self.size, seed=self.seed, progress=bar,
         )  # fmt: skip
+        count = len(detections.snapshot_names), rig.num_cameras
+        splits, parts = split(crops, *count), self._split_patches(patches, *count)
         about = {"capture": str(self.capture), "rig": rig.name, "object": obj.name, "seed": self.seed}
-        with publishing(self.out, (CARD, TRAIN, HELD_OUT), mark=CARD) as out:
+        with publishing(self.out, (CARD, TRAIN, HELD_OUT, TRAIN_PATCHES, HELD_OUT_PATCHES), mark=CARD) as out:
             for name, part in zip((TRAIN, HELD_OUT), splits, strict=True):
                 part.save(out / name, about)
-            write_text(out / CARD, self._card(rig, obj, len(detections.snapshot_names), *splits))
+            for name, some in zip((TRAIN_PATCHES, HELD_OUT_PATCHES), parts, strict=False):
+                some.save(out / name, about)
+            card = self._card(rig, obj, len(detections.snapshot_names), *splits)
+            write_text(out / CARD, card.replace("{patches}", self._say_patches(parts)))
         said = [f"{len(part)} crops with {_count_markers(part)} markers" for part in splits]
         print(f"{self.out}: {said[0]} for training, {said[1]} held out", file=sys.stderr)
+
+    def _split_patches(self, patches: PatchDataset, snapshots: int, cameras: int) -> Sequence[PatchDataset]:
+        """Hold out patches like crops; none where either part would be empty: crops are of use without them."""
+        try:
+            return split(patches, snapshots, cameras)
+        except RefusedError:
+            return ()
+
+    def _say_patches(self, parts: Sequence[PatchDataset]) -> str:
+        if not parts:
+            return NO_PATCHES
+        return PATCHES_TEXT.format(train=len(parts[0]), held_out=len(parts[1]), folder=self.out)
 
     def _card(
         self, rig: CameraRig, obj: CalibrationObject, snapshots: int, train: FrameDataset, held_out: FrameDataset
@@ -69,7 +109,7 @@ class Harvest(arguments.Harvest):
             train=len(train), train_seen=_count_markers(train), train_snapshots=len(train.snapshot.unique()),
             held_out=len(held_out), held_out_seen=_count_markers(held_out),
             held_out_snapshots=len(held_out.snapshot.unique()),
-            folder=self.out,
+            folder=self.out, patches="{patches}",
         )  # fmt: skip
 
 

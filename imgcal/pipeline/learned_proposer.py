@@ -79,15 +79,22 @@ class LearnedProposer:
 
     @torch.no_grad()
     def propose(self, snapshot: Snapshot) -> Proposal:
-        """Search one snapshot around known poses and, if they show too little, around the finder's pose."""
+        """Search one snapshot around known poses and, if they show too little, around the finder's pose.
+
+        What the finder has measured itself is behind the proposal, for where the network's is refused.
+        """
         near = self._around(snapshot) if snapshot.candidates else None
-        if self.finder is None or (near is not None and self._convinces(near, snapshot)):
+        if self.finder is None:
             return near or Proposal.decline(snapshot, "found no pose to look around")
-        found = self.finder.propose(snapshot)
+        finder = self.finder
+        if near is not None and self._convinces(near, snapshot):
+            return replace(near, otherwise=lambda: replace(finder.propose(snapshot), found_by=finder.name))
+        found = finder.propose(snapshot)
         if found.rig_from_object is None:
             return near or self._at_origin(snapshot) or Proposal.decline(snapshot, found.reason)
         there = self._around(replace(snapshot, candidates=(found.rig_from_object,)))
-        return there if near is None or len(there.detections) > len(near.detections) else near
+        best = there if near is None or len(there.detections) > len(near.detections) else near
+        return replace(best, otherwise=lambda: replace(found, found_by=finder.name))
 
     def _at_origin(self, snapshot: Snapshot) -> Proposal | None:
         """Search at the rig's origin, the usual place, for an object of many small markers: the finder cannot find

@@ -2,9 +2,21 @@ from .callbacks import Callbacks, DivergedError
 from .engine import Run, is_finished, prepare, progress, train, train_step
 from .experiment import Experiment
 from .experiment_file import KINDS, change_experiment, load_experiment, save_experiment
-from .frame_dataset import CARD, HELD_OUT, TRAIN, FrameDataset, adaptation, load_frames, load_splits
+from .frame_dataset import (
+    CARD,
+    HELD_OUT,
+    HELD_OUT_PATCHES,
+    TRAIN,
+    TRAIN_PATCHES,
+    FrameDataset,
+    PatchDataset,
+    adaptation,
+    load_frames,
+    load_patches,
+    load_splits,
+)
 from .infrared_task import InfraredExperiment, InfraredTask
-from .labelled_crops import harvest
+from .labelled_crops import cut_labelled, harvest, split
 from .measurer_task import MeasurerExperiment, MeasurerTask
 from .rigs import RigExperiment, RigTask, checkpoint_experiment
 from .state import TrainingState, load_state, save_state
@@ -13,8 +25,10 @@ from .task import Loss, Result, Task
 __all__ = [
     "CARD",
     "HELD_OUT",
+    "HELD_OUT_PATCHES",
     "KINDS",
     "TRAIN",
+    "TRAIN_PATCHES",
     "Callbacks",
     "DivergedError",
     "Experiment",
@@ -24,6 +38,7 @@ __all__ = [
     "Loss",
     "MeasurerExperiment",
     "MeasurerTask",
+    "PatchDataset",
     "Result",
     "RigExperiment",
     "RigTask",
@@ -33,16 +48,19 @@ __all__ = [
     "adaptation",
     "change_experiment",
     "checkpoint_experiment",
+    "cut_labelled",
     "harvest",
     "is_finished",
     "load_experiment",
     "load_frames",
+    "load_patches",
     "load_splits",
     "load_state",
     "prepare",
     "progress",
     "save_experiment",
     "save_state",
+    "split",
     "train",
     "train_step",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,13 @@ from torch import Tensor
 from imgcal.errors import InputError
 from imgcal.io import read_tensors, shipped_names, write_tensors
 from imgcal.networks import Queries
+from imgcal.synthesis import Patches
+from imgcal.types import PATCH_SIZE, BlobKind
 
 FORMAT = "imgcal-frames/1"
 TRAIN, HELD_OUT, CARD = "train.safetensors", "held_out.safetensors", "README.md"
+PATCHES_FORMAT = "imgcal-patches/1"
+TRAIN_PATCHES, HELD_OUT_PATCHES = "train_patches.safetensors", "held_out_patches.safetensors"
 ADAPTATION = (
     "training.steps=400",
     "training.validate_every=50",
@@ -66,6 +70,62 @@ class FrameDataset:
         """Write a file in one step; `about` has plain values that describe the origin of the crops."""
         tensors = {field.name: getattr(self, field.name) for field in fields(self)}
         write_tensors(path, tensors, FORMAT, {"about": json.dumps(about)})
+
+
+@dataclass(frozen=True)
+class PatchDataset:
+    """Patches at full scale around the markers of frames, for the measurer: M of them.
+
+    Light is measured as in `FrameDataset`, in units of the patch's own marker.
+    """
+
+    light: Tensor  # (M, 24, 24) float16
+    radius: Tensor  # (M,) float32, patch pixels, of the marker's image
+    offset: Tensor  # (M, 2) float32, patch pixels, from the middle of the patch to where the calibrated rig has it
+    camera: Tensor  # (M,) int64, number in the rig
+    snapshot: Tensor  # (M,) int64, number in the capture
+
+    def __len__(self) -> int:
+        return len(self.light)
+
+    def select(self, rows: Tensor) -> PatchDataset:
+        """Keep the patches of these rows."""
+        return PatchDataset(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def as_patches(self) -> Patches:
+        """Give the patches as rendered ones are given: whole markers."""
+        kind = torch.full((len(self),), int(BlobKind.WHOLE), device=self.light.device)
+        return Patches(self.light.float(), self.radius, self.offset, kind)
+
+    def save(self, path: str | Path, about: Mapping[str, Any]) -> None:
+        """Write a file in one step; see `FrameDataset.save`."""
+        tensors = {field.name: getattr(self, field.name) for field in fields(self)}
+        write_tensors(path, tensors, PATCHES_FORMAT, {"about": json.dumps(about)})
+
+
+def load_patches(folder: str | Path) -> tuple[PatchDataset, PatchDataset]:
+    """Read the patches of a dataset of `imgcal harvest`: to learn from, and held out.
+
+    Raises:
+        InputError: no such files, or something else in them.
+    """
+    found = []
+    for name in (TRAIN_PATCHES, HELD_OUT_PATCHES):
+        path = Path(folder) / name
+        tensors, _ = read_tensors(path, PATCHES_FORMAT)
+        names = [field.name for field in fields(PatchDataset)]
+        if set(tensors) != set(names):
+            raise InputError(f"{path}: found tensors {', '.join(sorted(tensors))}, expected {', '.join(names)}")
+        part, count = PatchDataset(**tensors), len(tensors["light"])
+        shapes = {"light": (count, PATCH_SIZE, PATCH_SIZE), "offset": (count, 2)}
+        for each in names:
+            expected = shapes.get(each, (count,))
+            if tuple(tensors[each].shape) != expected:
+                raise InputError(f"{path}: {each}: found shape {tuple(tensors[each].shape)}, expected {expected}")
+        if not count:
+            raise InputError(f"{path}: found no patches, expected some")
+        found.append(part)
+    return found[0], found[1]
 
 
 def load_frames(path: str | Path) -> FrameDataset:
@@ -119,6 +179,19 @@ def turn(crops: FrameDataset, generator: torch.Generator) -> FrameDataset:
         light, place = light.rot90(1, (-2, -1)), torch.stack((place[..., 1], last - place[..., 0]), -1)
     values = {field.name: getattr(crops, field.name) for field in fields(crops)}
     return FrameDataset(**values | {"crops": light, "place": place})
+
+
+def thin(crops: FrameDataset, most: int, generator: torch.Generator) -> FrameDataset:
+    """Keep `most` fiducials a crop, those nearest to one that is drawn: as many as a tile has, in a tile's time."""
+    if crops.place.shape[1] <= most:
+        return crops
+    drawn = torch.multinomial(crops.asked.float() + 1e-9, 1, generator=generator)
+    middle = crops.place.gather(1, drawn[..., None].expand(-1, 1, 2))
+    far = (crops.place - middle).norm(dim=-1).masked_fill(~crops.asked, torch.inf)
+    kept = far.argsort(1)[:, :most]
+    values = {name: getattr(crops, name).gather(1, kept) for name in ("sigma", "radius", "depth", "asked", "seen")}
+    place = crops.place.gather(1, kept[..., None].expand(-1, -1, 2))
+    return replace(crops, place=place, **values)
 
 
 def expect_elsewhere(crops: FrameDataset, generator: torch.Generator, near: bool) -> Queries:

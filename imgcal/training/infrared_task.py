@@ -23,7 +23,7 @@ from imgcal.networks import (
 )
 from imgcal.synthesis import degrade_crops, host_generator, render_crops, sample_scenes, second_look
 from imgcal.training.experiment import Experiment, Fraction
-from imgcal.training.frame_dataset import FrameDataset, expect_elsewhere, load_splits, turn
+from imgcal.training.frame_dataset import FrameDataset, expect_elsewhere, load_splits, thin, turn
 from imgcal.training.infrared import evidence_at_best, make_queries, query_losses
 from imgcal.training.task import Loss, Task
 
@@ -31,7 +31,8 @@ SECOND_LOOKS = 0.5  # share of the batches that simulate a second look, after a 
 VALIDATION_SEED = 20_000_003
 CAMERAS = 2  # crops per rig: more rigs and objects instead of more cameras
 FIDUCIALS = (5, 12)  # of the objects
-NEAR = 2.0  # crop pixels within which a position is correct
+FIDUCIALS_AT_ONCE = 16  # that are asked for in a crop of a real frame
+NEAR = 2.0  # crop pixels within which a place is right
 
 
 class InfraredExperiment(Experiment):
@@ -131,8 +132,8 @@ class InfraredTask(Task[CropBatch, Evidence]):
         return CropBatch(normalize_crops(crops), make_queries(truth), place, seen, window)
 
     def _batch_of_frames(self, crops: FrameDataset, generator: torch.Generator) -> CropBatch:
-        """Make crops of real frames harder, and build queries with displaced positions."""
-        crops = turn(crops, generator)
+        """Make crops of real frames harder, and ask for their fiducials from elsewhere."""
+        crops = thin(turn(crops, generator), FIDUCIALS_AT_ONCE, generator)
         light, seen = degrade_crops(crops.crops.float(), crops.place, crops.radius, crops.seen, generator)
         second = float(torch.rand((), generator=host_generator(generator))) < SECOND_LOOKS
         window = self.network.config.close_window if second else None

@@ -6,8 +6,9 @@ learns your own markers, lamps, lenses and walls.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import fields, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -20,16 +21,28 @@ from imgcal.errors import RefusedError
 from imgcal.estimation import estimate
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.matching import measure_markers
-from imgcal.networks import Expectation, Tiles, cut_crops
-from imgcal.training.frame_dataset import FrameDataset
+from imgcal.networks import Expectation, Tiles, cut_crops, cut_patches
+from imgcal.training.frame_dataset import FrameDataset, PatchDataset
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 
 COPIES = 3
 """Crops per place, each with another corner and another scale."""
 TURN_DEG, ASIDE = 1.5, 0.01
-"""Standard deviations of the poses that place crops: degrees, and distances relative to that of the object."""
+"""Standard deviations of the poses that crops are placed by: degrees, and parts of the distance to the object."""
+BESIDE = 3.0
+"""Patch pixels, each way, within which markers are beside the middle of their patches."""
+BRIGHT_PIXEL = 559
+"""Of the 576 pixels of a patch, in ascending order: as bright as its marker, whatever a few pixels show."""
+LARGEST_PATCH_SIGMA = 1.0
+"""Pixels: where a projection is known less well, it says nothing of a marker's exact place."""
 LEAST_SEEN = 3
-"""Smallest number of visible markers in a crop."""
+"""Markers that a crop must show."""
+ALIKE, LEAST_LIGHT = 0.5, 0.4
+"""Correlation with the usual look of the capture's markers, and part of their usual light, from which one is seen."""
+BRIGHTEST = 3
+"""Crop pixels, each way, within which a marker is brightest."""
+SNAPSHOTS_LOOKED_AT = 20
+"""Snapshots that tell how markers usually look."""
 LARGEST_SIGMA = 1.0
 """Crop pixels: largest standard deviation of a projection that serves as a label."""
 FARTHEST = 4.0
@@ -74,20 +87,52 @@ def harvest(
     Raises:
         RefusedError: no snapshot is conclusive, no pose fits, or one of the two would be empty.
     """
+    made = cut_labelled(
+        frames, detections, rig, obj, options, detection=detection, sight=sight, size=size, seed=seed,
+        progress=progress,
+    )  # fmt: skip
+    return split(made[0], len(detections.snapshot_names), rig.num_cameras)
+
+
+def cut_labelled(
+    frames: Callable[[int], Mapping[str, Frame | None]],
+    detections: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions = PipelineOptions(),
+    *,
+    detection: DetectionOptions = DetectionOptions(),
+    sight: Sight | None = None,
+    size: int = 96,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[FrameDataset, PatchDataset]:
+    """Cut the crops of all snapshots that can be decided, and patches of their markers; arguments as of `harvest`.
+
+    Raises:
+        RefusedError: no snapshot can be decided, or no pose fits.
+    """
     rig, options = rig.to(torch.float64), options.of_object(obj)
     labelled = associate(detections, rig, obj, options, progress, sight)
     observations, poses = fit_poses(labelled, rig, obj, options)
     generator = torch.Generator().manual_seed(seed)
     numbers: Iterable[int] = range(len(labelled.used))
-    parts = []
+    parts, patches, look = [], [], usual_look(frames, labelled.used, rig, obj, poses, detection)
     for row in progress(numbers, len(labelled.used)) if progress else numbers:
         snapshot = labelled.used[row]
-        shown = frames(snapshot)
-        seen, sigma = find_visible(shown, rig, obj, poses[row : row + 1], observations.of_snapshots([row]), detection)
+        shown, pose = frames(snapshot), poses[row : row + 1]
+        seen, sigma = find_visible(shown, rig, obj, pose, observations.of_snapshots([row]), detection)
+        if look is not None:
+            seen |= look.shows(shown, rig, Expectation.of(rig, obj, pose), detection)
+        usable = seen & (sigma < LARGEST_PATCH_SIGMA)
+        around = Expectation.of(rig, obj, pose)
         for _ in range(COPIES):
-            part = _cut(shown, rig, obj, poses[row : row + 1], seen, sigma, detection, size, generator)
+            own = _cut_patches(shown, rig, around, usable, detection, generator)
+            patches.append(replace(own, snapshot=torch.full_like(own.snapshot, snapshot)))
+            part = _cut(shown, rig, obj, pose, seen, sigma, detection, size, generator)
             parts.append(replace(part, snapshot=torch.full_like(part.snapshot, snapshot)))
-    return split(_join(parts), len(detections.snapshot_names), rig.num_cameras)
+    columns = (torch.cat([getattr(part, field.name) for part in patches]) for field in fields(PatchDataset))
+    return _join(parts), PatchDataset(*columns)
 
 
 def fit_poses(
@@ -151,8 +196,103 @@ def find_visible(
     return seen & expected.visible[0], sigma
 
 
-def split(crops: FrameDataset, snapshots: int, cameras: int) -> tuple[FrameDataset, FrameDataset]:
-    """Hold out stretches of snapshots, with a gap on both sides of each; with few snapshots, cameras.
+@dataclass(frozen=True)
+class Look:
+    """How the markers of a capture look, whatever their shape."""
+
+    patch: Tensor  # (24, 24) light of the usual marker, without its mean
+    light: float  # how strongly it shows: `_patches` of it
+
+    @torch.no_grad()
+    def shows(
+        self, frames: Mapping[str, Frame | None], rig: CameraRig, expected: Expectation, detection: DetectionOptions
+    ) -> Tensor:
+        """Tell which of the expected fiducials (1, C, N) look like the others: (C, N) bool."""
+        patches, light = _patches(frames, rig, expected, detection)
+        alike = (patches * self.patch).sum((-1, -2)) / (light * self.patch.norm()).clamp(min=1e-9)
+        return (alike > ALIKE) & (light > LEAST_LIGHT * self.light) & expected.visible[0]
+
+
+def usual_look(
+    frames: Callable[[int], Mapping[str, Frame | None]],
+    snapshots: Sequence[int],
+    rig: CameraRig,
+    obj: CalibrationObject,
+    poses: RigidTransform,
+    detection: DetectionOptions,
+) -> Look | None:
+    """Find out how most markers look, at their projections in some of the snapshots with poses (S,).
+
+    Returns:
+        None where they look like nothing that recurs.
+    """
+    every = max(len(snapshots) // SNAPSHOTS_LOOKED_AT, 1)
+    patches, light = [], []
+    for row in range(0, len(snapshots), every):
+        expected = Expectation.of(rig, obj, poses[row : row + 1])
+        own, strength = _patches(frames(snapshots[row]), rig, expected, detection)
+        kept = expected.visible[0] & (strength > 0)
+        patches.append(own[kept])
+        light.append(strength[kept])
+    all_patches, all_light = torch.cat(patches), torch.cat(light)
+    if not len(all_light):
+        return None
+    # The median pixel by pixel: a marker that is hidden, or another one beside it, does not show in it.
+    usual = (all_patches / all_light[:, None, None]).median(0).values
+    usual = usual - usual.mean()
+    alike = (all_patches * usual).sum((-1, -2)) / (all_light * usual.norm()).clamp(min=1e-9)
+    if float(alike.median()) < ALIKE:
+        return None
+    return Look(usual, float(all_light.median()))
+
+
+def _patches(
+    frames: Mapping[str, Frame | None], rig: CameraRig, expected: Expectation, detection: DetectionOptions
+) -> tuple[Tensor, Tensor]:
+    """Cut patches around expected fiducials (1, C, N): less their mean (C, N, 24, 24), and the norm of that (C, N)."""
+    radius = expected.radius[0].clamp(0.5, 64)
+    patches, _ = cut_patches(
+        frames, rig.camera_names, expected.uv[0], radius, inverted=detection.polarity == "dark"
+    )  # fmt: skip
+    patches = patches - patches.flatten(2).nanmean(-1)[..., None, None]
+    patches = patches.nan_to_num()
+    return patches, patches.flatten(2).norm(dim=-1)
+
+
+def _cut_patches(
+    frames: Mapping[str, Frame | None],
+    rig: CameraRig,
+    expected: Expectation,
+    usable: Tensor,
+    detection: DetectionOptions,
+    generator: torch.Generator,
+) -> PatchDataset:
+    """Cut patches of the usable (C, N) of the expected fiducials, each as if it were expected somewhere beside."""
+    uv, radius = expected.uv[0], expected.radius[0].clamp(0.5, 64)
+    _, usual = cut_patches({}, rig.camera_names, uv, radius)
+    aside = (2 * torch.rand(uv.shape, generator=generator, dtype=uv.dtype) - 1) * BESIDE * usual.scale[..., None]
+    patches, placement = cut_patches(
+        frames, rig.camera_names, uv + aside, radius, inverted=detection.polarity == "dark"
+    )  # fmt: skip
+    light, place = patches[usable], placement.to_crop(uv[..., None, :])[..., 0, :][usable]
+    ground = light.flatten(1).nanmedian(1).values.nan_to_num()[:, None, None]
+    light = (light - ground).nan_to_num()
+    level = light.flatten(1).kthvalue(BRIGHT_PIXEL, 1).values[:, None, None]
+    kept = (level > 0).flatten()
+    camera = torch.arange(rig.num_cameras)[:, None].expand_as(usable)[usable]
+    reduced = (radius / placement.scale)[usable]
+    middle = (placement.size - 1) / 2
+    return PatchDataset(
+        (light / level.clamp(min=1e-9)).clamp(-100, 100).half()[kept], reduced.float()[kept],
+        (place - middle).float()[kept], camera[kept], torch.zeros(int(kept.sum()), dtype=torch.int64),
+    )  # fmt: skip
+
+
+Part = TypeVar("Part", FrameDataset, PatchDataset)
+
+
+def split(crops: Part, snapshots: int, cameras: int) -> tuple[Part, Part]:
+    """Hold out stretches of snapshots, with a gap on both sides of each; of few snapshots, cameras.
 
     Raises:
         RefusedError: one of the two would be empty.
@@ -215,7 +355,9 @@ def _normalize_light(light: Tensor, place: Tensor, shown: Tensor) -> tuple[Tenso
     size = light.shape[-1]
     ground = light.flatten(1).nanmedian(1).values.nan_to_num()
     where = place.round().clamp(0, size - 1).long()
-    peak = light.flatten(1).gather(1, where[..., 1] * size + where[..., 0]) - ground[:, None]
+    # The brightest place of a marker need not be its middle: a ring has none there.
+    brightest = functional.max_pool2d(light.nan_to_num(-torch.inf)[:, None], 2 * BRIGHTEST + 1, 1, BRIGHTEST)[:, 0]
+    peak = brightest.flatten(1).gather(1, where[..., 1] * size + where[..., 0]) - ground[:, None]
     level = peak.masked_fill(~shown, torch.nan).nanmedian(1).values.nan_to_num()
     usable = (shown.sum(1) >= LEAST_SEEN) & (level > 0)
     scale = torch.where(usable, level, 1.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -21,8 +21,9 @@ from imgcal.networks import (
     normalize_crops,
     warm_start,
 )
-from imgcal.synthesis import Patches, expose_patches, render_patches
-from imgcal.training.experiment import Experiment
+from imgcal.synthesis import Patches, expose_patches, host_generator, render_patches
+from imgcal.training.experiment import Experiment, Fraction
+from imgcal.training.frame_dataset import load_patches
 from imgcal.training.task import Loss, Task
 from imgcal.types import BlobKind
 
@@ -34,7 +35,9 @@ class MeasurerExperiment(Experiment):
 
     task: Literal["measurer"] = "measurer"  # what the network is trained for
     network: MeasurerConfig = MeasurerConfig()  # family and size
-    pool: Annotated[int, Field(ge=1, le=10**7)] = 16_000  # patches rendered once; rotation, light and noise vary
+    pool: Annotated[int, Field(ge=1, le=10**7)] = 16_000  # patches rendered at the start; turned, lit and noised anew
+    frames: Annotated[str, Field(min_length=1)] | None = None  # folder that `imgcal harvest` wrote: markers of your own
+    frames_share: Fraction = 0.5  # share of the batches that are of these; the others are rendered
 
     def make_task(self, device: torch.device, batch_size: int, weights: torch.Generator, fresh: bool) -> MeasurerTask:
         """Build the network and its source of patches; see `Experiment.make_task`."""
@@ -67,6 +70,7 @@ class MeasurerTask(Task[PatchBatch, Measured]):
     judged = "validation_error_px"
     headline: ClassVar = {"error_px": "error {:.3g} px", "validation_error_px": "validation error {:.3g} px"}
     network: Measurer
+    own: Patches | None = None  # of real frames, to learn from
 
     def __init__(
         self,
@@ -85,12 +89,22 @@ class MeasurerTask(Task[PatchBatch, Measured]):
         self.device = device
         self.sizes = experiment.training.validation_sizes(batch_size)
         self.pool = _pool(experiment.pool, POOL_SEED, device)
-        self.held_out = _pool(max(sum(self.sizes), 1), VALIDATION_SEED, device)
+        self.share = experiment.frames_share
+        if experiment.frames is None:
+            self.held_out = _pool(max(sum(self.sizes), 1), VALIDATION_SEED, device)
+            return
+        own, held_out = load_patches(experiment.frames)
+        draw = torch.Generator().manual_seed(VALIDATION_SEED)
+        rows = torch.randint(len(held_out), (max(sum(self.sizes), 1),), generator=draw)
+        self.own, self.held_out = (_to(part, device) for part in (own.as_patches(), held_out.select(rows).as_patches()))
 
     def batch(self, count: int, generator: torch.Generator) -> PatchBatch:
-        """Draw patches from the pool, and add light and noise."""
-        rows = torch.randint(len(self.pool.kind), (count,), generator=generator, device=self.device)
-        return _expose(self.pool.select(rows), generator)
+        """Take patches of the pool, or of real frames, and give them light and noise."""
+        host, pool = host_generator(generator), self.pool
+        if self.own is not None and float(torch.rand((), generator=host)) < self.share:
+            pool = self.own
+        rows = torch.randint(len(pool.kind), (count,), generator=generator, device=self.device)
+        return _expose(pool.select(rows), generator)
 
     def predict(self, network: nn.Module, batch: PatchBatch) -> Measured:
         """Measure the markers."""
@@ -142,6 +156,10 @@ def _pool(count: int, seed: int, device: torch.device) -> Patches:
     """Render a fixed set of patches, once for all trainings of a process."""
     with torch.no_grad():
         return render_patches(count, torch.Generator(device).manual_seed(seed))
+
+
+def _to(patches: Patches, device: torch.device) -> Patches:
+    return Patches(*(getattr(patches, field.name).to(device) for field in fields(Patches)))
 
 
 def _expose(patches: Patches, generator: torch.Generator) -> PatchBatch:

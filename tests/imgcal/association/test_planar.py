@@ -120,3 +120,33 @@ def test_whitened_points_differ_by_a_rotation_after_any_affine_map() -> None:
     np.testing.assert_allclose(_rotation(angle), turn, atol=1e-9)
     affine = _affinity(points, mapped, angle)
     np.testing.assert_allclose(np.c_[points, np.ones(40)] @ affine[:2].T, mapped, atol=1e-9)
+
+
+def test_a_lattice_is_found_though_half_of_it_is_hidden(o10) -> None:
+    """What is left is no cloud whose shape says anything, and other blobs lie about."""
+    rows, columns = np.meshgrid(np.arange(9.0), np.arange(9.0), indexing="ij")
+    grid = make_object(np.c_[20 * columns.ravel() - 80, 20 * rows.ravel() - 80, np.zeros(81)])
+    for seed in range(3):
+        snapshot = take(o10, grid, seed, drift=None, noise=0.05)
+        blobs, camera = gather(snapshot.detections, o10), 3 * seed
+        uv, count = blobs.ideal[camera], blobs.count[camera]
+        random = np.random.default_rng(seed)
+        middle = uv[:count].mean(0)
+        # Behind one drape are the fiducials of one side, behind another a few of the rest.
+        shown = (uv[:count] - middle) @ (np.cos(seed), np.sin(seed)) < 10
+        shown &= np.linalg.norm(uv[:count] - uv[:count][shown][5], axis=1) > 60
+        strays = middle + random.uniform(-300, 300, (12, 2))
+        kept = np.concatenate((uv[:count][shown], strays)).astype(np.float32)
+        parts = (
+            kept[None], kept[None], np.full((1, len(kept)), 0.1), np.full((1, len(kept)), np.nan),
+            np.arange(len(kept))[None],
+        )  # fmt: skip
+        assert 25 < shown.sum() < 60
+        poses = planar_poses(PaddedBlobs(*parts, np.array([len(kept)]), len(kept)), o10.select([camera]), 0, grid)
+        points, truth = grid.points.numpy(), snapshot.pose.apply(grid.points).numpy()
+        # A square has eight poses, and steps of the lattice are as good as long as they show as many of the rest.
+        error = [
+            np.linalg.norm((points @ r.T + t)[:, None] - truth, axis=-1).min(1).max()
+            for r, t in zip(poses.rotation, poses.translation, strict=True)
+        ]
+        assert min(error, default=np.inf) < 0.02 * float(o10.working_distance)

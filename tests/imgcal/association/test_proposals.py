@@ -6,6 +6,7 @@ import torch
 
 from imgcal.association import IdentityOptions, Proposal, Sight, Snapshot, associate, judge, proposal_rows
 from imgcal.association.proposals import merge_proposal
+from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform, geodesic_angle, rotation_from_vector
 from imgcal.io import load_object
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
@@ -158,3 +159,24 @@ def test_after_many_looks_in_vain_blobs_still_decide(o10, asymmetric8):
     given = replace(seen, fiducial=np.full(len(seen), -1)).select((seen.snapshot >= 9) | (seen.fiducial < 2))
     found = associate(given, o10, asymmetric8, sight=Sight(NearSighted(truth, degrees=0.0), frames, False))
     assert found.used == [9, 10, 11]
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_a_refused_proposal_gives_way_to_the_one_behind_it(truth, o10, asymmetric8, behind):
+    """A proposer that is wrong by itself, with the oracle behind it, or nobody."""
+
+    @dataclass(frozen=True)
+    class Wrong(Oracle):
+        def propose(self, snapshot):
+            true = super().propose(snapshot)
+            rows = replace(true.detections, fiducial=(true.detections.fiducial + 3) % 8)
+            wrong = replace(true, detections=rows, margin=1.0)
+            return replace(wrong, otherwise=lambda: replace(true, found_by="other")) if behind else wrong
+
+    given = replace(blobs_of(truth), snapshot_names=("0", "1"))
+    if not behind:
+        with pytest.raises(RefusedError, match=r"margin of 1\.0 only"):
+            associate(given, o10, asymmetric8, sight=Sight(Wrong(truth), frames, True))
+        return
+    found = associate(given, o10, asymmetric8, sight=Sight(Wrong(truth), frames, True))
+    assert [snapshot.found_by for snapshot in found.snapshots] == ["other", "other"]

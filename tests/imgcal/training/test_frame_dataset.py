@@ -6,7 +6,7 @@ import torch
 from imgcal.errors import InputError
 from imgcal.io import write_tensors
 from imgcal.training import HELD_OUT, TRAIN, FrameDataset, load_frames, load_splits
-from imgcal.training.frame_dataset import FORMAT, expect_elsewhere, turn
+from imgcal.training.frame_dataset import FORMAT, expect_elsewhere, thin, turn
 
 CROPS, FIDUCIALS, SIZE = 4, 3, 96
 
@@ -73,3 +73,14 @@ def test_what_is_expected_outside_the_crop_is_not_asked_for(crops) -> None:
     queries = expect_elsewhere(edge, torch.Generator().manual_seed(1), near=False)
     outside = (queries.place < -0.5).any(-1)
     assert outside.any() and not queries.asked[outside].any()
+
+
+def test_a_thinned_crop_keeps_neighbours_with_all_that_is_known_of_them(crops) -> None:
+    sigma = torch.arange(CROPS * FIDUCIALS).view(CROPS, FIDUCIALS).float()
+    crops = replace(crops, sigma=sigma, asked=torch.tensor([[True, True, False]] * CROPS))
+    kept = thin(crops, 2, torch.Generator().manual_seed(0))
+    assert kept.place.shape == (CROPS, 2, 2) and kept.asked.all()
+    for row in range(CROPS):
+        for place, number in zip(kept.place[row], kept.sigma[row].long() % FIDUCIALS, strict=True):
+            assert torch.equal(place, crops.place[row, number])
+    assert thin(crops, FIDUCIALS, torch.Generator()) is crops

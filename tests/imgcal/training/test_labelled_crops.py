@@ -9,7 +9,7 @@ from imgcal.errors import RefusedError
 from imgcal.io import data_path, open_capture
 from imgcal.training import harvest
 from imgcal.training.frame_dataset import FrameDataset
-from imgcal.training.labelled_crops import split
+from imgcal.training.labelled_crops import cut_labelled, split
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +39,20 @@ def test_markers_are_bright_where_the_rig_has_them(sample) -> None:
     assert set(train.camera.tolist()).isdisjoint(held_out.camera.tolist())
 
 
+def test_patches_have_their_markers_where_they_say(sample) -> None:
+    frames, blobs, rig, obj = sample
+    crops, patches = cut_labelled(frames.get, blobs, rig, obj)
+    assert len(patches) > 2 * 0.9 * int(crops.seen.sum()) / 3
+    light = patches.light.float().clamp(min=0)
+    near = torch.arange(24) - 11.5
+    bright = light * ((near[None, None] - patches.offset[:, :1, None]).abs() < 5)
+    bright = bright * ((near[None, :, None] - patches.offset[:, 1:, None]).abs() < 5)
+    total = bright.sum((1, 2))
+    centre = torch.stack(((bright.sum(1) * near).sum(1), (bright.sum(2) * near).sum(1)), 1) / total[:, None]
+    assert (centre - patches.offset).norm(dim=1).median() < 0.3
+    assert patches.offset.abs().max() > 2  # not always in the middle
+
+
 def test_a_marker_that_the_frame_does_not_show_is_not_seen(sample) -> None:
     frames, blobs, rig, obj = sample
     pose = imgcal.score(blobs, rig, obj)
@@ -53,6 +67,28 @@ def test_a_marker_that_the_frame_does_not_show_is_not_seen(sample) -> None:
     there = (train.snapshot == 0) & (train.camera == 2)
     assert train.asked[there, 4].all() and not train.seen[there, 4].any()
     assert train.seen[there, 3].all()
+
+
+def test_markers_of_any_shape_are_seen_where_they_recur(sample) -> None:
+    """Rings, which have no light in their middle and which no fit of a spot measures."""
+    frames, blobs, rig, obj = sample
+    found = imgcal.score(blobs, rig, obj).labelled
+    u, v = np.meshgrid(np.arange(-20, 21), np.arange(-20, 21))
+    far = np.hypot(u, v)
+    shown = {number: {name: np.full_like(frame, 20) for name, frame in each.items()} for number, each in frames.items()}
+    table = found.detections
+    for row in np.flatnonzero(table.fiducial >= 0):
+        frame = shown[int(table.snapshot[row])][rig.camera_names[table.camera[row]]]
+        column, line = table.uv[row].round().astype(int)
+        size = 1.6 * table.radius[row]
+        window = frame[line - 20 : line + 21, column - 20 : column + 21]
+        if window.shape == far.shape:
+            window[abs(far - size) < 0.3 * size] = 150
+    train, held_out = harvest(shown.get, blobs, rig, obj)
+    for part in (train, held_out):
+        assert part.seen.sum() > 0.8 * part.asked.sum()
+        light = part.crops.float().flatten(1).nan_to_num().amax(1)
+        assert light.median() == pytest.approx(1.0, abs=0.2)
 
 
 def made(snapshots: int, cameras: int) -> FrameDataset:

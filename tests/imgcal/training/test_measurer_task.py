@@ -1,10 +1,20 @@
 import math
 
+import pytest
 import torch
 
+from imgcal.errors import InputError
 from imgcal.networks import Measured, load_measurer
-from imgcal.training import MeasurerExperiment, MeasurerTask, load_experiment
+from imgcal.training import (
+    HELD_OUT_PATCHES,
+    TRAIN_PATCHES,
+    MeasurerExperiment,
+    MeasurerTask,
+    PatchDataset,
+    load_experiment,
+)
 from imgcal.training.measurer_task import PatchBatch
+from imgcal.types import BlobKind
 
 
 def task() -> MeasurerTask:
@@ -55,3 +65,29 @@ def test_it_learns_and_its_file_is_read(tmp_path) -> None:
     torch.testing.assert_close(
         again.offset.detach(), made.network(batch.patches, batch.radius).offset.detach(), atol=0.05, rtol=0.05
     )
+
+
+def test_patches_of_real_frames_are_mixed_with_rendered_ones_and_held_out_ones_judge(tmp_path) -> None:
+    place = torch.linspace(-3, 3, 40)
+    offset, number = torch.stack((place, -place), 1), torch.arange(40)
+    steps = torch.arange(24.0) - 11.5
+    u, v = steps[None, None] - offset[:, :1, None], steps[None, :, None] - offset[:, 1:, None]
+    rings = ((u.square() + v.square()).sqrt() - 5).abs() < 0.8
+    patches = PatchDataset(rings.half(), torch.full((40,), 3.0), offset, 0 * number, number)
+    for name, part in ((TRAIN_PATCHES, patches), (HELD_OUT_PATCHES, patches.select(number[::2]))):
+        part.save(tmp_path / name, {})
+    changes = ["training.validation_rigs=20", "pool=130", f"frames={tmp_path}", "frames_share=0.5"]
+    made = load_experiment("measurer-cnn", changes, kind=MeasurerExperiment).make_task(
+        torch.device("cpu"), 20, torch.Generator().manual_seed(0), True
+    )
+    generator = torch.Generator().manual_seed(1)
+    own = [bool((made.batch(20, generator).kind == BlobKind.WHOLE).all()) for _ in range(40)]
+    assert 8 < sum(own) < 32
+    said = made.validate(
+        lambda batch: Measured(batch.offset + 0.2, torch.full_like(batch.radius, math.log(0.1)), knows(batch, 1).kind)
+    )
+    assert abs(said["validation_error_px"] - 0.2) < 1e-5 and said["validation_wrong_verdicts"] == 0
+    with pytest.raises(InputError, match=r"nowhere.train_patches\.safetensors"):
+        load_experiment("measurer-cnn", [*changes[:2], f"frames={tmp_path / 'nowhere'}"]).make_task(
+            torch.device("cpu"), 20, torch.Generator(), True
+        )

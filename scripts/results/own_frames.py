@@ -1,0 +1,264 @@
+"""Networks that learnt from frames of the same rig, on real frames that are made harder.
+
+    IMGCAL_CAPTURES=... python -m scripts.results.own_frames --runs out/own_frames
+
+The sets and degradations are those of `scripts.results.degraded_captures`. One part of each set labels the crops that
+networks learn from (camera 1 of the lattice, camera 3 of the cavity, views 9 to 15 of the grid); every detector then
+calibrates from the rest. Who labelled the snapshots is kept: what a network proposes in vain is left to the filter, and
+where that finds nothing, to blobs.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+import imgcal
+from imgcal.errors import RefusedError
+from imgcal.matching import MatchedFilter
+from imgcal.networks import load_infrared, load_measurer
+from imgcal.pipeline.learned_proposer import LearnedProposer
+from imgcal.pipeline.sources import Detector
+from imgcal.training import HELD_OUT, TRAIN
+from imgcal.training.labelled_crops import cut_labelled
+from imgcal.types import CameraRig, Detections
+from scripts.output import RESULTS, ROOT, command, fill, markdown, read_json, surroundings, write_json
+from scripts.results import degraded_captures as captures
+from scripts.results.degradations import DEGRADATIONS
+from scripts.results.infrared import Shuffled
+from tests.captures.sets import dot_grid
+
+JSON, PAGE = RESULTS / "own_frames.json", ROOT / "docs" / "infrared.md"
+ADAPT = {"dots": ("cam1",), "cavity": ("cam3",), "grid": ()}  # cameras that are learnt from; of the grid, views are
+REST = {"dots": ("cam2", "cam3"), "cavity": ("cam4",), "grid": ("cam",)}
+ENCODERS = {"ir-cnn": "cnn", "ir-vit": "vit", "ir-vit-stem": "vit-stem"}
+SEEDS = (0, 1, 2)
+EVERY = 5  # one crop of so many is held out to end a training by; what is measured are other cameras or views
+
+
+@cache
+def rest(name: str) -> captures.Task:
+    """A set without what networks learn from."""
+    given = captures.task(name, captures.captures_folder())
+    names = REST[name]
+    rig = given.rig.select([given.rig.camera_names.index(camera) for camera in names])
+    return replace(given, frames={camera: given.frames[camera] for camera in names}, rig=rig,
+                   held_out=of_cameras(given.held_out, names))  # fmt: skip
+
+
+def of_cameras(points: Detections, names: tuple[str, ...]) -> Detections:
+    """Keep the points of some cameras."""
+    number = np.array([names.index(name) if name in names else -1 for name in points.camera_names])
+    kept = points.select(number[points.camera] >= 0)
+    return replace(kept, camera=number[kept.camera], camera_names=names)
+
+
+def prepare(runs: Path) -> None:
+    """Cut the crops that networks learn from: labelled by the rig that these frames alone give."""
+    for name in captures.SETS:
+        given = captures.task(name, captures.captures_folder())
+        if name == "grid":
+            frames = {"cam": dot_grid(captures.captures_folder())[0][captures.CALIBRATE :]}
+            rig: CameraRig = given.rig
+        else:
+            frames = {camera: given.frames[camera] for camera in ADAPT[name]}
+            rig = given.rig.select([given.rig.camera_names.index(camera) for camera in ADAPT[name]])
+        found = imgcal.calibrate(frames, rig, given.obj, detection=given.detection)
+        blobs = imgcal.detect(frames, given.detection)
+        crops, _ = cut_labelled(
+            lambda s, frames=frames: {camera: each[s] for camera, each in frames.items()},  # type: ignore[misc]
+            blobs, found.rig, given.obj, detection=given.detection,
+        )  # fmt: skip
+        held_out = torch.arange(len(crops)) % EVERY == EVERY - 1
+        folder = runs / "data" / name
+        folder.mkdir(parents=True, exist_ok=True)
+        crops.select(~held_out).save(folder / TRAIN, {"set": name})
+        crops.select(held_out).save(folder / HELD_OUT, {"set": name})
+        print(f"{name}: {len(crops)} crops, {int(crops.seen.sum())} markers", flush=True)
+
+
+def trainings(runs: Path, encoders: Iterable[str], seeds: Iterable[int]) -> list[list[str]]:
+    """Arguments of `imgcal train` of each adaptation."""
+    made = []
+    for encoder in encoders:
+        start = [] if encoder == "ir-cnn" else [f"network.encoder={ENCODERS[encoder]}",
+                                                f'training.init_from="{runs / encoder}"']  # fmt: skip
+        for name in captures.SETS:
+            for seed in seeds:
+                out = adapted(runs, name, encoder, seed)
+                made.append(["ir-cnn", "--from", str(runs / "data" / name), "--out", str(out),
+                             "--set", *start, f"training.seed={seed}"])  # fmt: skip
+    return made
+
+
+def adapted(runs: Path, name: str, encoder: str, seed: int) -> Path:
+    """Folder of an adaptation."""
+    return runs / f"{name}-{encoder}-{seed}"
+
+
+def train(runs: Path, cores: int) -> None:
+    """Train what the encoders begin with, where it is not shipped, and adapt all."""
+    todo = []
+    for encoder in ENCODERS:
+        if encoder != "ir-cnn" and not (runs / encoder / "model.safetensors").is_file():
+            todo.append(["ir-cnn", "--out", str(runs / encoder), "--set", f"network.encoder={ENCODERS[encoder]}"])
+    run_trainings(todo, cores)
+    run_trainings([each for each in trainings(runs, ENCODERS, SEEDS)
+                   if not (Path(each[4]) / "model.safetensors").is_file()], cores)  # fmt: skip
+
+
+def run_trainings(todo: list[list[str]], cores: int) -> None:
+    """Run `imgcal train` with each of the arguments, so many at once."""
+    waiting, running = list(todo), []
+    while waiting or running:
+        while waiting and len(running) < cores:
+            arguments = [sys.executable, "-m", "imgcal", "train", *waiting.pop(0)]
+            running.append(subprocess.Popen(arguments, env={**os.environ, "OMP_NUM_THREADS": "1"}))
+        if running.pop(0).wait():
+            raise SystemExit("a training failed")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One calibration."""
+
+    captures: str
+    kind: str
+    level: float
+    detector: str  # a name, or ENCODER seed K, with or without "shuffled" behind it
+    runs: str
+
+    def proposer(self) -> Detector:
+        """Who looks at the frames."""
+        encoder, _, more = self.detector.partition(" seed ")
+        if encoder not in ENCODERS:
+            return self.detector
+        seed, _, shuffled = more.partition(" ")
+        path = adapted(Path(self.runs), self.captures, encoder, int(seed)) / "model.safetensors"
+        network = load_infrared(path).network
+        if shuffled:
+            broken = Shuffled(network.config).eval()
+            broken.load_state_dict(network.state_dict())
+            network = broken
+        return LearnedProposer(network, shipped_measurer(), MatchedFilter())
+
+
+@cache
+def shipped_measurer() -> Any:
+    """The shipped measurer."""
+    return load_measurer(ROOT / "data" / "models" / "measurer-cnn.safetensors").network
+
+
+def measured(case: Case) -> dict[str, Any]:
+    """Calibrate from the rest of a set, and score."""
+    torch.set_num_threads(1)
+    given = rest(case.captures)
+    frames = given.degraded(case.kind, case.level, 0)
+    row: dict[str, Any] = {**asdict(case), "reason": "", "off_px": None, "labels": 0, "found_by": {}}
+    del row["runs"]
+    try:
+        found = imgcal.calibrate(frames, given.rig, given.obj, detection=given.detection, detector=case.proposer())
+    except RefusedError as error:
+        return {**row, "reason": str(error)}
+    return {**row, "off_px": given.off(found.rig), "labels": int(found.observations.seen.sum()),
+            "found_by": dict(found.detectors)}  # fmt: skip
+
+
+def cases(runs: Path, detectors: Iterable[str]) -> list[Case]:
+    """All cases of some detectors, those that take longest first."""
+    return [
+        Case(name, kind, level, detector, str(runs))
+        for name in ("grid", "dots", "cavity")
+        for kind, made in DEGRADATIONS.items()
+        for level in made.levels
+        for detector in detectors
+    ]
+
+
+def detectors() -> list[str]:
+    """All detectors."""
+    networks = [f"{encoder} seed {seed}" for encoder in ENCODERS for seed in SEEDS]
+    return ["classical", "matched", "auto", "learned", *networks, "ir-cnn seed 0 shuffled"]
+
+
+def measure(runs: Path, cores: int, todo: list[Case]) -> None:
+    """Measure what the JSON has not yet."""
+    known = read_json(JSON)["outcomes"] if JSON.is_file() else []
+    there = {key(row) for row in known}
+    todo = [case for case in todo if key(asdict(case)) not in there]
+    with ProcessPoolExecutor(cores) as pool:
+        for row in pool.map(measured, todo):
+            known.append(row)
+            said = row["reason"][:120] or f"{row['off_px']:.3f} px {row['found_by']}"
+            print(*key(row), said, flush=True)
+            write_json(JSON, surroundings() | {"outcomes": known})
+
+
+def key(row: dict[str, Any]) -> tuple[Any, ...]:
+    """What a result depends on."""
+    return tuple(row[name] for name in ("captures", "kind", "level", "detector"))
+
+
+def tables(rows: list[dict[str, Any]]) -> str:
+    """Calibrated, refused and wrong of each detector; and of what each network labelled itself."""
+    references = captures.references_of(rows)
+    count = len({row["kind"] + str(row["level"]) for row in rows})
+    lines = []
+    for name in detectors():
+        mine = {
+            each: [row for row in rows if (row["detector"], row["captures"]) == (name, each)] for each in captures.SETS
+        }
+        whole = {each: found for each, found in mine.items() if len(found) == count}  # others are under way
+        if not whole:
+            continue
+        cells = [_outcomes(whole.get(each, []), references) for each in captures.SETS]
+        every = [row for found in whole.values() for row in found] if len(whole) == len(captures.SETS) else []
+        own = sum("learned" in row["found_by"] for row in every)
+        network = every and (" seed " in name or name == "learned")
+        lines.append([name, *cells, _outcomes(every, references), str(own) if network else ""])
+    head = ["calibrated / refused / wrong", *captures.SETS.values(), "all", "rigs with labels of the network"]
+    return markdown(head, lines)
+
+
+def _outcomes(rows: list[dict[str, Any]], references: dict[str, float]) -> str:
+    said = [captures.status(row, references) for row in rows]
+    return " / ".join(str(said.count(kind)) for kind in ("calibrated", "refused", "wrong")) if said else ""
+
+
+def main(
+    runs: Path,
+    steps: tuple[str, ...] = ("prepare", "train", "measure", "page"),
+    cores: int = 1,
+    only: tuple[str, ...] = (),
+) -> None:
+    """Adapt, calibrate, write the JSON and the table.
+
+    Args:
+        runs: folder of data sets and trainings.
+        steps: prepare, train, measure, page.
+        cores: processes at once.
+        only: detectors that are measured; none = all.
+    """
+    if "prepare" in steps:
+        prepare(runs)
+    if "train" in steps:
+        train(runs, cores)
+    if "measure" in steps:
+        measure(runs, cores, cases(runs, only or detectors()))
+    if "page" in steps:
+        fill(PAGE, {"own frames": tables(read_json(JSON)["outcomes"])})
+
+
+if __name__ == "__main__":
+    command(lambda: tyro.cli(main, args=sys.argv[1:], description=__doc__))

@@ -1,0 +1,201 @@
+"""Markers that no rendering shows: what networks find before and after they have learnt from some frames.
+
+    python -m scripts.results.unlike_markers --runs out/unlike
+
+Rig O10 and object asymmetric8 with squares, rings, bars, dark discs or bloomed lamps as markers, among round discs that
+are no markers. The rig is known, as after a calibration; `imgcal harvest` labels 3 to 100 frames (ten are a snapshot),
+`imgcal train --from` adapts network and measurer, and other snapshots are measured, in which the believed pose is
+1 degree and 8 mm off. Right and wrong are those of `scripts.results.infrared`.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from numpy.typing import NDArray
+
+import imgcal
+from imgcal.association import Proposer, Sight, Snapshot, match_to_rig
+from imgcal.detection import DetectionOptions, detect_snapshot, to_detections
+from imgcal.errors import RefusedError
+from imgcal.matching import MatchedFilter
+from imgcal.networks import Expectation, load_infrared, load_measurer
+from imgcal.pipeline.learned_proposer import LearnedProposer
+from imgcal.synthesis import PhysicalDrift, simulate_truth
+from imgcal.training import HELD_OUT, HELD_OUT_PATCHES, TRAIN, TRAIN_PATCHES, cut_labelled, split
+from imgcal.types import CameraRig, RigPrior
+from scripts.output import RESULTS, ROOT, command, fill, markdown, read_json, surroundings, write_json
+from scripts.results.infrared import Case, Tally, ask
+
+JSON, PAGE = RESULTS / "unlike_markers.json", ROOT / "docs" / "infrared.md"
+MARKERS = ("squares", "rings", "bars", "dark", "bloomed")
+FRAMES = {3: (0,), 10: (0,), 30: (0, 1, 2), 100: (0,)}  # and the seeds of each
+CLUTTER = 15  # round discs a frame that are no markers
+SNAPSHOTS = 3  # that are measured
+GROUND, LIGHT, NOISE = 25.0, 130.0, 4.0  # grey levels
+MEASURER = "-measurer"  # what the folders of adapted measurers end in
+DRAWN = 24  # px, half of the window that a marker is drawn in
+
+
+def draw(frame: NDArray[np.float64], place: NDArray[np.float64], radius: float, shape: str, angle: float) -> None:
+    """Add the light of one marker, each pixel's the mean of nine places in it."""
+    middle = np.rint(place).astype(int)
+    low, high = np.maximum(middle - DRAWN, 0), np.minimum(middle + DRAWN + 1, frame.shape[::-1])
+    if (low >= high).any():
+        return
+    parts = (np.arange(3) - 1) / 3
+    u = (np.arange(low[0], high[0])[:, None] + parts).ravel() - place[0]
+    v = (np.arange(low[1], high[1])[:, None] + parts).ravel() - place[1]
+    x = (u * np.cos(angle) + v[:, None] * np.sin(angle)) / radius
+    y = (v[:, None] * np.cos(angle) - u * np.sin(angle)) / radius
+    far = np.hypot(x, y)
+    light = {
+        "squares": np.maximum(abs(x), abs(y)) < 0.9,
+        "rings": abs(far - 1.6) < 0.35,
+        "bars": (abs(x) < 2.4) & (abs(y) < 0.4),
+        "bloomed": 3 / (1 + far**4) + 0.25 * np.exp(-abs(y) / 0.4 - abs(x) / 4) + 0.25 / (1 + far**2),
+    }.get(shape, far < 1).astype(np.float64)
+    drawn = light.reshape(high[1] - low[1], 3, high[0] - low[0], 3).mean((1, 3))
+    frame[low[1] : high[1], low[0] : high[0]] += drawn
+
+
+def snapshots(rig: CameraRig, shape: str, count: int, seed: int) -> Iterator[tuple[CameraRig, Case]]:
+    """Make snapshots of rigs that have drifted: the rig as it is, and the case."""
+    obj, generator = imgcal.load_object("asymmetric8"), torch.Generator().manual_seed(seed)
+    truth = simulate_truth(rig, obj, count, generator, PhysicalDrift())
+    random, options = np.random.default_rng(seed), DetectionOptions(polarity="dark" if shape == "dark" else "bright")
+    for number in range(count):
+        pose = truth.rig_from_object[number][None]
+        expected = Expectation.of(truth.rig, obj, pose)
+        frames = {}
+        for camera, name in enumerate(rig.camera_names):
+            width, height = rig.image_size[camera].tolist()
+            light = np.zeros((height, width))
+            usual = float(expected.radius[0, camera].median())
+            for _ in range(CLUTTER):
+                draw(light, random.uniform((0, 0), (width, height)), usual * random.uniform(0.7, 1.3), "discs", 0.0)
+            for fiducial in np.flatnonzero(expected.visible[0, camera].numpy()):
+                place, size = expected.uv[0, camera, fiducial].numpy(), float(expected.radius[0, camera, fiducial])
+                draw(light, place, size, shape, random.uniform(0, np.pi))
+            shown = 190 - 130 * light if shape == "dark" else GROUND + LIGHT * light
+            frames[name] = np.clip(np.rint(shown + NOISE * random.standard_normal(light.shape)), 0, 255).astype(
+                np.uint8
+            )
+        found = to_detections([detect_snapshot(frames, options)], rig.camera_names, ("0",))
+        blobs = match_to_rig(found, rig)
+        snapshot = Snapshot(frames, blobs, rig, obj, (rig.prior or RigPrior()).std(rig), (), options)
+        yield (
+            truth.rig,
+            Case(snapshot, expected.uv[0].numpy(), expected.visible[0].numpy(), truth.rig_from_object[number]),
+        )
+
+
+def prepare(runs: Path, markers: Sequence[str] = MARKERS) -> None:
+    """Harvest from so many frames of each kind of marker, the rig being known."""
+    rig, obj = imgcal.load_rig("O10"), imgcal.load_object("asymmetric8")
+    for shape in markers:
+        for count in FRAMES:
+            some = rig.select(range(min(count, 10)))
+            made = list(snapshots(some, shape, max(count // 10, 1), 1000 + count))
+            known, options = made[0][0], made[0][1].snapshot.detection
+            frames = [case.snapshot.frames for _, case in made]
+            series = {name: [each[name] for each in frames] for name in some.camera_names}
+            sight = Sight(MatchedFilter(), frames.__getitem__, True, options)
+            try:
+                parts = cut_labelled(frames.__getitem__, imgcal.detect(series, options), known, obj,
+                                     detection=options, sight=sight)  # fmt: skip
+                splits, patches = (split(part, len(frames), some.num_cameras) for part in parts)
+            except RefusedError as error:
+                print(f"{shape}, {count} frames: {error}", flush=True)
+                continue
+            folder = runs / "data" / f"{shape}-{count}"
+            folder.mkdir(parents=True, exist_ok=True)
+            for name, part in zip((TRAIN, HELD_OUT, TRAIN_PATCHES, HELD_OUT_PATCHES), (*splits, *patches), strict=True):
+                part.save(folder / name, {"markers": shape})
+            print(f"{shape}, {count} frames: {len(splits[0])} and {len(splits[1])} crops", flush=True)
+
+
+def trainings(runs: Path, markers: Sequence[str] = MARKERS) -> list[list[str]]:
+    """Arguments of `imgcal train` of each adaptation."""
+    return [
+        [name, "--from", f"{runs}/data/{shape}-{count}", "--out", f"{runs}/{shape}-{count}-{seed}{suffix}",
+         "--set", f"training.seed={seed}"]
+        for count, seeds in reversed(FRAMES.items()) for shape in markers for seed in seeds
+        for name, suffix in (("ir-cnn", ""), ("measurer-cnn", MEASURER))
+        if (runs / "data" / f"{shape}-{count}").is_dir()
+    ]  # fmt: skip
+
+
+def measured(shape: str, runs: Path) -> dict[str, Any]:
+    """Ask the filter, the shipped network and the adapted ones about the same snapshots."""
+    torch.set_num_threads(1)
+    models = ROOT / "data" / "models"
+    file = "model.safetensors"
+    methods: dict[str, Proposer] = {"matched filter": MatchedFilter()}
+    pairs = {"ir-cnn": (models / "ir-cnn.safetensors", models / "measurer-cnn.safetensors")} | {
+        f"{count} frames, seed {seed}": (
+            runs / f"{shape}-{count}-{seed}" / file, runs / f"{shape}-{count}-{seed}{MEASURER}" / file,
+        )
+        for count, seeds in FRAMES.items() for seed in seeds
+    }  # fmt: skip
+    for name, (network, measurer) in pairs.items():
+        if network.is_file() and measurer.is_file():
+            methods[name] = LearnedProposer(load_infrared(network).network, load_measurer(measurer).network)
+    tallies = {name: Tally() for name in methods}
+    for number, (_, case) in enumerate(snapshots(imgcal.load_rig("O10"), shape, SNAPSHOTS, 77)):
+        for name, method in methods.items():
+            ask(lambda snapshot, method=method: method.propose(snapshot).detections, case, 1.0, number, tallies[name])
+    return {name: tally.result() for name, tally in tallies.items()}
+
+
+def tables(found: dict[str, Any]) -> str:
+    """Right and wrong of each method, by marker; of several seeds the mean."""
+    measured_names = {name.partition(", seed")[0] for methods in found.values() for name in methods}
+    columns = [
+        name for name in ("matched filter", "ir-cnn", *(f"{n} frames" for n in FRAMES)) if name in measured_names
+    ]
+    lines = []
+    for shape, methods in found.items():
+        line = [shape]
+        for column in columns:
+            said = [each for name, each in methods.items() if name == column or name.startswith(f"{column}, seed")]
+            right, wrong = (np.mean([each[f"{kind}_percent"] for each in said]) if said else np.nan
+                            for kind in ("right", "wrong"))  # fmt: skip
+            line.append(f"{right:.1f} / {wrong:.1f}" if said else "")
+        lines.append(line)
+    return markdown(["right % of visible / wrong % of claimed", *columns], lines)
+
+
+def main(runs: Path, steps: tuple[str, ...] = ("prepare", "train", "measure", "page"), cores: int = 1) -> None:
+    """Harvest, adapt, measure, write the JSON and the table.
+
+    Args:
+        runs: folder of data sets and trainings.
+        steps: prepare, train, measure, page.
+        cores: processes at once.
+    """
+    if "prepare" in steps:
+        prepare(runs)
+    if "train" in steps:
+        for arguments in trainings(runs):
+            if not (Path(arguments[4]) / "model.safetensors").is_file():
+                subprocess.run([sys.executable, "-m", "imgcal", "train", *arguments], check=True, env={**os.environ})
+    if "measure" in steps:
+        with ProcessPoolExecutor(cores) as pool:
+            found = dict(zip(MARKERS, pool.map(measured, MARKERS, [runs] * len(MARKERS)), strict=True))
+        write_json(JSON, surroundings() | {"snapshots": SNAPSHOTS, "markers": found})
+    if "page" in steps:
+        fill(PAGE, {"unlike markers": tables(read_json(JSON)["markers"])})
+
+
+if __name__ == "__main__":
+    command(lambda: tyro.cli(main, args=sys.argv[1:], description=__doc__))
