@@ -120,7 +120,7 @@ def train(runs: Path, cores: int) -> None:
 
 def run_trainings(todo: list[list[str]], cores: int) -> None:
     """Run `imgcal train` with each of the arguments, so many at once."""
-    waiting, running = list(todo), []
+    waiting, running = list(todo), list[subprocess.Popen[bytes]]()
     while waiting or running:
         while waiting and len(running) < cores:
             arguments = [sys.executable, "-m", "imgcal", "train", *waiting.pop(0)]

@@ -15,6 +15,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from imgcal.networks import Expectation, load_infrared, load_measurer
 from imgcal.pipeline.learned_proposer import LearnedProposer
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.training import HELD_OUT, HELD_OUT_PATCHES, TRAIN, TRAIN_PATCHES, cut_labelled, split
-from imgcal.types import CameraRig, RigPrior
+from imgcal.types import CameraRig, Detections, RigPrior
 from scripts.output import RESULTS, ROOT, command, fill, markdown, read_json, surroundings, write_json
 from scripts.results.infrared import Case, Tally, ask
 
@@ -111,9 +112,12 @@ def prepare(runs: Path, markers: Sequence[str] = MARKERS) -> None:
             series = {name: [each[name] for each in frames] for name in some.camera_names}
             sight = Sight(MatchedFilter(), frames.__getitem__, True, options)
             try:
-                parts = cut_labelled(frames.__getitem__, imgcal.detect(series, options), known, obj,
-                                     detection=options, sight=sight)  # fmt: skip
-                splits, patches = (split(part, len(frames), some.num_cameras) for part in parts)
+                crops, cut = cut_labelled(frames.__getitem__, imgcal.detect(series, options), known, obj,
+                                          detection=options, sight=sight)  # fmt: skip
+                splits, patches = (
+                    split(crops, len(frames), some.num_cameras),
+                    split(cut, len(frames), some.num_cameras),
+                )
             except RefusedError as error:
                 print(f"{shape}, {count} frames: {error}", flush=True)
                 continue
@@ -153,8 +157,12 @@ def measured(shape: str, runs: Path) -> dict[str, Any]:
     tallies = {name: Tally() for name in methods}
     for number, (_, case) in enumerate(snapshots(imgcal.load_rig("O10"), shape, SNAPSHOTS, 77)):
         for name, method in methods.items():
-            ask(lambda snapshot, method=method: method.propose(snapshot).detections, case, 1.0, number, tallies[name])
+            ask(partial(_detections, method), case, 1.0, number, tallies[name])
     return {name: tally.result() for name, tally in tallies.items()}
+
+
+def _detections(method: Proposer, snapshot: Snapshot) -> Detections:
+    return method.propose(snapshot).detections
 
 
 def tables(found: dict[str, Any]) -> str:
