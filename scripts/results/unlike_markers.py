@@ -32,7 +32,16 @@ from imgcal.matching import MatchedFilter
 from imgcal.networks import Expectation, load_infrared, load_measurer
 from imgcal.pipeline.learned_proposer import LearnedProposer
 from imgcal.synthesis import PhysicalDrift, simulate_truth
-from imgcal.training import HELD_OUT, HELD_OUT_PATCHES, TRAIN, TRAIN_PATCHES, cut_labelled, split
+from imgcal.training import (
+    HELD_OUT,
+    HELD_OUT_PATCHES,
+    TRAIN,
+    TRAIN_PATCHES,
+    FrameDataset,
+    PatchDataset,
+    cut_labelled,
+    split,
+)
 from imgcal.types import CameraRig, Detections, RigPrior
 from scripts.output import RESULTS, ROOT, command, fill, markdown, read_json, surroundings, write_json
 from scripts.results.infrared import Case, Tally, ask
@@ -114,16 +123,14 @@ def prepare(runs: Path, markers: Sequence[str] = MARKERS) -> None:
             try:
                 crops, cut = cut_labelled(frames.__getitem__, imgcal.detect(series, options), known, obj,
                                           detection=options, sight=sight)  # fmt: skip
-                splits, patches = (
-                    split(crops, len(frames), some.num_cameras),
-                    split(cut, len(frames), some.num_cameras),
-                )
+                splits = split(crops, len(frames), some.num_cameras)
+                parts: list[FrameDataset | PatchDataset] = [*splits, *split(cut, len(frames), some.num_cameras)]
             except RefusedError as error:
                 print(f"{shape}, {count} frames: {error}", flush=True)
                 continue
             folder = runs / "data" / f"{shape}-{count}"
             folder.mkdir(parents=True, exist_ok=True)
-            for name, part in zip((TRAIN, HELD_OUT, TRAIN_PATCHES, HELD_OUT_PATCHES), (*splits, *patches), strict=True):
+            for name, part in zip((TRAIN, HELD_OUT, TRAIN_PATCHES, HELD_OUT_PATCHES), parts, strict=True):
                 part.save(folder / name, {"markers": shape})
             print(f"{shape}, {count} frames: {len(splits[0])} and {len(splits[1])} crops", flush=True)
 
