@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.types.calibration_object import CalibrationObject
 from imgcal.types.rig import CameraRig
 
@@ -85,7 +85,7 @@ def formats() -> Path:
 @pytest.fixture(scope="session")
 def o10() -> CameraRig:
     """The reference rig of ten cameras, float64."""
-    return load_rig("O10")
+    return read_rig("O10")
 
 
 @pytest.fixture(scope="session")

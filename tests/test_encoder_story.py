@@ -9,7 +9,7 @@ import pytest
 
 from imgcal.cli.main import main
 from imgcal.errors import InputError
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.pipeline import load_initializer
 
 PAGE = (Path(__file__).parents[1] / "docs" / "train.md").read_text("utf-8")
@@ -48,7 +48,7 @@ def _others_that_load_it(capsys):
         Path("again").mkdir(exist_ok=True)
         Path("again/model.safetensors").write_bytes(Path("out/mine/model.safetensors").read_bytes())
         assert main(["compare", "out/mine", "again", *few, *trust]) == code
-    rig, obj = load_rig("T4"), load_object("asymmetric8")
+    rig, obj = read_rig("T4"), load_object("asymmetric8")
     with pytest.raises(InputError, match="found the encoder mine:Encoder, whose code would run"):
         load_initializer("out/mine", rig, obj)
     assert load_initializer("out/mine", rig, obj, trusted=("mine:Encoder",)).name == "mine"

@@ -24,7 +24,7 @@ from imgcal.formats import (
     select_cameras,
     write_into,
 )
-from imgcal.io import load_rig, load_rig_covariance, publishing, write_bytes
+from imgcal.io import load_rig_covariance, publishing, read_rig, write_bytes
 from imgcal.messages import list_names, shorten
 
 
@@ -113,7 +113,7 @@ class Convert(arguments.Convert):
         if ours:
             if self.unit is not None or self.distance is not None:
                 raise InputError(f"{where}: an imgcal rig file is in mm, expected neither --unit nor --distance")
-            rig = from_camera_rig(load_rig(first), load_rig_covariance(first))
+            rig = from_camera_rig(read_rig(first), load_rig_covariance(first))
             title = "imgcal rig"
         else:
             found = read_foreign_rig(self.source, self.source_format, self.source_rig)

@@ -10,7 +10,7 @@ from imgcal.errors import InputError
 from imgcal.io import open_capture, save_cameras, save_rig
 from imgcal.messages import list_names
 from imgcal.synthesis import arrange_rig
-from imgcal.types import Volume
+from imgcal.types import ConvexVolume
 
 
 class Rig(arguments.Rig):
@@ -26,7 +26,7 @@ class Rig(arguments.Rig):
 
 
 def _look_at(given: arguments.LookAt) -> None:
-    volume = None if given.volume is None else Volume.box(given.volume[:3], given.volume[3:])
+    volume = None if given.volume is None else ConvexVolume.box(given.volume[:3], given.volume[3:])
     rig = arrange_rig(
         given.shape,
         given.cameras,

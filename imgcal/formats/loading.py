@@ -52,7 +52,7 @@ def load_rig(
     path = Path(path)
     stated = unit is not None or image_size is not None or format is not None
     if not stated and not (path.exists() and is_foreign(path)):
-        return io.load_rig(path)
+        return io.read_rig(path)
     if path.exists() and not is_foreign(path):
         raise InputError(f"{path}: a rig file of our own says its unit, image sizes and format itself")
     return _convert_lenses(in_millimetres(read_foreign_rig(path, format), str(path), unit), path, image_size, fit_limit)

@@ -22,7 +22,7 @@ from .names import (
 from .object_csv import load_object, load_objects, object_from_text, object_text, save_object
 from .own_folder import holding
 from .posterior_file import read_posterior, write_posterior
-from .rig_yaml import RigCovariance, load_rig, load_rig_covariance, rig_from_text, rig_text, save_rig
+from .rig_yaml import RigCovariance, load_rig_covariance, read_rig, rig_from_text, rig_text, save_rig
 from .safetensors_file import read_tensors, read_texts, write_tensors
 from .validation import StrictModel, StrictRecord, validate
 from .yaml_file import (
@@ -66,7 +66,6 @@ __all__ = [
     "load_detections",
     "load_object",
     "load_objects",
-    "load_rig",
     "load_rig_covariance",
     "looks_like",
     "model_file",
@@ -85,6 +84,7 @@ __all__ = [
     "read_json",
     "read_metrics",
     "read_posterior",
+    "read_rig",
     "read_tensors",
     "read_texts",
     "read_yaml",

@@ -16,7 +16,7 @@ from imgcal.io.atomic import write_text
 from imgcal.io.names import title_from_name
 from imgcal.io.rig_schema import FORMAT as RIG_FORMAT
 from imgcal.io.rig_schema import CameraImages, Coefficient, Focal, Name, Pixel, check_names
-from imgcal.io.rig_yaml import load_rig
+from imgcal.io.rig_yaml import read_rig
 from imgcal.io.validation import StrictModel, validate
 from imgcal.io.yaml_file import Flow, read_yaml, yaml_text
 from imgcal.types import CameraRig, RigPrior, limits
@@ -86,7 +86,7 @@ def load_cameras(path: str | Path) -> CameraRig:
     """
     path = Path(path)
     if not path.is_file() or _starts_with(path, RIG_FORMAT):
-        return drop_poses(load_rig(path))
+        return drop_poses(read_rig(path))
     content = read_yaml(path, _CamerasFile, FORMAT, ENTRY_NAMES)
     cameras = content.cameras
     sizes = torch.tensor([camera.image_size for camera in cameras])
@@ -112,8 +112,8 @@ def drop_poses(rig: CameraRig, focal_spread: float = FOCAL_SPREAD) -> CameraRig:
         focal_spread: relative, one standard deviation of the focal lengths.
 
     Examples:
-        >>> from imgcal.io import load_rig
-        >>> cameras = drop_poses(load_rig("T4"))
+        >>> from imgcal.io import read_rig
+        >>> cameras = drop_poses(read_rig("T4"))
         >>> float(cameras.positions.abs().max()), cameras.prior.focal_length
         (0.0, 0.15)
     """

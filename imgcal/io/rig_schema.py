@@ -15,7 +15,7 @@ from imgcal.geometry import LENS_MODELS, LensModel
 from imgcal.io.names import LONGEST_NAME, is_file_name
 from imgcal.io.validation import StrictModel
 from imgcal.messages import list_names, quote
-from imgcal.types import DriftRate, RigPrior, Volume, limits, parameter_names
+from imgcal.types import ConvexVolume, DriftRate, RigPrior, limits, parameter_names
 
 FORMAT = "imgcal-rig/1"
 ENTRY_NAMES = {"cameras": "camera"}
@@ -164,12 +164,12 @@ class _Volume(StrictModel):
             raise ValueError(str(error).removeprefix("volume: ")) from error
         return self
 
-    def value(self) -> Volume:
+    def value(self) -> ConvexVolume:
         if self.points is not None:
-            return Volume(tuple((x, y, z) for x, y, z in self.points))
+            return ConvexVolume(tuple((x, y, z) for x, y, z in self.points))
         assert self.low is not None and self.high is not None
         (x, y, z), (u, v, w) = self.low, self.high
-        return Volume.box((x, y, z), (u, v, w))
+        return ConvexVolume.box((x, y, z), (u, v, w))
 
 
 class _Covariance(StrictModel):

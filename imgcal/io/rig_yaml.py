@@ -25,7 +25,7 @@ from imgcal.io.posterior_file import read_posterior, write_posterior
 from imgcal.io.rig_schema import ENTRY_NAMES, FORMAT, CameraEntry, RigFile, Std, collect_std
 from imgcal.io.validation import validate
 from imgcal.io.yaml_file import Flow, FlowMap, read_yaml, record_from_yaml, yaml_text
-from imgcal.types import CameraRig, DriftRate, RigPosterior, RigPrior, Volume, parameter_names
+from imgcal.types import CameraRig, ConvexVolume, DriftRate, RigPosterior, RigPrior, parameter_names
 
 POSTERIOR = ".posterior.safetensors"
 """Behind the stem of a rig's file: where all that its calibration knows is kept."""
@@ -46,7 +46,7 @@ class RigCovariance:
         return cls(std, matrix, reference_camera)
 
 
-def load_rig(path: str | Path) -> CameraRig:
+def read_rig(path: str | Path) -> CameraRig:
     """Read a rig.
 
     Args:
@@ -76,14 +76,14 @@ def rig_from_text(text: str, where: str) -> CameraRig:
     """Read a rig from the text of its file, the result of `rig_text`; errors and its name begin with `where`.
 
     Raises:
-        InputError: as `load_rig`.
+        InputError: as `read_rig`.
     """
     content = record_from_yaml(text.encode(errors="replace"), where, RigFile, FORMAT, ENTRY_NAMES)
     return _parse_rig(content, where)
 
 
 def load_rig_covariance(path: str | Path) -> RigCovariance | None:
-    """Read the uncertainty in a rig file; None if it has none. Arguments and errors as for `load_rig`."""
+    """Read the uncertainty in a rig file; None if it has none. Arguments and errors as for `read_rig`."""
     content, _ = _read(path)
     if content.covariance is None:
         return None
@@ -108,7 +108,7 @@ def save_rig(
         path: the file to write.
         covariance: one standard deviation of every parameter goes to its camera, to 6 digits; None = not written.
         full: write the whole covariance matrix, too (half a megabyte for 10 cameras).
-        posterior: written to a file beside it, from which `load_rig` attaches it to the rig; None = not written.
+        posterior: written to a file beside it, from which `read_rig` attaches it to the rig; None = not written.
 
     Raises:
         InputError: the file cannot be written, or the rig could not be read again (NaN, for example).
@@ -216,7 +216,7 @@ def _camera_entry(rig: CameraRig, camera: int, covariance: RigCovariance | None)
     return entry
 
 
-def _volume_entry(volume: Volume) -> dict[str, Any]:
+def _volume_entry(volume: ConvexVolume) -> dict[str, Any]:
     if volume.is_box:
         return FlowMap(low=Flow(volume.low), high=Flow(volume.high))
     return {"points": [Flow(point) for point in volume.points]}

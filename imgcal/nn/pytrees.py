@@ -15,7 +15,16 @@ from torch import Tensor
 from torch.utils import _pytree as pytree  # PyTorch has no public name for it
 
 from imgcal.geometry import Projection, RigidTransform
-from imgcal.types import CalibrationObject, CameraRig, DriftRate, Observations, Prediction, RigPrior, Views, Volume
+from imgcal.types import (
+    CalibrationObject,
+    CameraRig,
+    ConvexVolume,
+    DriftRate,
+    Observations,
+    Prediction,
+    RigPrior,
+    Views,
+)
 
 Value = TypeVar("Value")
 
@@ -86,7 +95,7 @@ _LOAD: dict[str, Callable[[Any], Any]] = {
     "Constant": lambda value: Constant(torch.tensor(value["values"], device=value["device"])),
     "RigPrior": lambda value: RigPrior(**value),
     "DriftRate": lambda value: DriftRate(**value),
-    "Volume": lambda value: Volume(tuple(map(tuple, value["points"]))),
+    "ConvexVolume": lambda value: ConvexVolume(tuple(map(tuple, value["points"]))),
     "tuple": tuple,
 }
 
@@ -95,7 +104,7 @@ def _dump(value: Any) -> Any:
     """Convert a constant to a JSON value."""
     if isinstance(value, Constant):
         return ["Constant", {"values": value.tensor.tolist(), "device": str(value.tensor.device)}]
-    if isinstance(value, RigPrior | DriftRate | Volume):
+    if isinstance(value, RigPrior | DriftRate | ConvexVolume):
         return [type(value).__name__, asdict(value)]
     return ["tuple", list(value)] if isinstance(value, tuple) else ["", value]
 
@@ -119,7 +128,7 @@ torch.serialization.add_safe_globals(
         CalibrationObject,
         RigPrior,
         DriftRate,
-        Volume,
+        ConvexVolume,
     ]
 )
 register(

@@ -13,7 +13,7 @@ from imgcal.association import align_camera, associate_lights
 from imgcal.detection import detect
 from imgcal.errors import RefusedError
 from imgcal.geometry import lens_width
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.monitoring import RecentSnapshots, RigFilter
 from imgcal.online.keeper import RigKeeper
 from imgcal.pipeline import calibrate, score
@@ -48,7 +48,7 @@ def warm_up(all_lenses: bool = False) -> None:
     Args:
         all_lenses: also compile what rigs need with a camera of any lens but the usual one.
     """
-    usual = load_rig(RIG).resized(torch.tensor(SIZE))
+    usual = read_rig(RIG).resized(torch.tensor(SIZE))
     for rig in (usual, replace_lenses(usual)) if all_lenses else (usual,):
         _warm_up(rig)
 
@@ -82,7 +82,7 @@ def _warm_up(rig: CameraRig) -> None:
 
 def warm_up_fits() -> None:
     """Compile the last steps of a calibration: its fits, and the networks' inputs before them."""
-    rig, obj = load_rig(RIG).resized(torch.tensor(SIZE)), load_object(OBJECT)
+    rig, obj = read_rig(RIG).resized(torch.tensor(SIZE)), load_object(OBJECT)
     truth = simulate_truth(rig, obj, SNAPSHOTS, _make_generator(), DRIFT, POSES)
     with _ignore_refusals():
         calibrate(true_detections(truth), rig, obj)

@@ -42,7 +42,7 @@ from imgcal.pipeline.recalibration import (
 from imgcal.pipeline.repeats import drop_repeats, name_repeats
 from imgcal.pipeline.sources import Frames, find_blobs
 from imgcal.pipeline.units import require_solvable, require_units
-from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior, Volume
+from imgcal.types import CalibrationObject, CameraRig, ConvexVolume, Detections, RigPrior
 
 ALONE = RigPrior(focal_length=0.05, principal_point=10.0, distortion=0.02, rotation=0.01, position=10.0)
 """How far a camera may be off while its images are labelled one by one, as far as this distorts the object's shape."""
@@ -160,7 +160,7 @@ def _marker_alone(detections: Detections, obj: CalibrationObject) -> tuple[Detec
 def _for_what_comes_after(fit: Calibration, cameras: CameraRig, seconds: dict[str, float]) -> Calibration:
     """Give the rig a name, a volume and the default prior: the earlier prior does not apply to later calibrations."""
     volume = fit.predicted_error.volume
-    box = Volume.box(_corner(volume.low), _corner(volume.high))
+    box = ConvexVolume.box(_corner(volume.low), _corner(volume.high))
     rig = replace(fit.rig, name=cameras.name, prior=None, volume=box)
     return replace(fit, estimate=replace(fit.estimate, rig=rig), seconds=seconds, from_scratch=True)
 

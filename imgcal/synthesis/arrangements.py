@@ -10,7 +10,7 @@ from torch import Tensor
 from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform
 from imgcal.synthesis.lens import Lens, Shape
-from imgcal.types import CameraRig, RigPrior, Volume, limits
+from imgcal.types import CameraRig, ConvexVolume, RigPrior, limits
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 USED = 0.5
@@ -80,7 +80,7 @@ def arrange_rig(
     height: float = 0.0,
     target: tuple[float, float, float] = (0.0, 0.0, 0.0),
     lens: Lens = Lens(),
-    volume: Volume | None = None,
+    volume: ConvexVolume | None = None,
     prior: RigPrior | None = None,
     name: str | None = None,
 ) -> CameraRig:
@@ -115,7 +115,7 @@ def arrange_rig(
     if volume is None:
         reach = USED / 2 * float((positions - middle).norm(dim=-1).min())
         (x, y, z), floor = target, 0.0 if target[2] > 0 else -math.inf
-        volume = Volume.box((x - reach, y - reach, max(z - reach, floor)), (x + reach, y + reach, z + reach))
+        volume = ConvexVolume.box((x - reach, y - reach, max(z - reach, floor)), (x + reach, y + reach, z + reach))
     digits = len(str(cameras))
     return CameraRig(
         focal_length=torch.full((cameras, 2), lens.focal_length, dtype=torch.float64),

@@ -18,7 +18,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.synthesis.captures import Motion, Truth
 from imgcal.synthesis.hand_held import HandHeld
 from imgcal.synthesis.rigs import Drift
-from imgcal.types import CalibrationObject, CameraRig, Volume
+from imgcal.types import CalibrationObject, CameraRig, ConvexVolume
 from renderers import palette
 
 Floats = NDArray[np.float64]
@@ -40,7 +40,7 @@ OUTER = 0.05
 
 
 def sample_path(
-    hand: HandHeld, volume: Volume, count: int, generator: torch.Generator
+    hand: HandHeld, volume: ConvexVolume, count: int, generator: torch.Generator
 ) -> tuple[RigidTransform, Motion]:
     """Draw a path through a volume and sample it.
 
@@ -71,7 +71,7 @@ def simulate_volume(
     generator: torch.Generator,
     drift: Drift | None,
     *,
-    volume: Volume | None = None,
+    volume: ConvexVolume | None = None,
     hand: HandHeld | None = None,
 ) -> Truth:
     """Disturb the rig once, then carry the object through a volume: a wand in a room, seen by some cameras at a time.
@@ -135,11 +135,11 @@ def place_markers(rig: CameraRig, count: int, generator: torch.Generator) -> Cal
     return CalibrationObject((unit - 0.5) * side, palette(count).double(), name="body")
 
 
-def sample_volume(volume: Volume, count: int, generator: torch.Generator) -> Tensor:
+def sample_volume(volume: ConvexVolume, count: int, generator: torch.Generator) -> Tensor:
     """Draw places evenly over a volume: (count, 3) mm, float64.
 
     Examples:
-        >>> box = Volume.box((0, 0, 0), (10, 10, 10))
+        >>> box = ConvexVolume.box((0, 0, 0), (10, 10, 10))
         >>> sample_volume(box, 5, torch.Generator().manual_seed(0)).shape
         torch.Size([5, 3])
     """
@@ -158,7 +158,7 @@ def sample_volume(volume: Volume, count: int, generator: torch.Generator) -> Ten
     return found[:count]
 
 
-def find_seen_volume(rig: CameraRig) -> Volume:
+def find_seen_volume(rig: CameraRig) -> ConvexVolume:
     """Find a volume for a rig whose file gives none: a box about what most of its cameras see together.
 
     Raises:
@@ -187,7 +187,7 @@ def find_seen_volume(rig: CameraRig) -> Volume:
         raise InputError(f"rig {rig.name}: found no two cameras that see the same, expected the key `volume`, in mm")
     together = places[seen >= max(2, (most + 1) // 2)]
     low, high = torch.quantile(together, torch.tensor([OUTER, 1 - OUTER], dtype=torch.float64), dim=0).tolist()
-    return Volume.box(tuple(low), tuple(high))
+    return ConvexVolume.box(tuple(low), tuple(high))
 
 
 def _about(centroid: Tensor, poses: RigidTransform) -> RigidTransform:

@@ -19,7 +19,7 @@ from .rig import (
     RigPrior,
     parameter_names,
 )
-from .volume import Volume
+from .volume import ConvexVolume
 
 __all__ = [
     "BLOB_RADIUS",
@@ -40,6 +40,7 @@ __all__ = [
     "BoardKind",
     "CalibrationObject",
     "CameraRig",
+    "ConvexVolume",
     "CropPlacement",
     "Detections",
     "DriftRate",
@@ -53,7 +54,6 @@ __all__ = [
     "RigPrior",
     "Symmetry",
     "Views",
-    "Volume",
     "check_object",
     "check_observations",
     "check_rig",

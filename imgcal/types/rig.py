@@ -26,7 +26,7 @@ from imgcal.geometry import (
     rotation_from_vector,
     vector_from_rotation,
 )
-from imgcal.types.volume import Volume
+from imgcal.types.volume import ConvexVolume
 from renderers import is_traced
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ class CameraRig:
     working_distance: float | None = None  # mm, from the rig's origin to the object
     prior: RigPrior | None = None
     drift_rate: DriftRate | None = None  # None = the defaults
-    volume: Volume | None = None  # where it is used, in the rig frame
+    volume: ConvexVolume | None = None  # where it is used, in the rig frame
     lens_model: ModelNames = "brown_conrady"  # a name of `geometry.LENS_MODELS` for all cameras, or one for each
     posterior: Callable[[], RigPosterior] | None = field(default=None, metadata={"saved": False})
     """How well a calibration knows these values, if one made them."""

@@ -1,4 +1,4 @@
-"""`Volume`: where a rig is used."""
+"""`ConvexVolume`: where a rig is used."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ FLAT = 1e-6
 
 
 @dataclass(frozen=True)
-class Volume:
+class ConvexVolume:
     """Where objects are used: the smallest convex body that holds some points of the rig frame, a box for example.
 
     Examples:
-        >>> room = Volume.box((-1000, -1000, 0), (1000, 1000, 2000))
+        >>> room = ConvexVolume.box((-1000, -1000, 0), (1000, 1000, 2000))
         >>> len(room.points), room.low, room.high
         (8, (-1000.0, -1000.0, 0.0), (1000.0, 1000.0, 2000.0))
         >>> room.contains(np.array([[0.0, 0.0, 500.0], [0.0, 0.0, 2500.0]]))
@@ -45,7 +45,7 @@ class Volume:
             raise InputError("volume: found points that all lie in one plane, expected ones that enclose a volume")
 
     @classmethod
-    def box(cls, low: Corner, high: Corner) -> Volume:
+    def box(cls, low: Corner, high: Corner) -> ConvexVolume:
         """Enclose a box between two opposite corners, mm."""
         if any(not a < b for a, b in zip(low, high, strict=True)):
             raise InputError(f"volume: found low {list(low)} and high {list(high)}, expected each low below its high")
@@ -67,7 +67,7 @@ class Volume:
     @property
     def is_box(self) -> bool:
         """Tell whether the volume is the box between `low` and `high`."""
-        return len(self.points) == 8 and set(self.points) == set(Volume.box(self.low, self.high).points)
+        return len(self.points) == 8 and set(self.points) == set(ConvexVolume.box(self.low, self.high).points)
 
     def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which points (M, 3) mm are inside, a hair's breadth of rounding included: (M,)."""

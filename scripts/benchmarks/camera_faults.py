@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.synthesis import PhysicalDrift, Truth, simulate_truth, simulate_volume, true_detections
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 
@@ -22,13 +22,13 @@ Change = Callable[[CameraRig], CameraRig]
 
 def wand_in_a_room(snapshots: int, seed: int = 0) -> Scene:
     """Carry a wand through a room with ten cameras."""
-    rig, wand = load_rig("room10"), load_object("wand4")
+    rig, wand = read_rig("room10"), load_object("wand4")
     return rig, wand, simulate_volume(rig, wand, snapshots, torch.Generator().manual_seed(seed), PhysicalDrift())
 
 
 def object_before_a_ring(snapshots: int, seed: int = 0, rig: str = "O10") -> Scene:
     """Turn an object in front of one of the reference rigs."""
-    factory, obj = load_rig(rig), load_object("asymmetric8")
+    factory, obj = read_rig(rig), load_object("asymmetric8")
     return factory, obj, simulate_truth(factory, obj, snapshots, torch.Generator().manual_seed(seed), PhysicalDrift())
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from imgcal.estimation import estimate
 from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_rotation
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.online import RigKeeper
 from imgcal.synthesis import FrameModel, PhysicalDrift, Truth, simulate_frames, simulate_truth
 from imgcal.types import CalibrationObject, CameraRig, Observations
@@ -115,7 +115,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
 
 def make_stream(snapshots: int) -> Stream:
     """Render ten frames of 2048 x 1088 a snapshot: markers of 6 mm, reflections, false blobs, noise, 8 bit."""
-    rig, obj, generator = load_rig("O10"), load_object("asymmetric8"), torch.Generator().manual_seed(2)
+    rig, obj, generator = read_rig("O10"), load_object("asymmetric8"), torch.Generator().manual_seed(2)
     start = simulate_truth(rig, obj, 1 + JUDGED, generator, PhysicalDrift())
     pose, times = start.rig_from_object[0], torch.arange(snapshots, dtype=torch.float64)[:, None]
     turn = rotation_from_vector(times * torch.tensor([0.004, 0.006, -0.003], dtype=torch.float64))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from imgcal.association import Associations, PipelineOptions, SnapshotIdentity, relocalize, track
 from imgcal.detection import DetectionOptions, detect_snapshot
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.online import RigKeeper
 from imgcal.pipeline import calibrate, fit_labelled
 from imgcal.synthesis import FrameModel, PhysicalDrift, Truth, simulate_frames, simulate_truth, true_detections
@@ -63,7 +63,7 @@ class Scene:
 def measure(effort: Effort) -> dict[str, Any]:
     """Measure all five; every point takes about the same time."""
     seconds = effort.pick(1.0, 0.02)
-    o10, few = load_rig("O10"), load_object("asymmetric8")
+    o10, few = read_rig("O10"), load_object("asymmetric8")
     cameras = effort.pick((2, 4, 8, 16, 32, 64, 128, 256, 512, 1024), (2, 4))
     fiducials = effort.pick((8, 16, 32, 64, 128, 256, 437), (8, 12))
     lattices = effort.pick(((5, 5), (10, 10), (15, 15), (19, 23)), ((4, 4),))
@@ -191,7 +191,7 @@ def _views_by_opencv(scene: Scene) -> float:
 
 def of_frames(width: int, height: int, seconds: float) -> dict[str, float]:
     """Time ten frames of one size, one thread: medians, ms."""
-    rig, obj = wide(load_rig("O10"), width, height), load_object("asymmetric8")
+    rig, obj = wide(read_rig("O10"), width, height), load_object("asymmetric8")
     scene = make_scene(rig, obj)
     frames = _frames(scene)
     scale = width / 2048

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.types import CameraRig
 from imgcal.watch import CameraBlobs, Exposure, Item, Unreadable
 from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
@@ -42,7 +42,7 @@ class World:
 
     def __init__(self, snapshots: int, rate: float, bumps: int, seed: int = 0) -> None:
         self.rate, self.snapshots = rate, snapshots
-        self.factory, self.obj = load_rig("T4"), load_object("asymmetric8")
+        self.factory, self.obj = read_rig("T4"), load_object("asymmetric8")
         draw = random.Random(seed)
         steps = [
             Bump(int((i + 0.5) * snapshots / bumps), draw.randrange(self.factory.num_cameras), "rotation",

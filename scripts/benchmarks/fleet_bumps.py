@@ -19,7 +19,7 @@ from scipy import stats
 from torch import Tensor
 
 from imgcal.fleet import KINDS, DriftInformation, outlier_cameras
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.types import PARAMETER_KINDS, PARAMETERS, RigPrior
 from scripts.benchmarks.fleet_prior import NOISE, SNAPSHOTS, TRUE, recalibrated, simulate
 from scripts.output import ROOT, command, fill, markdown, read_json, surroundings, write_json
@@ -83,7 +83,7 @@ def direction(count: int, cameras: int, kind: int | None, generator: torch.Gener
 
 def measure(options: Options) -> dict[str, Any]:
     """Recalibrate devices, then draw what they would see of drifts and bumps."""
-    factory, obj = load_rig(options.rig), load_object("asymmetric8")
+    factory, obj = read_rig(options.rig), load_object("asymmetric8")
     fleet = simulate(factory, obj, options.devices, SNAPSHOTS, 0.0, options.seed)
     information, _ = recalibrated(fleet, factory, obj, RigPrior())
     generator = torch.Generator().manual_seed(options.seed)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from imgcal.estimation import EstimationOptions, estimate
 from imgcal.fleet import KINDS, DriftInformation, LearntPrior, learn_prior
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.synthesis import PhysicalDrift, synthesize
 from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 from scripts.output import ROOT, command, fill, markdown, read_json, surroundings, write_json
@@ -135,7 +135,7 @@ def _expected(information: DriftInformation, prior: RigPrior, factory: CameraRig
 
 def measure(options: Options) -> dict[str, Any]:
     """Learn, and compare."""
-    factory, obj = load_rig(options.rig), load_object("asymmetric8")
+    factory, obj = read_rig(options.rig), load_object("asymmetric8")
     fleet = simulate(factory, obj, options.devices, SNAPSHOTS, options.bumped, options.seed)
     information, _ = recalibrated(fleet, factory, obj, RigPrior())
     learnt = learn_prior(information)

@@ -24,7 +24,7 @@ from imgcal.cli.main import main as imgcal_command
 from imgcal.fleet import Dataset, Done, Engine, Item, Manifest, Settings, recalibrate_fleet, write_manifest
 from imgcal.fleet import run as fleet_run
 from imgcal.fleet.job import failed_row, process
-from imgcal.io import load_object, load_rig, save_detections
+from imgcal.io import load_object, read_rig, save_detections
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from scripts.output import ROOT, command, fill, markdown, read_json, surroundings, write_json
 
@@ -53,7 +53,7 @@ class Options:
 def write_blobs(path: Path, rig: str, snapshots: int, seed: int) -> None:
     """A table of unlabelled blobs of a drifted rig."""
     generator = torch.Generator().manual_seed(seed)
-    truth = simulate_truth(load_rig(rig), load_object("asymmetric8"), snapshots, generator, DRIFT)
+    truth = simulate_truth(read_rig(rig), load_object("asymmetric8"), snapshots, generator, DRIFT)
     seen = true_detections(truth)
     noise = np.random.default_rng(seed).normal(0.0, 0.1, seen.uv.shape)
     unlabelled = np.full(len(seen.uv), -1)

@@ -20,7 +20,7 @@ from imgcal.synthesis import (
     simulate_volume,
     true_detections,
 )
-from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior, Volume
+from imgcal.types import CalibrationObject, CameraRig, ConvexVolume, Detections, RigPrior
 
 NOISE = 0.1  # px, each axis
 FOCAL_ERROR = 0.15  # relative: largest error of what the cameras' focal lengths are said to be
@@ -39,7 +39,7 @@ class Case:
     name: str
     truth: Truth
     factory: CameraRig  # from which the true rig has drifted; its prior says how far
-    volume: Volume  # where it is used, in the true rig's frame
+    volume: ConvexVolume  # where it is used, in the true rig's frame
     cameras: CameraRig  # what a start from scratch is given: rough focal lengths, no places
     obj: CalibrationObject
     labelled: Detections
@@ -63,7 +63,7 @@ def make_case(number: int, snapshots: int) -> Case:
     )
     reach = 0.6 * radius
     middle = radius if shape == "row" else 0.0
-    volume = Volume.box((-reach, middle - reach, 100.0), (reach, middle + reach, 2200.0))
+    volume = ConvexVolume.box((-reach, middle - reach, 100.0), (reach, middle + reach, 2200.0))
     lens = torch.tensor([-0.08, 0.05, 0.0003, -0.0002, 0.0], dtype=torch.float64)
     rig = replace(rig, distortion=lens.repeat(cameras, 1), volume=volume, prior=DRIFT_PRIOR)
     obj = load_object("wand4") if number % 2 == 0 else load_object("asymmetric8")
@@ -112,7 +112,7 @@ def _as_blobs(labelled: Detections, rig: CameraRig, rng: np.random.Generator) ->
     return both.select(np.lexsort((both.uv[:, 1], both.camera, both.snapshot)))
 
 
-def point_errors(found: CameraRig, truth: CameraRig, volume: Volume, scaled: bool = False) -> np.ndarray:
+def point_errors(found: CameraRig, truth: CameraRig, volume: ConvexVolume, scaled: bool = False) -> np.ndarray:
     """Distances (mm) of points in the volume, triangulated by a rig from their true pixels, from where they are.
 
     The whole rig is laid upon the truth first, by the best rigid motion.

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from imgcal.association import relocalize, track
 from imgcal.geometry import RigidTransform
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.synthesis import RelativeDrift, synthesize
 from imgcal.types import CalibrationObject, CameraRig, Detections
 from scripts.benchmarks.effort import Effort
@@ -197,7 +197,7 @@ class Peers:
 
 def snapshots_of(case: Case, count: int, seed: int = 0) -> tuple[CameraRig, CalibrationObject, list[Snapshot]]:
     """Make the factory rig, the object, and what a freshly disturbed rig sees each time."""
-    rig, obj = load_rig("O10"), load_object(case.object_name)
+    rig, obj = read_rig("O10"), load_object(case.object_name)
     made = synthesize(rig, obj, count, torch.Generator().manual_seed(seed), drift=RelativeDrift(case.kappa, case.kappa))
     generator = np.random.default_rng(seed)
     shown = [_blobs(uv, rig, case, generator) for uv in made.projection.uv.numpy()]

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from imgcal.estimation import Problem, State, levenberg_marquardt_cpu
 from imgcal.geometry import RigidTransform, project_kornia
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.synthesis import synthesize
 from imgcal.types import CameraRig
 from scripts.benchmarks.effort import Effort
@@ -89,7 +89,7 @@ def measure(effort: Effort) -> dict[str, Any]:
 def scene_of(kind: str, count: int) -> Scene:
     """Return one camera with `count` points, or `count` drifted O10 rigs with 8 fiducials each."""
     generator = torch.Generator().manual_seed(0)
-    rig, obj = load_rig("O10"), load_object("asymmetric8")
+    rig, obj = read_rig("O10"), load_object("asymmetric8")
     if kind == "rigs":
         made = synthesize(rig, obj, count, generator)
         return Scene(made.rig, made.rig_from_object, obj.points)
@@ -233,7 +233,7 @@ def _equations(scene: Scene, upstream: Tensor) -> Run:
 
 def _measure_synthesis(effort: Effort) -> dict[str, Any]:
     """Rigs with drift, pose, projection and visibility check, as training draws them: float32."""
-    rig, obj = load_rig("O10").to(torch.float32), load_object("asymmetric8")
+    rig, obj = read_rig("O10").to(torch.float32), load_object("asymmetric8")
     generator = torch.Generator().manual_seed(0)
     batches, count = effort.pick(((64, 512, 4096), 512), ((8,), 8))
     made = synthesize(rig, obj, count, generator)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from imgcal.estimation import EstimationOptions, estimate, initial_pose, relative_covariance, relative_difference
 from imgcal.geometry import RigidTransform
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.synthesis import PhysicalDrift, PoseRange
 from imgcal.synthesis.rigs import sample_rig_from_object
 from imgcal.types import PARAMETERS, CalibrationObject, CameraRig, Observations
@@ -67,7 +67,7 @@ class Cases:
 
 def make_cases(count: int, snapshots: int, seed: int, scale: float = 1.0) -> Cases:
     """Observe O10 by random poses; disturb its factory calibration by `scale` times the drift."""
-    truth, obj = load_rig("O10"), load_object("asymmetric8")
+    truth, obj = read_rig("O10"), load_object("asymmetric8")
     generator = torch.Generator().manual_seed(seed)
     prior_std = scale * DRIFT.std(truth)
     poses = _poses(truth, obj, generator, count, snapshots)

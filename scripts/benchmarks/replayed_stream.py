@@ -14,7 +14,7 @@ from torch import Tensor
 import imgcal
 from imgcal.geometry import RigidTransform
 from imgcal.synthesis import HandHeld, PhysicalDrift, arrange_rig, sample_path
-from imgcal.types import CalibrationObject, CameraRig, Detections, Volume
+from imgcal.types import CalibrationObject, CameraRig, ConvexVolume, Detections
 from scripts.benchmarks.replayed_noise import Replay, Series, recorded_series
 from scripts.benchmarks.rig_streams import Blobs, Bump, Conditions, Stream
 from scripts.benchmarks.wand_recording import calibrated, recording
@@ -52,7 +52,7 @@ class Place:
     factory: CameraRig
     truth: CameraRig
     obj: CalibrationObject  # nominal
-    volume: Volume
+    volume: ConvexVolume
 
 
 def place_of(name: str, seed: int) -> Place:
@@ -66,7 +66,7 @@ def place_of(name: str, seed: int) -> Place:
         where = calibration.rig_from_object.apply(calibration.points_object.mean(0, keepdim=True))[:, 0]
         ends = torch.tensor([0.05, 0.95], dtype=torch.float64)
         low, high = (tuple(row) for row in torch.quantile(where.detach(), ends, dim=0).tolist())
-        return Place(recording().factory, calibration.rig, wand, Volume.box(low, high))
+        return Place(recording().factory, calibration.rig, wand, ConvexVolume.box(low, high))
     factory = (
         arrange_rig("ring", 8, 4000.0, height=2500.0, target=(0.0, 0.0, 1000.0))
         if name == "ring8"

@@ -17,8 +17,8 @@ from imgcal.cli.main import main
 from imgcal.io import (
     load_detections,
     load_object,
-    load_rig,
     read_frame,
+    read_rig,
     save_detections,
     save_object,
     save_rig,
@@ -63,7 +63,7 @@ class Case:
 def prepare(folder: Path) -> None:
     """Make the sound place: rig, object, capture, detections, other images, a video, a network, an experiment."""
     folder.mkdir(parents=True)
-    save_rig(load_rig("T4").resized(torch.tensor(SIZE)), folder / "rig.yaml")
+    save_rig(read_rig("T4").resized(torch.tensor(SIZE)), folder / "rig.yaml")
     save_object(load_object("asymmetric8"), folder / "object.csv")
     made = ["simulate", "--rig", str(folder / "rig.yaml"), "--object", str(folder / "object.csv"), "--out"]
     made += [str(folder / "capture"), "--snapshots", "2", "--kappa", "0.005", "--no-clutter", "--marker-radius", "14"]
@@ -76,7 +76,7 @@ def prepare(folder: Path) -> None:
         raise RuntimeError("no blobs are found in the sound capture")
     _other_frames(folder)
     _network(folder)
-    prepare_foreign(folder / "foreign", load_rig(folder / "rig.yaml"))
+    prepare_foreign(folder / "foreign", read_rig(folder / "rig.yaml"))
 
 
 def case(sound: Path, folder: Path, seed: int, number: int) -> Case:
@@ -90,7 +90,7 @@ def case(sound: Path, folder: Path, seed: int, number: int) -> Case:
 
 def _other_frames(folder: Path) -> None:
     """The same capture as TIFF, BMP, PGM, JPEG and as video."""
-    capture, rig = folder / "capture", load_rig(folder / "rig.yaml")
+    capture, rig = folder / "capture", read_rig(folder / "rig.yaml")
     for suffix in ("tif", "bmp", "pgm", "jpg", "avi"):
         other = folder / suffix
         (other / "frames").mkdir(parents=True)

@@ -18,7 +18,7 @@ import torch
 from imgcal.cli.compiling import HINT
 from imgcal.cli.main import main
 from imgcal.errors import InputError
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from scripts.fuzz.cases import Case
 
 NOISE = re.compile(r"Traceback|Warning|internal error|libpng|Corrupt JPEG|\[avi|^\s+File ", re.MULTILINE)
@@ -78,7 +78,7 @@ def _left_behind(case: Case, code: object, before: set[Path]) -> str:
         if (out / "rig.yaml").exists() != (code == 0):
             return f"exit code {code}, rig.yaml {(out / 'rig.yaml').exists()}"
         if code == 0:
-            load_rig(out / "rig.yaml")
+            read_rig(out / "rig.yaml")
     except (OSError, ValueError, InputError) as error:
         return f"what was written cannot be read: {error}"
     return ""

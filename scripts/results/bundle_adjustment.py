@@ -28,7 +28,7 @@ from imgcal.estimation import EstimationOptions, estimate, initial_pose
 from imgcal.evaluation import BASELINES, Conditions, Given, network_method, reprojection_error
 from imgcal.evaluation.protocol import Sample, draw
 from imgcal.geometry import vector_from_rotation
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.networks import load_network
 from imgcal.refinement import make_observations, make_prediction
 from imgcal.synthesis import PoseRange, RelativeDrift
@@ -69,7 +69,7 @@ class Column:
 def main(arguments: list[str] | None = None) -> None:
     """Run all trials, print, write."""
     options = tyro.cli(Options, args=arguments, description=__doc__)
-    rig, obj = load_rig("O6"), load_object("cube8")
+    rig, obj = read_rig("O6"), load_object("cube8")
     conditions = Conditions(rig, obj, PoseRange.overhead(), RelativeDrift(0.1, 0.0))
     sample = draw(conditions, options.trials, torch.Generator().manual_seed(0))
     untouched = Prediction(rig.expand(options.trials), sample.truth.rig_from_object)

@@ -18,7 +18,7 @@ from torch import Tensor
 from imgcal.errors import InputError
 from imgcal.evaluation import BASELINES, Conditions, Given, Method, load_models, reprojection_error
 from imgcal.evaluation.protocol import draw
-from imgcal.io import load_object, load_rig, write_text
+from imgcal.io import load_object, read_rig, write_text
 from imgcal.live_page import to_json
 from imgcal.report import DrawnRig, rig_scene, rig_view_script
 from imgcal.synthesis import RelativeDrift
@@ -93,7 +93,7 @@ def _one_rig(cameras: CameraRig) -> CameraRig:
 
 def _chosen(options: Options) -> tuple[Conditions, Method, str]:
     if options.model is None:
-        rig, obj = load_rig(options.rig), load_object(options.object)
+        rig, obj = read_rig(options.rig), load_object(options.object)
         name = "factory, pose fitted"
         return Conditions(rig, obj, drift=RelativeDrift()), BASELINES[name], name
     [model] = load_models([options.model])

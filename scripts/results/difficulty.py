@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.synthesis import DIFFICULTIES, FrameModel, PhysicalDrift, simulate_frames, simulate_truth
 from scripts.output import figure
 
@@ -24,7 +24,7 @@ COLUMNS = 4
 
 def main() -> None:
     """Render one snapshot at each level, and draw what lies around the object."""
-    rig, obj = load_rig("O10").select([CAMERA]), load_object("asymmetric8")
+    rig, obj = read_rig("O10").select([CAMERA]), load_object("asymmetric8")
     truth = simulate_truth(rig, obj, 1, torch.Generator().manual_seed(0), PhysicalDrift())
     u, v = truth.uv[0, 0].mean(0).round().int().tolist()
     with figure(PICTURE, COLUMNS, len(DIFFICULTIES) // COLUMNS, (11.0, 3.7)) as axes:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch.utils.flop_counter import FlopCounterMode
 
 from imgcal.detection import Blobs, DetectionOptions, Frame, detect_snapshot
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.networks import Measurer, load_measurer
 from imgcal.pipeline import LearnedMeasurer
 from imgcal.synthesis import DIFFICULTIES, FrameModel, PhysicalDrift, Shot, simulate_shots, simulate_truth
@@ -54,7 +54,7 @@ class Seen:
 
 def snapshots(level: str, count: int) -> Iterator[Seen]:
     """Simulate captures of O10, detect blobs, and say which marker each one shows."""
-    rig, obj = load_rig("O10"), load_object("asymmetric8")
+    rig, obj = read_rig("O10"), load_object("asymmetric8")
     generator = torch.Generator().manual_seed(SEED)
     truth = simulate_truth(rig, obj, count, generator, PhysicalDrift())
     shots = simulate_shots(truth, obj, FrameModel(difficulty=DIFFICULTIES[level]), generator)

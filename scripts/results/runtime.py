@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from imgcal import networks
 from imgcal.geometry import RigidTransform, rotation_from_vector
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.networks import NetworkConfig
 from imgcal.refinement import refine_points
 from imgcal.synthesis import PhysicalDrift, Snapshots, synthesize
@@ -77,7 +77,7 @@ class CameraViews:
 
 def opencv_views(images: int) -> CameraViews:
     """Let one drifted camera of O10 look at cube8 from all over the hemisphere."""
-    rig, obj, generator = load_rig("O10"), load_object("cube8"), torch.Generator().manual_seed(0)
+    rig, obj, generator = read_rig("O10"), load_object("cube8"), torch.Generator().manual_seed(0)
     drifted = DRIFT.apply(rig, generator)
     made = synthesize(drifted, obj, images, generator, drift=None)
     uv = made.projection.uv[:, 0]
@@ -104,7 +104,7 @@ def opencv(views: CameraViews, images: int, iterations: int | None = None) -> di
 
 def ring(cameras: int) -> CameraRig:
     """Make a ring of any number of cameras like O10's first one."""
-    base = load_rig("O10")
+    base = read_rig("O10")
     angle = torch.arange(cameras, dtype=torch.float64) * (2 * torch.pi / cameras)
     turn = rotation_from_vector(torch.stack((0 * angle, 0 * angle, angle), dim=-1))
     place = base.cam_from_rig[0]

@@ -8,7 +8,7 @@ import torch
 from imgcal.estimation import EstimationOptions, estimate
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.synthesis.captures import simulate_truth
 from imgcal.synthesis.rigs import PhysicalDrift
 from imgcal.types.observations import Detections, Observations
@@ -18,7 +18,7 @@ class Stream:
     """A factory rig, what it has become, and an object on its way."""
 
     def __init__(self, rig_name, object_name, snapshots, seed=0, jump=None):
-        self.rig, self.obj = load_rig(rig_name), load_object(object_name)
+        self.rig, self.obj = read_rig(rig_name), load_object(object_name)
         self.generator = torch.Generator().manual_seed(seed)
         self.random = np.random.default_rng(seed)
         if rig_name == "room10":

@@ -9,7 +9,7 @@ import torch
 import imgcal
 from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform, rotation_from_vector
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.online import RigKeeper
 from imgcal.synthesis import FrameModel, PhysicalDrift, Truth, simulate_frames, simulate_truth, true_detections
 from imgcal.types import CalibrationObject
@@ -116,7 +116,7 @@ def test_a_camera_that_has_seen_nothing_has_the_factory_values_and_prior():
 
 def test_a_horizon_of_no_snapshots_is_refused():
     with pytest.raises(InputError, match="horizon: found 0, expected at least 1 snapshot"):
-        RigKeeper(load_rig("T4"), load_object("asymmetric8"), horizon=0)
+        RigKeeper(read_rig("T4"), load_object("asymmetric8"), horizon=0)
 
 
 def test_it_goes_on_from_its_file_bit_for_bit(tmp_path):
@@ -138,7 +138,7 @@ def test_it_goes_on_from_its_file_bit_for_bit(tmp_path):
 
 
 def test_a_large_cloud_is_followed_and_a_large_lattice_is_not():
-    rig, generator = load_rig("T4"), torch.Generator().manual_seed(0)
+    rig, generator = read_rig("T4"), torch.Generator().manual_seed(0)
     cloud = 120 * (torch.rand(100, 3, generator=generator, dtype=torch.float64) - 0.5)
     lattice = torch.cartesian_prod(*[torch.arange(n).double() * 12 for n in (10, 10, 1)])
     for points in (cloud, lattice - lattice.mean(0)):
@@ -154,7 +154,7 @@ def test_a_large_cloud_is_followed_and_a_large_lattice_is_not():
 
 
 def test_frames_of_a_camera_that_is_out_or_dark_stop_nothing():
-    rig, obj = load_rig("T4").resized(torch.tensor([1024, 544])), load_object("asymmetric8")
+    rig, obj = read_rig("T4").resized(torch.tensor([1024, 544])), load_object("asymmetric8")
     generator = torch.Generator().manual_seed(4)
     start = simulate_truth(rig, obj, 1, generator, PhysicalDrift())
     pose, times = start.rig_from_object[0], torch.arange(4.0)[:, None].double()
@@ -177,4 +177,4 @@ def test_lights_need_all_snapshots(name):
     if name == "a light":
         obj = replace(obj, unknown_markers=False)
     with pytest.raises(InputError, match="leave the horizon out"):
-        RigKeeper(load_rig("T4"), obj, horizon=5)
+        RigKeeper(read_rig("T4"), obj, horizon=5)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from scripts.benchmarks import end_to_end
 from scripts.benchmarks import end_to_end_growth as growth
 from scripts.benchmarks.effort import Effort
@@ -27,7 +27,7 @@ def test_smoke(tmp_path):
 
 
 def test_opencv_labels_and_calibrates_a_camera():
-    scene = growth.make_scene(load_rig("O10"), load_object("asymmetric8"))
+    scene = growth.make_scene(read_rig("O10"), load_object("asymmetric8"))
     points, uv, view = scene.obj.points.numpy(), scene.truth.uv[0, 3].numpy(), growth.view_of(scene, 3)
     shuffled = np.random.default_rng(0).permutation(len(uv))
     known = growth.view_of(replace(scene, rig=scene.truth.rig), 3)  # as after the snapshot before
@@ -41,7 +41,7 @@ def test_opencv_labels_and_calibrates_a_camera():
 
 
 def test_images_of_another_size_show_the_same():
-    rig, obj = load_rig("O10"), load_object("asymmetric8")
+    rig, obj = read_rig("O10"), load_object("asymmetric8")
     scene = growth.make_scene(rig, obj)
     half = growth.wide(scene.truth.rig, 1024, 544)
     uv = half.project(scene.truth.rig_from_object[0].apply(obj.points)).uv

@@ -165,9 +165,9 @@ def test_runtime(tmp_path):
 
 
 def test_ring_is_the_reference_ring():
-    from imgcal.io import load_rig
+    from imgcal.io import read_rig
 
-    made, reference = script("runtime").ring(10), load_rig("O10")
+    made, reference = script("runtime").ring(10), read_rig("O10")
     torch.testing.assert_close(made.positions, reference.positions, atol=1e-3, rtol=0)
     torch.testing.assert_close(made.cam_from_rig.rotation, reference.cam_from_rig.rotation, atol=1e-5, rtol=0)
 
@@ -185,11 +185,11 @@ def test_bundle_adjustment(trained, tmp_path):
 
 
 def test_plain_bundle_adjustment_starts_at_the_projection_of_the_rig():
-    from imgcal.io import load_object, load_rig
+    from imgcal.io import load_object, read_rig
     from imgcal.synthesis.rigs import synthesize
 
     module, obj = script("bundle_adjustment"), load_object("cube8")
-    made = synthesize(load_rig("T4"), obj, 1, torch.Generator().manual_seed(2))
+    made = synthesize(read_rig("T4"), obj, 1, torch.Generator().manual_seed(2))
     numbers = module.numbers_of(made.rig.from_object(made.rig_from_object)[0])
     torch.testing.assert_close(
         torch.from_numpy(module._projected(numbers, obj.points.numpy())), made.projection.uv[0], atol=1e-6, rtol=0

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.synthesis import simulate_volume, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
 from imgcal.types import CalibrationObject
@@ -20,7 +20,7 @@ def several(parts, snapshots, seed=1, false=3):
 
     Lights are no part of the object that is given back where there is anything else.
     """
-    rig, rng = load_rig("room10"), np.random.default_rng(seed)
+    rig, rng = read_rig("room10"), np.random.default_rng(seed)
     objects = [
         CalibrationObject(torch.tensor(points, dtype=torch.float64), torch.ones(len(points), 3), name=f"object{k}")
         for k, points in enumerate(parts)

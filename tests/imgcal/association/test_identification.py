@@ -7,7 +7,7 @@ import torch
 from imgcal.association import IdentityOptions, identify, relocalize, track
 from imgcal.errors import InputError
 from imgcal.geometry.transforms import RigidTransform
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.io.names import data_path
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift, RelativeDrift, Snapshots, synthesize
@@ -21,7 +21,7 @@ Associations = tuple[Detections, np.ndarray]
 
 @pytest.fixture(scope="module")
 def o10() -> CameraRig:
-    return load_rig(data_path("rigs", "O10.yaml"))
+    return read_rig(data_path("rigs", "O10.yaml"))
 
 
 @pytest.fixture(scope="module")

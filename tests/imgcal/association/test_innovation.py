@@ -13,7 +13,7 @@ from imgcal.association.verification import fit, make_problem, rig_and_pose, sta
 from imgcal.estimation import levenberg_marquardt_cpu
 from imgcal.estimation.levenberg_marquardt import Solution
 from imgcal.estimation.linearization import Problem, State, linearize, pose_at, retract, rig_at
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.io.names import data_path
 from imgcal.synthesis.rigs import synthesize
 from imgcal.types.observations import Detections
@@ -22,7 +22,7 @@ from tests.imgcal.association.scenes import scene_of, take
 
 
 def test_covariance_of_an_unlabelled_fiducial_matches_the_dense_one() -> None:
-    rig = load_rig(data_path("rigs", "T4.yaml")).select([0, 2])
+    rig = read_rig(data_path("rigs", "T4.yaml")).select([0, 2])
     obj = load_object(data_path("objects", "asymmetric8.csv"))
     made = synthesize(rig, obj, 1, torch.Generator().manual_seed(0), drift=None)
     uv, pose = made.projection.uv[0], made.rig_from_object[0]
@@ -77,7 +77,7 @@ def test_covariance_of_an_unlabelled_fiducial_matches_the_dense_one() -> None:
 @pytest.fixture(scope="module")
 def noisy():
     """Noisy blobs of two cameras, labelled but for two of them, fitted."""
-    rig, obj = load_rig("T4").select([0, 2]), load_object("asymmetric8")
+    rig, obj = read_rig("T4").select([0, 2]), load_object("asymmetric8")
     snapshot = take(rig, obj, 3, noise=0.4, false=2, missing=1)
     scene = scene_of(snapshot, rig, obj)
     labels = snapshot.labels(scene.blobs, 8)

@@ -5,14 +5,14 @@ import pytest
 import torch
 
 from imgcal.association.single_image_labels import is_small_planar, label_by_shape
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.synthesis import simulate_volume
 
 
 @pytest.fixture(scope="module")
 def scene():
-    camera, wand = load_rig("room10").select([1]), load_object("wand4")
-    truth = simulate_volume(camera, wand, 80, torch.Generator().manual_seed(2), None, volume=load_rig("room10").volume)
+    camera, wand = read_rig("room10").select([1]), load_object("wand4")
+    truth = simulate_volume(camera, wand, 80, torch.Generator().manual_seed(2), None, volume=read_rig("room10").volume)
     whole = truth.visible[:, 0].all(-1)
     return camera, wand, truth.uv[whole, 0].numpy()
 

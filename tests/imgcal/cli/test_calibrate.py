@@ -15,9 +15,9 @@ from imgcal.geometry.rotations import vector_from_rotation
 from imgcal.io import (
     load_detections,
     load_object,
-    load_rig,
     load_rig_covariance,
     read_frame,
+    read_rig,
     save_detections,
     write_frame,
 )
@@ -52,8 +52,8 @@ def test_frames_to_recalibrated_rig(workplace, tmp_path, capsys):
     assert "not known: Not determined by these data" in printed and "Move the object" in printed
     assert f"before {result['rms_px_before']:.3f} px" in printed and str(out / "report.html") in printed
 
-    truth, factory = load_rig(workplace.capture / "truth" / "rig.yaml"), load_rig(workplace.rig)
-    found = load_rig(out / "rig.yaml")
+    truth, factory = read_rig(workplace.capture / "truth" / "rig.yaml"), read_rig(workplace.rig)
+    found = read_rig(out / "rig.yaml")
     std = load_rig_covariance(out / "rig.yaml").std
     error = relative_difference(found, truth)
     assert found.prior == factory.prior
@@ -83,7 +83,7 @@ def test_blobs_found_by_detect_give_the_same_rig(workplace, tmp_path):
     assert main(["detect", str(workplace.capture), "--out", str(table), "--rig", str(workplace.rig)]) == 0
     assert calibrate(workplace, table, tmp_path / "a", "--no-report") == 0
     assert calibrate(workplace, workplace.capture, tmp_path / "b", "--no-report") == 0
-    first, second = load_rig(tmp_path / "a" / "rig.yaml"), load_rig(tmp_path / "b" / "rig.yaml")
+    first, second = read_rig(tmp_path / "a" / "rig.yaml"), read_rig(tmp_path / "b" / "rig.yaml")
     assert first.local(second).abs().max() < 1e-6
 
 
@@ -102,10 +102,10 @@ def test_a_camera_that_sees_nothing_is_refused_unless_allowed(workplace, tmp_pat
     assert not (out / "rig.yaml").exists()
     assert (out / "report.html").exists()
     assert calibrate(workplace, table, out, "--blind-cameras", "--no-report") == 0
-    factory, found = load_rig(workplace.rig), load_rig(out / "rig.yaml")
+    factory, found = read_rig(workplace.rig), read_rig(out / "rig.yaml")
     assert np.allclose(found.focal_length[1], factory.focal_length[1])
     assert calibrate(workplace, table, tmp_path / "less", "--without", "cam02", "--no-report") == 0
-    assert load_rig(tmp_path / "less" / "rig.yaml").camera_names == ("cam01", "cam03", "cam04")
+    assert read_rig(tmp_path / "less" / "rig.yaml").camera_names == ("cam01", "cam03", "cam04")
 
 
 def test_too_few_fiducials_are_refused(workplace, tmp_path, capsys):
@@ -251,7 +251,7 @@ def test_the_untouched_table_is_accepted(workplace, tmp_path):
 
 def test_a_drift_beyond_the_prior_is_said_and_its_spread_is_honest(workplace, tmp_path, capsys):
     truth = simulate_truth(
-        load_rig(workplace.rig),
+        read_rig(workplace.rig),
         load_object(workplace.object),
         6,
         torch.Generator().manual_seed(0),
@@ -263,7 +263,7 @@ def test_a_drift_beyond_the_prior_is_said_and_its_spread_is_honest(workplace, tm
     assert calibrate(workplace, tmp_path / "blobs.csv", tmp_path / "out", "--no-report") == 0
     assert "than the rig's prior" in capsys.readouterr().err.replace("as far as", "than")
     assert json.loads((tmp_path / "out" / "result.json").read_text())["prior_too_narrow"]
-    found, std = load_rig(tmp_path / "out" / "rig.yaml"), load_rig_covariance(tmp_path / "out" / "rig.yaml").std
+    found, std = read_rig(tmp_path / "out" / "rig.yaml"), load_rig_covariance(tmp_path / "out" / "rig.yaml").std
     error = relative_difference(found, truth.rig)[:, 6:10] / std[:, 6:10]
     assert error.square().mean().sqrt() < 1.6
 
@@ -294,7 +294,7 @@ def test_a_start_pose_that_is_no_number_is_explained(workplace, tmp_path, capsys
 
 def test_leaving_out_all_cameras_is_one_line(workplace, tmp_path, capsys):
     assert (
-        calibrate(workplace, workplace.capture, tmp_path / "out", "--without", *load_rig(workplace.rig).camera_names)
+        calibrate(workplace, workplace.capture, tmp_path / "out", "--without", *read_rig(workplace.rig).camera_names)
         == 2
     )
     assert "--without: found all 4 cameras" in one_line(capsys)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from imgcal.cli.main import main
-from imgcal.io import load_object, load_rig, load_rig_covariance, save_cameras, save_detections
+from imgcal.io import load_object, load_rig_covariance, read_rig, save_cameras, save_detections
 from imgcal.synthesis import arrange_rig, simulate_volume
 from imgcal.synthesis.captures import true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
@@ -30,7 +30,7 @@ def test_without_a_factory_calibration(wand_capture, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "without a factory calibration" in printed and "since the factory" not in printed
     assert result["motion"] is None and "k3" in result["knowledge"]["undetermined"]
-    rig = load_rig(tmp_path / "out" / "rig.yaml")
+    rig = read_rig(tmp_path / "out" / "rig.yaml")
     assert rig.volume is not None and rig.prior is None and load_rig_covariance(tmp_path / "out" / "rig.yaml")
     assert "There was no factory calibration" in (tmp_path / "out" / "report.html").read_text()
     again = [*arguments[:-1], str(tmp_path / "again"), "--rig", str(tmp_path / "out" / "rig.yaml"), "--no-report"]

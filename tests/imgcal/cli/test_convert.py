@@ -6,7 +6,7 @@ import torch
 import yaml
 
 from imgcal.cli.main import main
-from imgcal.io import RigCovariance, load_rig, load_rig_covariance, save_rig
+from imgcal.io import RigCovariance, load_rig_covariance, read_rig, save_rig
 from imgcal.types import CameraRig
 from tests.imgcal.cli.conftest import Workplace
 
@@ -28,7 +28,7 @@ def test_a_kalibr_file_becomes_ours(camchain: Path, tmp_path: Path, capsys: pyte
     assert code == 0
     assert "Kalibr camchain: 4 cameras; frame: camera cam0" in out
     assert "(imgcal); re-read: worst difference" in out and "px on 588 points, lens models the same" in out
-    assert load_rig(tmp_path / "rig.yaml").camera_names == ("cam0", "cam1", "cam2", "cam3")
+    assert read_rig(tmp_path / "rig.yaml").camera_names == ("cam0", "cam1", "cam2", "cam3")
 
 
 def test_commands_take_it_as_a_rig(workplace: Workplace, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -50,7 +50,7 @@ def test_a_file_of_one_camera_is_named(tmp_path: Path, capsys: pytest.CaptureFix
     assert code == 2
     assert "this is a ROS camera_info file of one camera, without its place in the rig" in said
     assert run(capsys, tmp_path / "ros" / "cam01.yaml", "--out", tmp_path / "one.yaml")[0] == 0
-    assert load_rig(tmp_path / "one.yaml").num_cameras == 1
+    assert read_rig(tmp_path / "one.yaml").num_cameras == 1
 
 
 def test_nothing_is_guessed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -61,10 +61,10 @@ def test_nothing_is_guessed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert "the file does not state its unit of length" in error
     assert not (tmp_path / "rig.yaml").exists()
     assert run(capsys, folder, "--out", tmp_path / "rig.yaml", "--unit", "0.5m")[0] == 0
-    half = load_rig(tmp_path / "rig.yaml").positions
+    half = read_rig(tmp_path / "rig.yaml").positions
     distance = ["--distance", "cam01", "cam02", "100"]
     assert run(capsys, folder, "--out", tmp_path / "rig.yaml", *distance)[0] == 0
-    positions = load_rig(tmp_path / "rig.yaml").positions
+    positions = read_rig(tmp_path / "rig.yaml").positions
     assert float((positions[1] - positions[0]).norm()) == pytest.approx(100)
     assert not half.allclose(positions)
 
@@ -131,6 +131,6 @@ def test_sizes_may_be_stated_of_cameras_that_are_not_kept(
     sizes = [f"cam{number}=2048x1088" for number in range(4)]
     out = ["--out", tmp_path / "rig.yaml", "--cameras", "cam2", "cam0"]
     assert run(capsys, camchain, *out, "--image-size", *sizes)[0] == 0
-    assert load_rig(tmp_path / "rig.yaml").camera_names == ("cam2", "cam0")
+    assert read_rig(tmp_path / "rig.yaml").camera_names == ("cam2", "cam0")
     code, _, err = run(capsys, camchain, *out, "--image-size", "cam7=2048x1088")
     assert code == 2 and "found camera cam7, expected" in err

@@ -6,7 +6,7 @@ import torch
 
 from imgcal import calibrate
 from imgcal.cli.main import main
-from imgcal.io import load_object, load_rig, save_rig
+from imgcal.io import load_object, read_rig, save_rig
 from imgcal.synthesis import PhysicalDrift, simulate_volume, true_detections
 from tests.imgcal.formats import originals
 from tests.imgcal.formats.rigs import brown, rig_of
@@ -25,7 +25,7 @@ def recalibrated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[Pa
     lens = brown(-0.05, 0.02, 1e-4, -2e-4, 0.003)
     original.write_bytes(originals.qualisys(rig_of(lens, lens, lens)))
     assert run(capsys, original, "--out", rig)[0] == 0
-    factory = load_rig(rig)
+    factory = read_rig(rig)
     save_rig(factory.retract(torch.full((3, 15), 1e-3, dtype=torch.float64)), rig)
     return rig, original
 
@@ -79,7 +79,7 @@ def test_a_calibration_that_holds_the_distortion_goes_back_where_another_is_refu
     assert run(capsys, original, "--out", free)[0] == 0
     outcomes = []
     for path in (held, free):
-        factory = load_rig(path)
+        factory = read_rig(path)
         generator = torch.Generator().manual_seed(0)
         truth = simulate_volume(
             factory, load_object("asymmetric8"), 12, generator, PhysicalDrift(0.1, 1.0, 1e-3, 0.5, 0)
@@ -98,7 +98,7 @@ def test_a_calibration_that_holds_the_distortion_goes_back_where_another_is_refu
 
 def test_into_without_a_file_or_into_a_rig_file_of_ours_is_told(tmp_path, capsys):
     rig = tmp_path / "rig.yaml"
-    save_rig(load_rig("T4"), rig)
+    save_rig(read_rig("T4"), rig)
     assert main(["convert", str(rig), "--into", "--out", str(tmp_path / "new")]) == 2
     assert "--into: found no value, expected one or more" in capsys.readouterr().err
     assert main(["convert", str(rig), "--into", str(rig), "--out", str(tmp_path / "new.yaml")]) == 2

@@ -10,7 +10,7 @@ import torch
 from imgcal.cli.main import main
 from imgcal.evaluation import QUICK_BASELINES
 from imgcal.fleet import StoredResults
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.networks import Checkpoint, build_network, save_checkpoint
 from imgcal.training.experiment_file import load_experiment
 from tests.imgcal.fleet.conftest import engine  # noqa: F401  one Ray for all tests
@@ -45,7 +45,7 @@ def models(tmp_path_factory):
     paths = [folder / "first.safetensors", folder / "second" / "model.safetensors"]
     paths[1].parent.mkdir()
     for seed, path in enumerate(paths):
-        subject = (load_rig("T4"), load_object("asymmetric8"))
+        subject = (read_rig("T4"), load_object("asymmetric8"))
         network = build_network(experiment, *subject, torch.Generator().manual_seed(seed))
         save_checkpoint(path, Checkpoint(network, *subject, experiment, {}))
     (paths[1].parent / "metrics.jsonl").write_text('{"step": 1, "re_px": 5.0}\n{"step": 2, "validation_re_px": 4.0}\n')

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 
 from imgcal.cli.main import main
-from imgcal.io import load_detections, load_rig, save_detections, save_rig
+from imgcal.io import load_detections, read_rig, save_detections, save_rig
 from tests.imgcal.lensed import lensed
 
 
@@ -31,7 +31,7 @@ def test_truth_scores_zero_and_factory_does_not(workplace, capsys):
 
 def test_a_rig_of_mixed_lenses_is_simulated_scored_and_calibrated(workplace, tmp_path, capsys):
     rig, capture, out = tmp_path / "mixed.yaml", tmp_path / "capture", tmp_path / "out"
-    save_rig(lensed(load_rig(workplace.rig), "mixed"), rig)
+    save_rig(lensed(read_rig(workplace.rig), "mixed"), rig)
     known = ["--rig", str(rig), "--object", str(workplace.object)]
     how = ["--snapshots", "4", "--seed", "5", "--kappa", "0.01", "--no-clutter"]
     assert main(["simulate", *known, "--out", str(capture), *how]) == 0
@@ -44,7 +44,7 @@ def test_a_rig_of_mixed_lenses_is_simulated_scored_and_calibrated(workplace, tmp
     assert score(workplace, table, out / "rig.yaml", capsys)["rms_px"] < 0.01
     # Values of a camera have the names that its own lens gives them.
     undetermined = json.loads((out / "result.json").read_text())["knowledge"]["undetermined"]
-    lenses = dict(zip(load_rig(rig).camera_names, load_rig(rig).lens_models, strict=True))
+    lenses = dict(zip(read_rig(rig).camera_names, read_rig(rig).lens_models, strict=True))
     assert all(lenses[camera] == "rational" for name in ("k5", "k6") for camera in undetermined.get(name, ()))
     assert all(lenses[camera] != "equidistant" for name in ("p1", "p2") for camera in undetermined.get(name, ()))
     assert undetermined and not any("/" in name or name == "-" for name in undetermined)

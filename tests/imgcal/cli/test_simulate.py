@@ -8,7 +8,7 @@ import pytest
 
 from imgcal.cli.arguments import Level
 from imgcal.cli.main import main
-from imgcal.io import load_detections, load_rig, read_frame
+from imgcal.io import load_detections, read_frame, read_rig
 from imgcal.synthesis import DIFFICULTIES
 
 
@@ -42,7 +42,7 @@ def test_twelve_bit_dark_markers(tmp_path):
 
 def test_no_drift_keeps_the_factory_rig(tmp_path):
     assert simulate(tmp_path / "a", "--drift", "none") == 0
-    truth, factory = load_rig(tmp_path / "a" / "truth" / "rig.yaml"), load_rig("T4")
+    truth, factory = read_rig(tmp_path / "a" / "truth" / "rig.yaml"), read_rig("T4")
     assert truth.local(factory).abs().max() < 1e-12
 
 
@@ -148,7 +148,7 @@ def test_a_named_difficulty(tmp_path):
 
 def test_kappa_alone_is_the_papers_drift(tmp_path):
     assert simulate(tmp_path / "a", "--kappa", "0.01") == 0
-    truth, factory = load_rig(tmp_path / "a" / "truth" / "rig.yaml"), load_rig("T4")
+    truth, factory = read_rig(tmp_path / "a" / "truth" / "rig.yaml"), read_rig("T4")
     change = (truth.focal_length / factory.focal_length - 1).abs()
     assert 0.001 < change.max() <= 0.01
 
@@ -160,7 +160,7 @@ def test_a_rig_without_working_distance_is_simulated_in_its_volume(tmp_path):
     arguments = ["simulate", "--rig", str(tmp_path / "r.yaml"), "--object", "wand4", "--snapshots", "3"]
     assert main([*arguments, "--out", str(tmp_path / "a")]) == 0
     poses = np.loadtxt(tmp_path / "a" / "truth" / "rig_from_object.csv", delimiter=",", skiprows=1)
-    volume = load_rig(tmp_path / "r.yaml").volume
+    volume = read_rig(tmp_path / "r.yaml").volume
     assert volume.contains(poses[:, 4:] + 0.0).sum() >= 2  # the object's origin is not far from its centroid
     held = ["--poses", "hand-held", "--exposure-ms", "8", "--no-clutter", "--sensor.read-noise", "0"]
     assert main([*arguments, *held, "--out", str(tmp_path / "b")]) == 0

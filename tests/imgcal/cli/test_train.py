@@ -3,7 +3,7 @@ import signal
 import pytest
 
 from imgcal.cli.main import main
-from imgcal.io import holding, load_object, load_rig, read_metrics, save_rig
+from imgcal.io import holding, load_object, read_metrics, read_rig, save_rig
 from imgcal.networks import load_network
 from imgcal.training import engine
 from tests.imgcal.lensed import lensed
@@ -25,7 +25,7 @@ def train(experiment, out, *more):
 def test_a_network_comes_out(experiment, tmp_path, capsys):
     out = tmp_path / "deep" / "out"
     assert train(experiment, out, "--set", "training.steps=30", "optimizer.lr=1e-3", "--set", "training.steps=20") == 0
-    load_network(out / "model.safetensors", load_rig("T4"), load_object("asymmetric8"))
+    load_network(out / "model.safetensors", read_rig("T4"), load_object("asymmetric8"))
     printed = capsys.readouterr()
     assert printed.out == ""
     assert "step 20  RE " in printed.err and "validation RE" in printed.err
@@ -55,7 +55,7 @@ IMAGES = "{preset: hue-centroids, change: {trunk: {width: 16, depth: 1, later_de
 def test_a_rig_of_other_lenses_is_trained_for_compared_and_calibrated(tmp_path, capsys):
     """From an experiment file to a first guess; OpenCV's methods, which know one lens, are left out."""
     rig = tmp_path / "rig.yaml"
-    save_rig(lensed(load_rig("T4"), "mixed"), rig)
+    save_rig(lensed(read_rig("T4"), "mixed"), rig)
     runs = []
     for number, network in enumerate((POINTS, PAPER, IMAGES)):
         path = tmp_path / f"{number}.yaml"

@@ -16,7 +16,7 @@ from imgcal.cli.main import main
 from imgcal.cli.watch import metrics_address
 from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform
-from imgcal.io import load_object, load_rig, save_detections, save_object, save_rig
+from imgcal.io import load_object, read_rig, save_detections, save_object, save_rig
 from imgcal.io.frames import write_frame
 from imgcal.online import RigKeeper
 from imgcal.synthesis import Truth, simulate_volume, true_detections
@@ -73,7 +73,7 @@ def test_a_table_of_blobs_is_watched_once(blobs, stream, tmp_path, capsys):
     moved = [event for event in events(out) if event["event"] == "moved"]
     assert {event["camera"] for event in moved} == {"cam02"}
     assert moved[0]["since"] == "1970-01-01T00:00:00.500+00:00"
-    found = load_rig(out / "rig.yaml")
+    found = read_rig(out / "rig.yaml")
     truth = stream.bumped([1])  # of no size
     off = torch.rad2deg(found.local(truth)[:, :3].norm(dim=1))
     assert off.max() < 1.0 and (out / "state.json").is_file() and list(out.glob("history/*/*.yaml"))
@@ -139,7 +139,7 @@ def test_a_killed_process_goes_on_and_ctrl_c_ends_it_cleanly(blobs, tmp_path):
     (line,) = [text for text in complaint.splitlines() if "compiling" not in text]
     assert line.startswith("imgcal: interrupted after ") and line.endswith("the same command goes on from there")
     assert [event["event"] for event in events(out)].count("restart") == 1 and "restart: started again" in said
-    assert load_rig(out / "rig.yaml").num_cameras == 4
+    assert read_rig(out / "rig.yaml").num_cameras == 4
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def known(blobs, tmp_path_factory):
     return folder
 
 
-RIG, OBJECT = load_rig("T4"), load_object("asymmetric8")
+RIG, OBJECT = read_rig("T4"), load_object("asymmetric8")
 RATIONAL = replace(RIG, lens_model="rational", distortion=torch.nn.functional.pad(RIG.distortion, (0, 3)))
 
 
@@ -275,7 +275,7 @@ def test_the_state_of_another_version_is_told_and_nothing_is_lost(blobs, tmp_pat
     out = tmp_path / "out"
     assert watch(tmp_path / "blobs.csv", out) == 0
     state = out / "state.json"
-    state.write_text(state.read_text().replace("imgcal-keeper/6", "imgcal-keeper/5", 1))
+    state.write_text(state.read_text().replace("imgcal-keeper/7", "imgcal-keeper/6", 1))
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     capsys.readouterr()
     assert watch(tmp_path / "blobs.csv", out) == 2
@@ -377,7 +377,7 @@ def test_poses_of_a_recording_go_into_files(blobs, tmp_path, capsys):
 
 def light_blobs(snapshots):
     """Four markers that move evenly through a room of ten cameras, blobs without labels; where they are (S, 4, 3)."""
-    rig, wand = load_rig("room10"), load_object("wand4")
+    rig, wand = read_rig("room10"), load_object("wand4")
     start = simulate_volume(rig, wand, 1, torch.Generator().manual_seed(4), None)
     steps = torch.arange(snapshots)[:, None] * torch.tensor([8.0, 5.0, -3.0]).double()
     poses = RigidTransform(
@@ -414,7 +414,7 @@ def test_lights_become_points_in_a_file(tmp_path, capsys, suffix):
     kept = blobs.select(~gone)
     save_detections(replace(kept, fiducial=np.full(len(kept), -1)), tmp_path / "lights.csv")
     path, prior = tmp_path / f"trial{suffix}", RigPrior(2e-4, 0.3, 1e-4, 1e-4, 0.3)
-    save_rig(replace(load_rig("room10"), prior=prior), tmp_path / "rig.yaml")  # as good as calibrated
+    save_rig(replace(read_rig("room10"), prior=prior), tmp_path / "rig.yaml")  # as good as calibrated
     given = (
         str(tmp_path / "lights.csv"),
         "--rig",

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from imgcal.cli.main import main
-from imgcal.io import load_rig, save_rig
+from imgcal.io import read_rig, save_rig
 from imgcal.watch import Progress
 from tests.imgcal.streams import Stream
 
@@ -80,7 +80,7 @@ def blobs(tmp_path_factory):
 def frames(tmp_path_factory):
     """Frames of a capture in a folder, whose time stamps are those of the files."""
     folder = tmp_path_factory.mktemp("frames")
-    save_rig(load_rig("T4").resized(torch.tensor([512, 272])), folder / "rig.yaml")
+    save_rig(read_rig("T4").resized(torch.tensor([512, 272])), folder / "rig.yaml")
     known = ["--rig", str(folder / "rig.yaml"), "--object", "asymmetric8"]
     made = [*known, "--out", str(folder / "capture"), "--snapshots", "8", "--kappa", "0.002", "--no-clutter"]
     assert main(["simulate", *made]) == 0

@@ -5,14 +5,14 @@ import torch
 
 from imgcal.estimation import EstimationOptions, encode_options, initial_state, make_problem, map_operator, map_state
 from imgcal.geometry import RigidTransform
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import Observations
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor")  # opcheck itself asks its copies for it
 def test_is_sound(asymmetric8, monkeypatch):
-    rig = load_rig("T4")
+    rig = read_rig("T4")
     truth = simulate_truth(rig, asymmetric8, 2, torch.Generator().manual_seed(0), PhysicalDrift())
     seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
     observations = Observations(truth.uv, torch.full(seen.shape, 0.1, dtype=torch.float64), seen)

@@ -12,7 +12,7 @@ from imgcal.estimation.levenberg_marquardt import minimize
 from imgcal.estimation.linearization import linearize
 from imgcal.estimation.map_estimate import initial_state, make_loss, make_problem
 from imgcal.estimation.pose_support import UndeterminedPosesError, require_poses
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.pipeline import calibrate
 from imgcal.synthesis import simulate_volume, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
@@ -25,7 +25,7 @@ TRIPLE = ((-250.0, 0.0, 0.0), (-80.0, 0.0, 0.0), (250.0, 0.0, 0.0))
 
 def capture(points, snapshots, noise=0.1, seed=1):
     """Labelled blobs of an object in room10, of a rig that has drifted as its prior says."""
-    rig = load_rig("room10")
+    rig = read_rig("room10")
     obj = CalibrationObject(torch.tensor(points, dtype=torch.float64), torch.ones(len(points), 3))
     truth = simulate_volume(rig, obj, snapshots, torch.Generator().manual_seed(seed), PhysicalDrift())
     table = true_detections(truth)

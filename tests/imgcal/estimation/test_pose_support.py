@@ -8,7 +8,7 @@ import torch
 
 from imgcal.errors import RefusedError
 from imgcal.estimation.pose_support import UndeterminedPosesError, require_poses
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate
 from imgcal.synthesis import simulate_volume, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
@@ -17,7 +17,7 @@ STEM = 3  # the fiducial of the wand that does not lie on a line with the others
 
 
 def wand_capture(snapshots=8):
-    rig, wand = load_rig("room10"), load_object("wand4")
+    rig, wand = read_rig("room10"), load_object("wand4")
     truth = simulate_volume(rig, wand, snapshots, torch.Generator().manual_seed(1), PhysicalDrift())
     table = true_detections(truth)
     table.uv[:] += 0.1 * np.random.default_rng(1).standard_normal(table.uv.shape)

@@ -6,7 +6,7 @@ import torch
 
 from imgcal.errors import RefusedError
 from imgcal.estimation.rig_initialization import cold_start
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.synthesis import PhysicalDrift, arrange_rig, simulate_volume
 from imgcal.types import Observations, RigPrior
 
@@ -42,7 +42,7 @@ def test_a_rig_is_found_from_a_wand_and_rough_focal_lengths(shape, factor):
 
 
 def test_wrong_labels_do_little():
-    rig, wand = load_rig("room10").select([0, 3, 6]), load_object("wand4")
+    rig, wand = read_rig("room10").select([0, 3, 6]), load_object("wand4")
     truth, observations = seen_by(rig, wand, 60, seed=3)
     swapped = np.random.default_rng(0).random(observations.seen.shape[:2]) < 0.1
     observations.uv[torch.from_numpy(swapped)] = observations.uv[torch.from_numpy(swapped)][:, [2, 1, 0, 3]]
@@ -66,7 +66,7 @@ def test_each_camera_may_have_labelled_another_turn_of_a_cube():
 
 
 def test_a_camera_that_shares_nothing_is_named():
-    rig, wand = load_rig("room10").select([0, 3, 6]), load_object("wand4")
+    rig, wand = read_rig("room10").select([0, 3, 6]), load_object("wand4")
     truth, observations = seen_by(rig, wand, 30)
     observations.seen[:15, 2] = False
     observations.seen[15:, :2] = False

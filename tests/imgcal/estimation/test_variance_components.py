@@ -9,7 +9,7 @@ import torch
 from imgcal.association.series import associate
 from imgcal.errors import RefusedError
 from imgcal.estimation import variance_components
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate, fit_labelled, fitting
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
@@ -53,7 +53,7 @@ def test_the_latest_result_gives_way_where_a_label_does_not_fit(o10, asymmetric8
 def hard(seed):
     """A rig of six that has drifted several times as far as its prior allows; heavy tails and many wrong labels."""
     random = np.random.default_rng(seed)
-    rig, obj, far = load_rig("O6"), load_object("asymmetric8"), random.uniform(1, 6)
+    rig, obj, far = read_rig("O6"), load_object("asymmetric8"), random.uniform(1, 6)
     drift = PhysicalDrift(0.57 * far, 10 * far, 0.02 * far, 10 * far, 0.02 * far)
     snapshots = int(random.choice([1, 2, 4, 8]))
     table = true_detections(simulate_truth(rig, obj, snapshots, torch.Generator().manual_seed(seed), drift))

@@ -10,7 +10,7 @@ from torch import nn
 from imgcal.evaluation import Conditions
 from imgcal.evaluation.protocol import Sample, draw
 from imgcal.geometry.transforms import RigidTransform
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.synthesis import Corruption
 from imgcal.synthesis.rigs import PoseRange, RelativeDrift
 from imgcal.types.prediction import Prediction
@@ -32,7 +32,7 @@ def conditions() -> Make:
 
     def make(*, kappa: float = 0.02, rig: str = "T4", **corruption: float) -> Conditions:
         drift = RelativeDrift(kappa, kappa)
-        return Conditions(load_rig(rig), load_object("asymmetric8"), drift=drift, corruption=Corruption(**corruption))
+        return Conditions(read_rig(rig), load_object("asymmetric8"), drift=drift, corruption=Corruption(**corruption))
 
     return make
 

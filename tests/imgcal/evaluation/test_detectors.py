@@ -15,14 +15,14 @@ from imgcal.evaluation.detectors import (
     draw_capture,
     judge,
 )
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate
 from imgcal.synthesis import FrameModel, PhysicalDrift, simulate_truth, true_detections
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return Scene(load_rig("T4"), load_object("asymmetric8"), {"easy": FrameModel(), "same": FrameModel()}, snapshots=2)
+    return Scene(read_rig("T4"), load_object("asymmetric8"), {"easy": FrameModel(), "same": FrameModel()}, snapshots=2)
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 
 from imgcal.errors import InputError
 from imgcal.evaluation.models import _names, load_models
-from imgcal.io import data_path, load_object, load_rig
+from imgcal.io import data_path, load_object, read_rig
 from imgcal.networks import load_checkpoint
 from imgcal.pipeline.initialization import load_initializer
 
@@ -18,7 +18,7 @@ def test_a_shipped_network_knows_what_it_is_for() -> None:
     [model] = load_models([POINTS])
     assert model.name == POINTS.stem and model.size == POINTS.stat().st_size and model.history == ()
     assert model.facts.parameters == model.parameters > 10**5
-    assert model.conditions.rig.camera_names == load_rig("O10").camera_names
+    assert model.conditions.rig.camera_names == read_rig("O10").camera_names
     assert model.conditions.obj.num_fiducials == 8 and model.conditions.corruption.noise == 0
 
 
@@ -39,7 +39,7 @@ def test_a_training_of_positions_says_no_rig(tmp_path) -> None:
     with pytest.raises(InputError, match=r"found a training of positions, whose trunk is untrained"):
         load_models([file])
     with pytest.raises(InputError, match=r"positions\.safetensors: found a training of positions"):
-        load_initializer(str(file), load_rig("O10"), load_object("asymmetric8"))
+        load_initializer(str(file), read_rig("O10"), load_object("asymmetric8"))
 
 
 def test_networks_must_be_for_the_same_rig_and_object() -> None:
@@ -47,9 +47,9 @@ def test_networks_must_be_for_the_same_rig_and_object() -> None:
     with pytest.raises(InputError, match="another object"):
         load_models([POINTS, cube])
     with pytest.raises(InputError, match="another rig than T4"):
-        load_models([POINTS], load_rig("T4"))
+        load_models([POINTS], read_rig("T4"))
     assert load_models([]) == []
-    assert len(load_models([POINTS], load_rig("O10"), load_object("asymmetric8"))) == 1
+    assert len(load_models([POINTS], read_rig("O10"), load_object("asymmetric8"))) == 1
 
 
 def test_names_are_as_short_as_they_can_be(tmp_path) -> None:

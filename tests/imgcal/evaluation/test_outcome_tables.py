@@ -2,7 +2,7 @@ import json
 
 from imgcal.evaluation.detectors import Outcome, Scene
 from imgcal.evaluation.outcome_tables import detector_tables, detector_values
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.synthesis import FrameModel
 
 
@@ -36,7 +36,7 @@ def test_what_each_detector_made_of_each_difficulty():
 
 
 def test_values_are_plain_and_count_reasons():
-    scene = Scene(load_rig("T4"), load_object("cube8"), {"easy": FrameModel(), "hard": FrameModel()})
+    scene = Scene(read_rig("T4"), load_object("cube8"), {"easy": FrameModel(), "hard": FrameModel()})
     values = json.loads(json.dumps(detector_values(OUTCOMES, scene, {"seed": 3}), allow_nan=False))
     assert values["reasons"] == {"plain": {"why": 2}, "net": {"why": 1}}
     assert len(values["outcomes"]) == len(OUTCOMES) and values["outcomes"][0]["held_out_px"] == 0.1

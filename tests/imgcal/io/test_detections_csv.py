@@ -12,7 +12,7 @@ from imgcal.io import csv_file
 from imgcal.io.csv_file import CHUNK, Chunk
 from imgcal.io.detections_csv import DEFAULT_SIGMA, load_detections, save_detections
 from imgcal.io.object_csv import load_object
-from imgcal.io.rig_yaml import load_rig
+from imgcal.io.rig_yaml import read_rig
 from imgcal.types.calibration_object import CalibrationObject
 from imgcal.types.observations import Detections
 
@@ -85,7 +85,7 @@ def test_minimal_file_and_defaults(tmp_path: Path) -> None:
 def test_cameras_come_from_the_rig(tmp_path: Path) -> None:
     path = tmp_path / "d.csv"
     path.write_text("snapshot,camera,u,v\n0,cam03,1,2\n0,cam01,-0.5,1087.5\n")
-    rig = load_rig("O10")
+    rig = read_rig("O10")
     detections = load_detections(path, rig)
     assert detections.camera_names == rig.camera_names
     assert detections.camera.tolist() == [2, 0]
@@ -133,7 +133,7 @@ def test_bad_files_give_one_clear_line(content: str | bytes, message: str, tmp_p
     path = tmp_path / "bad.csv"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(InputError, match=message) as caught:
-        load_detections(path, load_rig("O10"), fiducials=8)
+        load_detections(path, read_rig("O10"), fiducials=8)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
 

@@ -1,4 +1,4 @@
-"""The file beside rig.yaml: exact, attached by load_rig, and damage is one line."""
+"""The file beside rig.yaml: exact, attached by read_rig, and damage is one line."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import imgcal
-from imgcal.io import load_rig, read_posterior, save_rig, write_posterior
+from imgcal.io import read_posterior, read_rig, save_rig, write_posterior
 from imgcal.types import RigPosterior
 
 
@@ -34,15 +34,15 @@ def test_what_is_written_is_read_again_exactly(tmp_path: Path) -> None:
 def test_load_rig_attaches_it_unless_the_file_is_gone_or_the_rig_was_edited(tmp_path: Path) -> None:
     rig, path = imgcal.load_rig("T4"), tmp_path / "rig.yaml"
     save_rig(rig, path, posterior=posterior_for(rig))
-    found = load_rig(path)
+    found = read_rig(path)
     assert found.posterior is not None
     assert found.posterior().belongs_to(found)
     path.write_text(path.read_text().replace(str(float(rig.focal_length[0, 0])), "1500.0", 1))
-    edited = load_rig(path)
+    edited = read_rig(path)
     assert edited.posterior is not None
     assert not edited.posterior().belongs_to(edited)
     (tmp_path / "rig.posterior.safetensors").unlink()
-    assert load_rig(path).posterior is None
+    assert read_rig(path).posterior is None
 
 
 def test_damage_is_one_line_that_names_the_file(tmp_path: Path) -> None:

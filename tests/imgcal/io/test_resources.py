@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.io import load_object, load_rig, names, open_capture, open_input
+from imgcal.io import load_object, names, open_capture, open_input, read_rig
 from imgcal.io.names import data_path, sample_path, shipped_names
 
 
@@ -12,7 +12,7 @@ def test_what_ships_is_there_and_can_be_read() -> None:
     assert "O10" in rigs and "asymmetric8" in objects
     assert list(rigs) == sorted(rigs)
     for name in rigs:
-        assert load_rig(name).num_cameras == load_rig(data_path("rigs", f"{name}.yaml")).num_cameras > 0
+        assert read_rig(name).num_cameras == read_rig(data_path("rigs", f"{name}.yaml")).num_cameras > 0
     for name in objects:
         assert load_object(name).num_fiducials >= 3
     assert shipped_names("nothing", ".yaml") == ()
@@ -29,14 +29,14 @@ def test_an_installed_package_carries_its_data(tmp_path: Path, monkeypatch) -> N
 
 def test_a_sample_is_found_by_its_name_from_any_folder(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    folder, rig = data_path("samples", "O10"), load_rig("sample:O10")
+    folder, rig = data_path("samples", "O10"), read_rig("sample:O10")
     assert sample_path("sample:O10") == folder and sample_path("sample") == Path("sample")
-    assert rig.name == load_rig(folder / "rig.yaml").name != load_rig("O10").name
+    assert rig.name == read_rig(folder / "rig.yaml").name != read_rig("O10").name
     assert bool((load_object("sample:O10").points == load_object(folder / "object.csv").points).all())
     assert open_input("sample:O10", rig).folder == open_capture("sample:O10", rig).folder == folder
 
 
-@pytest.mark.parametrize("load", [load_rig, load_object, open_input])
+@pytest.mark.parametrize("load", [read_rig, load_object, open_input])
 def test_a_sample_that_does_not_exist_is_refused_with_those_that_do(load) -> None:
     with pytest.raises(InputError, match="sample:O11: no such sample, expected sample:O10"):
         load("sample:O11")

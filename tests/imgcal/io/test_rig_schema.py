@@ -11,7 +11,7 @@ import yaml
 
 from imgcal.errors import InputError
 from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.io.rig_yaml import RigCovariance, load_rig, load_rig_covariance, save_rig
+from imgcal.io.rig_yaml import RigCovariance, load_rig_covariance, read_rig, save_rig
 from imgcal.types.rig import RigPrior
 
 TEXT = """\
@@ -40,7 +40,7 @@ prior:
 def test_reads_the_documented_example(tmp_path: Path) -> None:
     path = tmp_path / "pair.yaml"
     path.write_text(TEXT)
-    rig = load_rig(path)
+    rig = read_rig(path)
     assert rig.camera_names == ("left", "right")
     assert rig.name == "pair"
     assert rig.working_distance == 850.14
@@ -70,12 +70,12 @@ def test_reads_the_documented_example(tmp_path: Path) -> None:
 )
 def test_lenses_that_cannot_be(model: str, lens: list[float], message: str, tmp_path: Path) -> None:
     path = tmp_path / "r.yaml"
-    save_rig(load_rig("T4").select([0]), path)
+    save_rig(read_rig("T4").select([0]), path)
     lines = [line for line in path.read_text().splitlines() if not line.lstrip().startswith("distortion: [")]
     at = next(i for i, line in enumerate(lines) if "principal_point: [" in line)
     path.write_text("\n".join([*lines[:at], f"  model: {model}", f"  distortion: {lens}", *lines[at:]]) + "\n")
     with pytest.raises(InputError, match=re.escape(message)):
-        load_rig(path)
+        read_rig(path)
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_bad_files_give_one_clear_line(old: str, new: str, message: str, tmp_pat
     assert old in TEXT
     path.write_text(TEXT.replace(old, new))
     with pytest.raises(InputError, match=message) as caught:
-        load_rig(path)
+        read_rig(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
 
@@ -179,11 +179,11 @@ def _edit(content: dict[str, Any], case: str) -> None:
 )
 def test_bad_covariance(case: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "r.yaml"
-    rig = replace(load_rig("T4").select([0, 1, 2]), camera_names=("a", "b", "c"))
+    rig = replace(read_rig("T4").select([0, 1, 2]), camera_names=("a", "b", "c"))
     root = torch.randn(45, 45, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     save_rig(rig, path, RigCovariance.from_matrix(root @ root.mT / 100, 3, "a"), full=True)
     content = yaml.safe_load(path.read_text())
     _edit(content, case)
     path.write_text(yaml.safe_dump(content))
     with pytest.raises(InputError, match=message):
-        load_rig(path)
+        read_rig(path)

@@ -10,9 +10,9 @@ from imgcal.errors import InputError
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io.cameras_yaml import save_cameras
-from imgcal.io.rig_yaml import RigCovariance, load_rig, load_rig_covariance, save_rig
+from imgcal.io.rig_yaml import RigCovariance, load_rig_covariance, read_rig, save_rig
 from imgcal.types.rig import CameraRig, DriftRate, RigPrior
-from imgcal.types.volume import Volume
+from imgcal.types.volume import ConvexVolume
 
 
 def make_rig(numbers: torch.Tensor, names: tuple[str, ...] = ("a", "b", "c")) -> CameraRig:
@@ -42,10 +42,10 @@ def covariance_of(cameras: int) -> RigCovariance:
 @pytest.mark.parametrize(("name", "cameras"), [("O10", 10), ("O6", 6), ("U7", 7), ("T4", 4)])
 def test_shipped_rigs_load_by_name(name: str, cameras: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    rig = load_rig(name)
+    rig = read_rig(name)
     assert (rig.name, rig.num_cameras) == (name, cameras)
     (tmp_path / name).mkdir()  # a folder of that name, a capture perhaps, is in nobody's way
-    assert load_rig(name).num_cameras == cameras
+    assert read_rig(name).num_cameras == cameras
 
 
 finite = st.floats(-1e3, 1e3, allow_nan=False)
@@ -61,7 +61,7 @@ def test_round_trip_is_exact(tmp_path_factory: pytest.TempPathFactory, numbers: 
     # Near the smallest focal lengths half a unit of distortion is absurd.
     rig = replace(rig, distortion=rig.distortion * (rig.focal_length.amin() / 2000).clamp(max=1) ** 6)
     save_rig(rig, path)
-    loaded = load_rig(path)
+    loaded = read_rig(path)
     for name in ("focal_length", "principal_point", "distortion", "image_size"):
         assert torch.equal(getattr(loaded, name), getattr(rig, name))
     assert torch.equal(loaded.cam_from_rig.translation, rig.cam_from_rig.translation)
@@ -75,15 +75,16 @@ def test_round_trip_is_exact(tmp_path_factory: pytest.TempPathFactory, numbers: 
 def test_names_that_look_like_something_else_survive(name: str, tmp_path: Path) -> None:
     rig = make_rig(torch.zeros(1, 15, dtype=torch.float64), (name,))
     save_rig(rig, tmp_path / "r.yaml")
-    assert load_rig(tmp_path / "r.yaml").camera_names == (name,)
+    assert read_rig(tmp_path / "r.yaml").camera_names == (name,)
 
 
 @pytest.mark.parametrize(
-    "volume", [Volume.box((-1, -2, 3), (1, 2, 4.5)), Volume(((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 7.25)))]
+    "volume",
+    [ConvexVolume.box((-1, -2, 3), (1, 2, 4.5)), ConvexVolume(((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 7.25)))],
 )
-def test_a_volume_survives(volume: Volume, tmp_path: Path) -> None:
+def test_a_volume_survives(volume: ConvexVolume, tmp_path: Path) -> None:
     save_rig(replace(make_rig(torch.zeros(3, 15, dtype=torch.float64)), volume=volume), tmp_path / "r.yaml")
-    assert load_rig(tmp_path / "r.yaml").volume == volume
+    assert read_rig(tmp_path / "r.yaml").volume == volume
     assert ("low" in (tmp_path / "r.yaml").read_text()) == volume.is_box
 
 
@@ -98,13 +99,13 @@ def test_lens_models_round_trip(tmp_path: Path) -> None:
     path = tmp_path / "r.yaml"
     covariance = RigCovariance.from_matrix(root @ root.mT / 100, 3)
     save_rig(rig, path, covariance, full=True)
-    back, known = load_rig(path), load_rig_covariance(path)
+    back, known = read_rig(path), load_rig_covariance(path)
     assert back.lens_model == models and torch.equal(back.distortion, lenses)
     assert known is not None and known.matrix is not None and torch.equal(known.matrix, covariance.matrix)
     assert "distortion: [0.01, 0.01, 0.01, 0.01]" in path.read_text()
     one = rig.select([0])  # as wide as the rig that it is of; the file is not
     save_rig(one, path, RigCovariance.from_matrix(covariance.matrix[:18, :18], 1), full=True)
-    narrow = load_rig(path)
+    narrow = read_rig(path)
     assert narrow.lens_model == "equidistant" and narrow.distortion.shape == (1, 5)
     points = torch.tensor([[50.0, -20.0, 900.0]], dtype=torch.float64)
     torch.testing.assert_close(narrow.project(points).uv, one.project(points).uv, rtol=0, atol=1e-9)
@@ -123,21 +124,21 @@ def test_covariance_round_trip(tmp_path: Path) -> None:
     loaded = load_rig_covariance(path)
     assert loaded is not None and loaded.matrix is None
     torch.testing.assert_close(loaded.std, covariance.std, rtol=1e-5, atol=0)
-    assert load_rig(path).num_cameras == 3
+    assert read_rig(path).num_cameras == 3
     assert max(map(len, path.read_text().splitlines())) < 300
 
 
 def test_deep_nesting_is_no_traceback(tmp_path: Path) -> None:
     (tmp_path / "deep.yaml").write_text("[" * 5000)
     with pytest.raises(InputError, match=r"deep\.yaml: not valid YAML"):
-        load_rig(tmp_path / "deep.yaml")
+        read_rig(tmp_path / "deep.yaml")
 
 
 def test_unknown_name_offers_the_nearest(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"O11: no such file.*O10, O6, T4, U7.*nearest: O10"):
-        load_rig("O11")
+        read_rig("O11")
     with pytest.raises(InputError, match="found a folder"):
-        load_rig(tmp_path)
+        read_rig(tmp_path)
 
 
 def test_what_could_not_be_read_again_is_not_written(tmp_path: Path) -> None:
@@ -153,4 +154,4 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path: Path) -> None:
 def test_cameras_without_places_are_no_rig_and_the_way_on_is_told(tmp_path: Path) -> None:
     save_cameras({"left": (1280, 1024), "right": (1280, 1024)}, 65.0, tmp_path / "cameras.yaml")
     with pytest.raises(InputError, match=r"found `format: 'imgcal-cameras/1'`.* given as --cameras instead of --rig"):
-        load_rig(tmp_path / "cameras.yaml")
+        read_rig(tmp_path / "cameras.yaml")

@@ -1,13 +1,13 @@
 import time
 
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.live_page.address import Address
 from imgcal.live_page.demonstration import SETTLED, Demonstration
 from tests.imgcal.live_page.pages import Client
 
 
 def test_buttons_do_what_they_say(asymmetric8):
-    with Demonstration(load_rig("T4"), asymmetric8, Address(port=0), seed=1) as shown:
+    with Demonstration(read_rig("T4"), asymmetric8, Address(port=0), seed=1) as shown:
         client, seconds = Client(shown.page), iter(range(1000))
 
         def pressed(name, **more):

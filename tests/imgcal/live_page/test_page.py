@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import pytest
 
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.live_page.address import Address
 from imgcal.live_page.commands import Command
 from imgcal.live_page.demonstration import Demonstration
@@ -269,7 +269,7 @@ def test_a_report_opens_without_a_server(browser, calm, tmp_path):
 
 def test_a_bump_at_the_press_of_a_button_is_told_with_its_camera(browser, asymmetric8):
     """The whole chain: button, server, loop, simulated rig, keeper, server, page."""
-    with Demonstration(load_rig("T4"), asymmetric8, Address(port=0), seed=1) as shown:
+    with Demonstration(read_rig("T4"), asymmetric8, Address(port=0), seed=1) as shown:
         seconds = (number / 15 for number in range(10**6))
 
         def runs_until(done):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.live_page.rig_drawing import arrangement, forward, upright, viewing_volume
 from tests.imgcal.live_page.pages import dome
 
@@ -10,7 +10,7 @@ from tests.imgcal.live_page.pages import dome
     ("name", "up", "inward"), [("O10", [0, -1, 0], False), ("T4", [0, -1, 0], False), ("room10", [0, 0, 1], True)]
 )
 def test_up_is_where_the_images_have_their_top(name, up, inward):
-    rig = load_rig(name)
+    rig = read_rig(name)
     found = arrangement(rig, viewing_volume(rig))
     assert found["up"] == pytest.approx(up, abs=0.01) and found["inward"] is inward
     assert np.dot(found["up"], found["ahead"]) == pytest.approx(0, abs=1e-4)
@@ -35,5 +35,5 @@ def test_cameras_that_are_rolled_every_way_leave_the_normal_of_their_plane():
 
 
 def test_one_camera_has_a_size():
-    rig = load_rig("O10").select([0])
+    rig = read_rig("O10").select([0])
     assert arrangement(rig, viewing_volume(rig))["size"] > 0

@@ -132,13 +132,13 @@ def test_alarms_are_acknowledged_for_everybody(served, client, stream, o10, asym
 
 
 def test_downloads_hold_the_present_rig_and_no_token(served, client, stream, o10, tmp_path):
-    from imgcal.io import load_rig
+    from imgcal.io import read_rig
 
     status, headers, text = client.download("/rig.yaml")
     assert status == 200
     assert headers["content-disposition"] == 'attachment; filename="rig.yaml"'
     (tmp_path / "rig.yaml").write_text(text)
-    assert load_rig(tmp_path / "rig.yaml").camera_names == o10.camera_names
+    assert read_rig(tmp_path / "rig.yaml").camera_names == o10.camera_names
     status, _, report = client.download("/report.html")
     assert status == 200 and client.token() not in report
     data = json.loads(report.split('id="data">')[1].split("</script>")[0])

@@ -4,7 +4,7 @@ import torch
 
 from imgcal.association import lattice_shifts
 from imgcal.geometry import RigidTransform
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.matching.correlation import Scores
 from imgcal.matching.maps import surprise_maps
 from imgcal.matching.poses import Matcher, Ranked, Scene
@@ -56,7 +56,7 @@ def test_a_camera_that_is_a_step_of_the_lattice_off_is_put_right(cameras):
     """The whole pattern shifted by one dot in some camera hides its edge only: what was found there is no more."""
     side = torch.arange(9, dtype=torch.float64)
     points = 25.0 * torch.cartesian_prod(side, side, torch.zeros(1, dtype=torch.float64))
-    rig, obj = load_rig("T4").resized(torch.tensor((640, 340))), CalibrationObject(points - points.mean(0), palette(81))
+    rig, obj = read_rig("T4").resized(torch.tensor((640, 340))), CalibrationObject(points - points.mean(0), palette(81))
     truth = simulate_truth(rig, obj, 1, torch.Generator().manual_seed(2), PhysicalDrift())
     uv, (v, u) = truth.uv[0].numpy(), np.mgrid[:340, :640]
     draw = np.random.default_rng(0)

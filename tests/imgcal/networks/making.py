@@ -2,7 +2,7 @@
 
 import torch
 
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.networks import NetworkConfig, build
 from imgcal.synthesis.colour_coding import render_views
 from imgcal.synthesis.rigs import RelativeDrift, synthesize
@@ -14,7 +14,7 @@ SMALL = ["points", "points-one-pass", "points-cnn1d", "hue-centroids", "vit", "c
 
 
 def make(preset, rig="T4", obj="asymmetric8", lens=None, **change):
-    factory, thing = load_rig(rig).to(torch.float32), load_object(obj)
+    factory, thing = read_rig(rig).to(torch.float32), load_object(obj)
     factory = factory if lens is None else lensed(factory, lens)
     weights = torch.Generator().manual_seed(0)
     return build(NetworkConfig(preset=preset, change=change), factory, thing, DRIFT.std(factory), weights).eval()

@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import save
 
 from imgcal.errors import InputError
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.io.safetensors_file import read_tensors, write_tensors
 from imgcal.networks import Checkpoint, build_network, load_checkpoint, load_network, save_checkpoint, warm_start
 from imgcal.networks.checkpoint import FORMAT
@@ -54,7 +54,7 @@ def path(made, tmp_path):
 
 def test_a_network_comes_back(made, path):
     experiment, network = made
-    found = load_checkpoint(path, load_rig("T4"), load_object("asymmetric8"))
+    found = load_checkpoint(path, read_rig("T4"), load_object("asymmetric8"))
     views = Views(uv=1000 * torch.rand(3, 4, 8, 2), seen=torch.ones(3, 4, 8, dtype=torch.bool))
     expected, again = network(views)[-1], found.network(views)[-1]
     assert torch.equal(again.rig.focal_length, expected.rig.focal_length)
@@ -64,7 +64,7 @@ def test_a_network_comes_back(made, path):
     assert checkpoint_experiment(found.experiment) == experiment
     assert found.experiment.drift == experiment.drift and found.experiment.poses == experiment.poses
     assert found.obj.name == "asymmetric8"
-    torch.testing.assert_close(found.drift_std, experiment.drift.std(load_rig("T4")), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(found.drift_std, experiment.drift.std(read_rig("T4")), rtol=1e-9, atol=1e-12)
 
 
 DEEP = '{"a":' * 200 + "1" + "}" * 200
@@ -142,7 +142,7 @@ def test_a_rig_in_single_precision_is_the_same(made, tmp_path):
     experiment, network = made
     checkpoint = Checkpoint(network, network.factory, network.obj, experiment, {})
     save_checkpoint(tmp_path / "a.safetensors", checkpoint)
-    load_network(tmp_path / "a.safetensors", load_rig("T4"), load_object("asymmetric8"))
+    load_network(tmp_path / "a.safetensors", read_rig("T4"), load_object("asymmetric8"))
 
 
 def test_bfloat16_is_for_parameters_only(made, tmp_path):
@@ -167,11 +167,11 @@ def test_bfloat16_is_for_parameters_only(made, tmp_path):
 )
 def test_another_rig_or_object_is_refused(path, rig, obj, expected):
     with pytest.raises(InputError, match=re.escape(expected)):
-        load_network(path, load_rig(rig), load_object(obj))
+        load_network(path, read_rig(rig), load_object(obj))
 
 
 def test_another_factory_value_is_refused_by_camera(path):
-    rig = load_rig("T4")
+    rig = read_rig("T4")
     principal_point = rig.principal_point.clone()
     principal_point[2, 1] += 0.1
     with pytest.raises(InputError, match=r"principal point of cam03: found 1024, 544\.1, expected 1024, 544"):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.networks import NetworkConfig, build
 from tests.imgcal.networks.making import DRIFT, make
 
@@ -12,7 +12,7 @@ from tests.imgcal.networks.making import DRIFT, make
 def test_a_rig_without_working_distance_is_refused():
     from dataclasses import replace
 
-    factory = replace(load_rig("T4").to(torch.float32), working_distance=None)
+    factory = replace(read_rig("T4").to(torch.float32), working_distance=None)
     with pytest.raises(InputError, match="working_distance"):
         build(NetworkConfig(preset="points"), factory, load_object("cube8"), DRIFT.std(factory), torch.Generator())
 

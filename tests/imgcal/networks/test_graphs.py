@@ -9,7 +9,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils._pytree import tree_leaves
 
 import imgcal.nn  # noqa: F401  value types as pytrees
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.networks import NetworkConfig, build
 from imgcal.types import CalibrationObject, RigPrior, Views
 from renderers import splat
@@ -28,7 +28,7 @@ IMAGES = {
 def make(preset: str, change: dict[str, Any], obj: CalibrationObject) -> nn.Module:
     """Make a small network whose heads say something."""
     random = torch.Generator().manual_seed(0)
-    factory = load_rig("T4").to(torch.float32)
+    factory = read_rig("T4").to(torch.float32)
     network = build(NetworkConfig(preset=preset, change=change), factory, obj, RigPrior().std(factory), random)
     for parameter in network.parameters():
         if not parameter.any():

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.networks import NetworkConfig, Positions, build
 from imgcal.nn import MapEstimate, project_fiducials
 from imgcal.synthesis.colour_coding import ImageOptions, render_views
@@ -20,7 +20,7 @@ TRUNK = {"width": 16, "heads": 2, "depth": 1, "later_depth": 1}
 
 def spoken(preset, size=64):
     """A small network whose heads say something."""
-    factory, thing = load_rig("T4").to(torch.float32), load_object("asymmetric8")
+    factory, thing = read_rig("T4").to(torch.float32), load_object("asymmetric8")
     config = NetworkConfig(preset=preset, change=TINY.get(preset, {}) | {"trunk": TRUNK})
     weights = torch.Generator().manual_seed(0)
     network = build(config, factory, thing, DRIFT.std(factory), weights, ImageOptions(size=size))
@@ -31,7 +31,7 @@ def spoken(preset, size=64):
 
 
 def test_images_are_drawn_as_is_asked_for():
-    factory, thing = load_rig("T4").to(torch.float32), load_object("asymmetric8")
+    factory, thing = read_rig("T4").to(torch.float32), load_object("asymmetric8")
     given = (factory, thing, DRIFT.std(factory), torch.Generator(), ImageOptions(size=64, dot=2.0))
     assert build(NetworkConfig(preset="vit"), *given).image_options == ImageOptions(size=64, dot=2.0)
     with pytest.raises(InputError, match="the network points takes points"):

@@ -5,7 +5,7 @@ import torch
 
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.networks.parameterization import POSE_SHIFT, Parameterization
 from imgcal.synthesis.rigs import RelativeDrift, synthesize
 from imgcal.types.parameter_vectors import pack18, pack21
@@ -19,7 +19,7 @@ B, C = 3, 4
 @pytest.fixture
 def parameterization():
     """In float64, to compare exactly."""
-    rig = load_rig("T4")
+    rig = read_rig("T4")
     return Parameterization(rig, load_object("asymmetric8"), DRIFT.std(rig)).double()
 
 
@@ -43,7 +43,7 @@ def test_the_18_numbers_are_scaled_by_those_of_the_rig(parameterization, truth):
 
 @pytest.mark.parametrize("lens", KINDS)
 def test_coefficients_that_a_lens_does_not_have_stay_zero(lens):
-    rig = lensed(load_rig("T4"), lens)
+    rig = lensed(read_rig("T4"), lens)
     parameterization = Parameterization(rig, load_object("asymmetric8"), DRIFT.std(rig)).double()
     assert sum(parameterization.widths.values()) == 13 + rig.distortion.shape[-1]
     numbers = torch.ones(B, C, 13 + rig.distortion.shape[-1], dtype=torch.float64)

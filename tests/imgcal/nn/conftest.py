@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from imgcal.geometry import RigidTransform, rotation_from_vector
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.types import CalibrationObject, CameraRig, RigPrior
 
 
@@ -36,7 +36,7 @@ def batch(request: pytest.FixtureRequest) -> tuple[int, ...]:
 @pytest.fixture(scope="session")
 def rig() -> CameraRig:
     """Four cameras, float64."""
-    return load_rig("T4")
+    return read_rig("T4")
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ import torch
 import imgcal
 from imgcal.errors import InputError
 from imgcal.online import RigKeeper, RigState
-from imgcal.types import CalibrationObject, CameraRig, DriftRate, RigPrior, Volume
+from imgcal.types import CalibrationObject, CameraRig, ConvexVolume, DriftRate, RigPrior
 from imgcal.types.board import Board
 from scripts.benchmarks.rig_streams import Bump, Stream
 
@@ -80,7 +80,7 @@ def test_the_same_snapshots_give_the_same_states(saved, tmp_path: Path) -> None:
 
 def test_what_a_rig_file_may_hold_beside_its_cameras_is_gone_on_with(tmp_path: Path) -> None:
     made = stream()
-    volume = Volume.box((-100.0, -100.0, 700.0), (100.0, 100.0, 900.0))
+    volume = ConvexVolume.box((-100.0, -100.0, 700.0), (100.0, 100.0, 900.0))
     rig = replace(made.factory, volume=volume, prior=RigPrior(position=3.0), drift_rate=DriftRate(position=0.1))
     with RigKeeper(rig, made.obj) as keeper:
         for seconds, blobs in made.snapshots(3):
@@ -97,7 +97,7 @@ def test_what_a_rig_file_may_hold_beside_its_cameras_is_gone_on_with(tmp_path: P
 
 def test_people_can_read_it(saved) -> None:
     content = json.loads(saved[0].read_text())
-    assert content["format"] == "imgcal-keeper/6"
+    assert content["format"] == "imgcal-keeper/7"
     assert content["sentence"].startswith("cam02 moved")
     assert content["snapshot"] == "00015"
     assert content["cameras"]["cam01"] == "ok"

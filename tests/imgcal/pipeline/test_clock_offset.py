@@ -8,7 +8,7 @@ import torch
 
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform, rotation_from_vector
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.pipeline import LateCamera, calibrate
 from imgcal.pipeline.clock_offset import timing_motion
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
@@ -19,7 +19,7 @@ COUNT = 14
 
 def moving_object(*, camera=2, first=COUNT, by=0, bump=0.0, step=30.0, tilt=0.15):
     """Blobs of T4 and a hand-moved object; from snapshot `first` on, one camera shows another moment or is bumped."""
-    rig, obj = load_rig("T4"), load_object("asymmetric8")
+    rig, obj = read_rig("T4"), load_object("asymmetric8")
     generator = torch.Generator().manual_seed(0)
     truth = simulate_truth(rig, obj, COUNT + 2, generator, PhysicalDrift())
     time = torch.arange(COUNT + 2).double()[:, None]

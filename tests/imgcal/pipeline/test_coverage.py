@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from imgcal.geometry import RigidTransform
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.pipeline import Coverage, calibrate, measure_coverage
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from imgcal.types import RigPrior
@@ -19,7 +19,7 @@ def std_of(result):
 @pytest.fixture(scope="module")
 def narrow():
     """A calibration from a few snapshots in the middle of the images."""
-    rig, obj = load_rig("T4"), load_object("asymmetric8")
+    rig, obj = read_rig("T4"), load_object("asymmetric8")
     truth = simulate_truth(rig, obj, 4, torch.Generator().manual_seed(1), PhysicalDrift())
     return truth, calibrate(true_detections(truth), rig, obj)
 
@@ -69,7 +69,7 @@ def test_all_is_known_where_the_object_was_everywhere():
 
 def test_a_lens_that_is_held_is_not_said_to_be_undetermined(narrow):
     truth, result = narrow
-    rig = load_rig("T4")
+    rig = read_rig("T4")
     held = replace(rig, prior=replace(result.rig.prior or RigPrior(), distortion=1e-6))
     known = measure_coverage(
         found := calibrate(true_detections(truth), held, load_object("asymmetric8")), std_of(found)
@@ -79,7 +79,7 @@ def test_a_lens_that_is_held_is_not_said_to_be_undetermined(narrow):
 
 def test_a_wide_capture_covers_more(narrow):
     truth, _ = narrow
-    rig, obj = load_rig("T4"), load_object("asymmetric8")
+    rig, obj = read_rig("T4"), load_object("asymmetric8")
     steps = torch.linspace(-130.0, 130.0, 4, dtype=torch.float64)
     shifts = torch.cat((torch.cartesian_prod(steps, steps), torch.zeros(16, 1)), dim=1).double()
     base = truth.rig_from_object

@@ -9,7 +9,7 @@ from imgcal.io import load_object
 from imgcal.pipeline import calibrate, unit_doubt
 from imgcal.pipeline.from_scratch import calibrate_from_scratch
 from imgcal.synthesis import HandHeld, PhysicalDrift, arrange_rig, simulate_volume, true_detections
-from imgcal.types import RigPrior, Volume
+from imgcal.types import ConvexVolume, RigPrior
 
 FACTORY = arrange_rig(
     "ring", 4, 3000.0, height=1800.0, target=(0.0, 0.0, 900.0), prior=RigPrior(0.01, 5.0, 0.01, 0.01, 3)
@@ -68,7 +68,7 @@ def test_a_cube_will_do_though_each_image_takes_another_turn_of_it():
 
 def test_what_the_data_do_not_say_is_refused():
     wand = load_object("wand4")
-    _, labelled, blobs, cameras = capture(wand, 12, volume=Volume.box((0, 0, 900), (1, 1, 901)))
+    _, labelled, blobs, cameras = capture(wand, 12, volume=ConvexVolume.box((0, 0, 900), (1, 1, 901)))
     with pytest.raises(RefusedError, match=r"say too little|cannot be placed|do not"):
         calibrate_from_scratch(labelled, cameras, wand)
     noise = np.random.default_rng(0).random(blobs.uv.shape) * 1000

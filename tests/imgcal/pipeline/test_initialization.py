@@ -10,7 +10,7 @@ from torch import nn
 from imgcal.errors import InputError
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
-from imgcal.io import data_path, load_object, load_rig
+from imgcal.io import data_path, load_object, read_rig
 from imgcal.pipeline import calibrate, rms_length
 from imgcal.pipeline.initialization import KINDS, Initializer, load_initializer
 from imgcal.synthesis.captures import simulate_truth, true_detections
@@ -38,7 +38,7 @@ class Oracle(nn.Module):
 
 @pytest.fixture
 def case():
-    factory, obj = load_rig("O10"), load_object("asymmetric8")
+    factory, obj = read_rig("O10"), load_object("asymmetric8")
     made = synthesize(factory, obj, SNAPSHOTS, torch.Generator().manual_seed(5), drift=None, pose_range=PoseRange())
     rig = RelativeDrift().apply(factory, torch.Generator().manual_seed(6))
     uv = rig.expand(SNAPSHOTS).project(made.rig_from_object.apply(obj.points)).uv
@@ -79,7 +79,7 @@ def test_a_shipped_network_does_not_mind_a_radius(case):
 
 
 def test_the_folder_of_a_run_is_its_network(tmp_path):
-    o10, cube = load_rig("O10"), load_object("cube8")
+    o10, cube = read_rig("O10"), load_object("cube8")
     with pytest.raises(InputError, match=r"found a folder without model\.safetensors"):
         load_initializer(str(tmp_path), o10, cube)
     (tmp_path / "my-rig").mkdir()
@@ -97,11 +97,11 @@ def test_the_folder_of_a_run_is_its_network(tmp_path):
 )
 def test_what_does_not_fit_is_refused(name, rig, message):
     with pytest.raises(InputError, match=message):
-        load_initializer(name, load_rig(rig), load_object("asymmetric8"))
+        load_initializer(name, read_rig(rig), load_object("asymmetric8"))
 
 
 def test_what_a_shipped_network_lacks_is_said():
-    other = load_rig("T4")
+    other = read_rig("T4")
     with pytest.raises(InputError, match=r"train one .* focal length of cam01: found"):
         load_initializer("vit", other, load_object("asymmetric8"))
 

@@ -8,7 +8,7 @@ import torch
 
 from imgcal.detection import DetectionOptions, detect, detect_frame
 from imgcal.errors import InputError
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.networks import Measured, Measurer
 from imgcal.pipeline import LearnedMeasurer, calibrate
 from imgcal.types import BlobFlag, BlobKind
@@ -118,7 +118,7 @@ def test_calibration_takes_it(scene):
     one = LearnedMeasurer(network)({"a": frame}, blobs, DetectionOptions())
     for snapshot in range(3):
         np.testing.assert_allclose(again.uv[again.snapshot == snapshot], one.uv)
-    rig, obj = load_rig("T4"), load_object("asymmetric8")
+    rig, obj = read_rig("T4"), load_object("asymmetric8")
     with pytest.raises(InputError, match="measurer measurer: found blobs without frames"):
         calibrate(found, rig, obj, measurer=LearnedMeasurer(network))
 

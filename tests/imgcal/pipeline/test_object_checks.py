@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from imgcal.errors import RefusedError
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate, score
 from imgcal.synthesis import simulate_truth, simulate_volume, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
@@ -19,7 +19,7 @@ PRIOR = RigPrior(DRIFT.focal_length, DRIFT.principal_point, DRIFT.distortion, np
 
 def capture(rig_name: str, snapshots: int, bend, seed: int = 0, noise: float = 0.05):
     """Factory rig, object as its file has it, true rig, true object, labelled detections."""
-    rig = replace(load_rig(rig_name), prior=PRIOR)
+    rig = replace(read_rig(rig_name), prior=PRIOR)
     obj = load_object("wand4" if rig_name == "room10" else "asymmetric8")
     true = replace(obj, points=bend(obj.points.clone()))
     simulate = simulate_volume if rig_name == "room10" else simulate_truth
@@ -115,7 +115,7 @@ def test_a_right_object_stays_exact_and_costs_nothing() -> None:
 
 def jumping_cube(bend, seed: int = 0):
     """Unlabelled views of a cube that jumps: identity takes another of its 24 turns each time."""
-    rig, obj = replace(load_rig("O10"), prior=PRIOR), load_object("cube8")
+    rig, obj = replace(read_rig("O10"), prior=PRIOR), load_object("cube8")
     true = replace(obj, points=bend(obj.points.clone()))
     truth = simulate_truth(rig, true, 3, torch.Generator().manual_seed(seed), DRIFT)
     table = true_detections(truth)

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from imgcal.association.options import PipelineOptions
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.pipeline.scoring import rms_length, score
 from imgcal.synthesis.captures import simulate_truth, true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
@@ -18,7 +18,7 @@ def test_a_score_needs_no_prior(o10, asymmetric8):
 
 @pytest.mark.parametrize("lens", KINDS)
 def test_rigs_of_other_lenses_are_scored(asymmetric8, lens):
-    factory = lensed(load_rig("T4"), lens)
+    factory = lensed(read_rig("T4"), lens)
     truth = simulate_truth(factory, asymmetric8, 4, torch.Generator().manual_seed(1), PhysicalDrift())
     table = true_detections(truth)
     assert score(table, truth.rig, asymmetric8).distances.max() < 1e-6

@@ -8,7 +8,7 @@ import torch
 
 from imgcal.association import Proposal
 from imgcal.errors import InputError, RefusedError
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.online import RigKeeper
 from imgcal.pipeline import calibrate, score
 from imgcal.synthesis.captures import FrameModel, simulate_frames, simulate_truth, true_detections
@@ -18,7 +18,7 @@ from imgcal.synthesis.rigs import PhysicalDrift
 @pytest.fixture(scope="module")
 def seen():
     """A small rig, an object, frames and exact blobs of one snapshot."""
-    rig, obj = load_rig("T4").resized(torch.tensor([1024, 544])), load_object("asymmetric8")
+    rig, obj = read_rig("T4").resized(torch.tensor([1024, 544])), load_object("asymmetric8")
     generator = torch.Generator().manual_seed(4)
     truth = simulate_truth(rig, obj, 1, generator, PhysicalDrift())
     return rig, obj, next(simulate_frames(truth, obj, FrameModel(), generator)), true_detections(truth)

@@ -9,7 +9,7 @@ import torch
 
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_rotation
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate, score
 from imgcal.pipeline.units import unit_doubt
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
@@ -75,7 +75,7 @@ def seen(rig, obj):
 
 @cache
 def rig_of(name):
-    return load_rig(name)
+    return read_rig(name)
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
@@ -118,7 +118,7 @@ def test_a_refusal_for_another_reason_names_no_unit():
 @pytest.mark.parametrize("distance_known", [True, False])
 @pytest.mark.parametrize("name", RIGS)
 def test_which_one_is_in_metres_is_said(name, distance_known):
-    rig, obj = load_rig(name), load_object("asymmetric8")
+    rig, obj = read_rig(name), load_object("asymmetric8")
     rig = rig if distance_known else replace(rig, working_distance=None)
     assert unit_doubt(rig, obj) == ""
     assert unit_doubt(in_metres(rig), obj).startswith("the rig seems to be in metres")
@@ -130,18 +130,18 @@ def test_which_one_is_in_metres_is_said(name, distance_known):
 
 @pytest.mark.parametrize("name", ["cube27", "sphere64", "wand4"])
 def test_all_objects_that_ship_are_in_millimetres(name):
-    assert not any(unit_doubt(load_rig(rig), load_object(name)) for rig in RIGS)
+    assert not any(unit_doubt(read_rig(rig), load_object(name)) for rig in RIGS)
 
 
 def test_a_small_board_close_to_one_camera_is_no_doubt():
-    rig = replace(load_rig("T4"), working_distance=60.0)
+    rig = replace(read_rig("T4"), working_distance=60.0)
     obj = load_object("asymmetric8")
     assert unit_doubt(rig, replace(obj, points=obj.points / 40)) == ""
-    assert unit_doubt(replace(load_rig("T4"), working_distance=None).select([0]), obj) == ""
+    assert unit_doubt(replace(read_rig("T4"), working_distance=None).select([0]), obj) == ""
 
 
 def test_a_refusal_begins_with_the_unit():
-    rig, obj = load_rig("T4"), load_object("asymmetric8")
+    rig, obj = read_rig("T4"), load_object("asymmetric8")
     blobs = true_detections(simulate_truth(rig, obj, 2, torch.Generator().manual_seed(0), PhysicalDrift()))
     blobs = replace(blobs, fiducial=blobs.fiducial * 0 - 1)
     with pytest.raises(

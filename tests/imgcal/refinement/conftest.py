@@ -6,7 +6,7 @@ from torch import Tensor
 
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.synthesis.colour_coding import render_views
 from imgcal.synthesis.rigs import RelativeDrift, Snapshots, synthesize
 from imgcal.types.calibration_object import CalibrationObject
@@ -26,7 +26,7 @@ class Scene:
 
     @classmethod
     def make(cls, rig: str, obj: str, count: int, seed: int = 5) -> "Scene":
-        factory, fiducials, drift = load_rig(rig), load_object(obj), RelativeDrift(0.05, 0.05)
+        factory, fiducials, drift = read_rig(rig), load_object(obj), RelativeDrift(0.05, 0.05)
         truth = synthesize(factory, fiducials, count, torch.Generator().manual_seed(seed), drift=drift)
         return cls(factory, fiducials, drift.std(factory), truth)
 

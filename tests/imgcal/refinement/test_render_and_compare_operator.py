@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from imgcal.geometry import RigidTransform
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.refinement import ImageRefinementOptions, encode_image_options, refine_images_anywhere
 from imgcal.refinement import render_and_compare_operator as module
 from imgcal.synthesis import ImageOptions
@@ -22,7 +22,7 @@ def test_options_are_written_and_read():
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor")  # opcheck itself asks its copies for it
 def test_is_sound(asymmetric8, monkeypatch):
-    rig = load_rig("T4").expand(1)
+    rig = read_rig("T4").expand(1)
     pose = RigidTransform.identity(1, dtype=torch.float64)
     pose.translation[:, 2] = rig.working_distance
     uv = rig.resized(torch.tensor([96, 96])).project(pose.apply(asymmetric8.points)).uv

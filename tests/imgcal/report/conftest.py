@@ -10,7 +10,7 @@ import torch
 
 from imgcal.estimation import EstimationOptions, Gauge, estimate
 from imgcal.estimation.accuracy import predicted_error
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.io.names import data_path
 from imgcal.report import ReportContent, SnapshotSummary
 from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, sample_rig_from_object, synthesize
@@ -71,7 +71,7 @@ def calibrated(
 ) -> ReportContent:
     """Recalibrate a drifted O10 from noisy detections with false blobs, and fill the content."""
     generator = torch.Generator().manual_seed(seed)
-    factory = load_rig(data_path("rigs", "O10.yaml")).to(torch.float64)
+    factory = read_rig(data_path("rigs", "O10.yaml")).to(torch.float64)
     factory = factory.select(range(cameras))
     obj = load_object(data_path("objects", f"{object_name}.csv"))
     obj = replace(obj, points=obj.points.to(torch.float64))

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from imgcal.geometry import RigidTransform, rotation_from_vector
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.live_page import up_and_forward
 from imgcal.report import DrawnRig, rig_scene, rig_view_script
 from imgcal.report.rig_view import frustum_length, frustums
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def test_frustums_start_at_the_camera_and_end_at_the_border_of_its_image() -> None:
-    rig = load_rig("O10")
+    rig = read_rig("O10")
     drawn = torch.as_tensor(frustums(rig, 50.0))
     np.testing.assert_allclose(drawn[:, 0], rig.positions, atol=1e-9)
     pinhole = replace(rig, distortion=torch.zeros_like(rig.distortion))
@@ -36,7 +36,7 @@ def test_frustums_start_at_the_camera_and_end_at_the_border_of_its_image() -> No
 
 @pytest.mark.parametrize("name", ["O10", "room10", "U7"])
 def test_drawn_cameras_are_smaller_than_the_distance_between_neighbours(name: str) -> None:
-    rig = load_rig(name)
+    rig = read_rig(name)
     drawn = frustums(rig, frustum_length(rig))
     size = np.linalg.norm(drawn[:, 1:] - drawn[:, :1], axis=-1).max()
     centres = rig.positions.numpy()
@@ -45,9 +45,9 @@ def test_drawn_cameras_are_smaller_than_the_distance_between_neighbours(name: st
 
 
 def test_up_is_what_is_up_for_most_cameras() -> None:
-    ring = load_rig("room10")  # looks inward and down, z of its frame is up
+    ring = read_rig("room10")  # looks inward and down, z of its frame is up
     np.testing.assert_array_equal(up_and_forward(ring)[0], [0, 0, 1])
-    np.testing.assert_array_equal(up_and_forward(load_rig("T4"))[0], [0, -1, 0])
+    np.testing.assert_array_equal(up_and_forward(read_rig("T4"))[0], [0, -1, 0])
     turn = RigidTransform(rotation_from_vector(torch.tensor([[0.6, 0.0, 0.0]]).double()), torch.zeros(1, 3).double())
     tilted = replace(ring, cam_from_rig=ring.cam_from_rig @ turn.inverse())
     up, _ = up_and_forward(tilted)
@@ -58,19 +58,19 @@ def test_cameras_that_look_down_and_are_rolled_every_way_are_above_what_they_see
     angles = torch.arange(10).double() * 2 * torch.pi / 10
     turns, places = torch.zeros(10, 3).double(), torch.zeros(10, 3).double()
     turns[:, 2], places[:, 0] = angles, 500.0  # on a ring, each looks along z of the rig's frame
-    looking_down = replace(load_rig("room10"), cam_from_rig=RigidTransform(rotation_from_vector(turns), places))
+    looking_down = replace(read_rig("room10"), cam_from_rig=RigidTransform(rotation_from_vector(turns), places))
     np.testing.assert_array_equal(up_and_forward(looking_down)[0], [0, 0, -1])
 
 
 def test_forward_is_level() -> None:
     for name in ("O10", "room10", "U7", "T4", "O6"):
-        scene = rig_scene([DrawnRig("factory", "--ghost", (load_rig(name),))])
+        scene = rig_scene([DrawnRig("factory", "--ghost", (read_rig(name),))])
         up, forward = np.array(scene["up"]), np.array(scene["forward"])
         assert abs(up @ forward) < 1e-6 and np.linalg.norm(forward) == pytest.approx(1)
 
 
 def test_scene_is_json_and_has_a_step_for_each_state() -> None:
-    rig = load_rig("T4")
+    rig = read_rig("T4")
     scene = rig_scene(
         [DrawnRig("a", "--ghost", (rig,)), DrawnRig("b", "--after", (rig, rig, rig))], np.zeros((2, 5, 3))
     )
@@ -107,7 +107,7 @@ LOOK = """
 @pytest.mark.parametrize("width", [390, 1200])
 def test_every_view_shows_the_whole_rig_with_names_apart(browser: BrowserContext, width: int, tmp_path: Path) -> None:
     points = np.random.default_rng(0).normal(0, 100, (3, 8, 3))
-    scene = rig_scene([DrawnRig("factory", "--after", (load_rig("room10"),), filled=True)], points)
+    scene = rig_scene([DrawnRig("factory", "--after", (read_rig("room10"),), filled=True)], points)
     page = tmp_path / "view.html"
     page.write_text(
         '<body style="margin:0;--after:blue"><div><canvas style="width:100%;height:360px"></canvas></div>'

@@ -4,14 +4,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.synthesis import DIFFICULTIES, Difficulty, FrameModel, PhysicalDrift, simulate_shots, simulate_truth
 from renderers import SensorModel, Spots
 
 
 @pytest.fixture(scope="module")
 def small():
-    rig, obj = load_rig("T4"), load_object("asymmetric8")
+    rig, obj = read_rig("T4"), load_object("asymmetric8")
     scale = 0.25
     rig = replace(
         rig.select([0, 1]),

@@ -5,19 +5,19 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.pipeline import score
 from imgcal.synthesis.arrangements import look_at
 from imgcal.synthesis.captures import true_detections
 from imgcal.synthesis.rigs import PhysicalDrift
 from imgcal.synthesis.volumes import HandHeld, find_seen_volume, sample_path, sample_volume, simulate_volume
-from imgcal.types import Volume
+from imgcal.types import ConvexVolume
 
-CORNER = Volume(((0, 0, 0), (900, 0, 0), (0, 900, 0), (0, 0, 900)))
+CORNER = ConvexVolume(((0, 0, 0), (900, 0, 0), (0, 900, 0), (0, 0, 900)))
 
 
 def test_a_wand_in_a_room_is_seen_by_some_cameras_at_a_time():
-    rig, obj = load_rig("room10"), load_object("wand4")
+    rig, obj = read_rig("room10"), load_object("wand4")
     truth = simulate_volume(rig, obj, 40, torch.Generator().manual_seed(0), PhysicalDrift())
     table = true_detections(truth)
     assert len(table) == int(truth.visible.sum()) < truth.visible.numel()
@@ -34,7 +34,7 @@ def test_places_are_even_in_the_volume():
     np.testing.assert_allclose(places.mean(0), 225, atol=12)  # the centroid of a tetrahedron
 
 
-@pytest.mark.parametrize("volume", [CORNER, Volume.box((-500, -500, 0), (500, 500, 2000))])
+@pytest.mark.parametrize("volume", [CORNER, ConvexVolume.box((-500, -500, 0), (500, 500, 2000))])
 def test_a_hand_is_as_fast_as_said_smooth_and_stays_inside(volume):
     hand = HandHeld(speed=600.0, turning=90.0, rate=100.0)
     poses, motion = sample_path(hand, volume, 6000, torch.Generator().manual_seed(3))
@@ -53,7 +53,7 @@ def test_a_hand_is_as_fast_as_said_smooth_and_stays_inside(volume):
 
 
 def test_the_same_seed_is_the_same_way():
-    rig, obj = load_rig("room10"), load_object("wand4")
+    rig, obj = read_rig("room10"), load_object("wand4")
     a, b, c = (
         simulate_volume(rig, obj, 5, torch.Generator().manual_seed(seed), None, hand=HandHeld()).uv
         for seed in (1, 1, 2)
@@ -62,7 +62,7 @@ def test_the_same_seed_is_the_same_way():
 
 
 def test_a_volume_is_found_where_cameras_look_together():
-    rig = load_rig("room10")
+    rig = read_rig("room10")
     box = find_seen_volume(replace(rig, volume=None))
     middle = torch.tensor([box.low, box.high]).mean(0).double()
     assert rig.project(middle[None]).visible.sum() >= 8

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.io import load_object, load_rig
+from imgcal.io import load_object, read_rig
 from imgcal.synthesis.corruption import Corruption
 from imgcal.synthesis.rigs import PoseRange, RelativeDrift
 from imgcal.training.data import Source, object_to
@@ -17,7 +17,7 @@ CONFIG = RefinedLoss(weight=1.0)
 
 @pytest.fixture
 def source():
-    rig = load_rig("T4").to(torch.float32)
+    rig = read_rig("T4").to(torch.float32)
     obj = object_to(load_object("asymmetric8"), "cpu")
     return Source(rig, obj, RelativeDrift(0.02, 0.02), PoseRange.overhead(), Corruption(noise=0.1))
 

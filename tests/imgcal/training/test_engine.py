@@ -11,7 +11,7 @@ from tensorboard.backend.event_processing import event_accumulator
 
 from imgcal.cli.training_folder import BAD_BATCH, RESULT, STATE
 from imgcal.errors import InputError, RefusedError
-from imgcal.io import load_rig, read_metrics, save_rig
+from imgcal.io import read_metrics, read_rig, save_rig
 from imgcal.io.safetensors_file import read_tensors
 from imgcal.networks import load_checkpoint
 from imgcal.training import engine, rigs
@@ -151,12 +151,12 @@ def test_a_continuation_must_be_of_the_same_experiment(experiment, tmp_path):
 
 def test_a_continuation_has_the_same_rig_wherever_its_file_lies(experiment, tmp_path):
     (tmp_path / "here").mkdir()
-    save_rig(load_rig("T4"), file := tmp_path / "here" / "mine.yaml")
+    save_rig(read_rig("T4"), file := tmp_path / "here" / "mine.yaml")
     run = tmp_path / "run"
     train(experiment("training.steps=20", f"rig={file}"), run)
     moved = file.rename(tmp_path / "mine.yaml")
     assert train(experiment("training.steps=22", f"rig={moved}"), run, resume=True).step == 22
-    rig = load_rig("T4")
+    rig = read_rig("T4")
     save_rig(replace(rig, focal_length=rig.focal_length * 1.001), moved)
     with pytest.raises(InputError, match="rig: its file has changed since the training began"):
         train(experiment("training.steps=24", f"rig={moved}"), run, resume=True)

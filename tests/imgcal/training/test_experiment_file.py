@@ -3,7 +3,7 @@ import math
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.io import load_rig, save_rig
+from imgcal.io import read_rig, save_rig
 from imgcal.synthesis import ImageOptions
 from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, RelativeDrift, make_drift
 from imgcal.training.experiment_file import change_experiment, load_experiment, save_experiment
@@ -35,12 +35,12 @@ def test_a_resolved_experiment_is_the_same(experiment, tmp_path):
 def test_files_are_looked_for_beside_the_experiment(experiment, tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    save_rig(load_rig("O6"), tmp_path / "mine.yaml")
+    save_rig(read_rig("O6"), tmp_path / "mine.yaml")
     (tmp_path / "T4").mkdir()  # no file: the shipped rig is meant
     (tmp_path / "toy2.yaml").write_text(EXPERIMENT.replace("rig: T4", "rig: mine.yaml"))
     made = load_experiment(tmp_path / "toy2.yaml")
     assert made.load_rig().num_cameras == 6 and experiment().load_rig().num_cameras == 4
-    save_rig(load_rig("U7"), tmp_path / "here" / "mine.yaml")  # the current folder comes first, as ever
+    save_rig(read_rig("U7"), tmp_path / "here" / "mine.yaml")  # the current folder comes first, as ever
     assert load_experiment(tmp_path / "toy2.yaml").load_rig().num_cameras == 7
 
 

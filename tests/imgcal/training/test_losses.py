@@ -6,7 +6,7 @@ import torch
 
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.nn import project_fiducials, rms_per_axis
 from imgcal.synthesis.rigs import RelativeDrift, synthesize
 from imgcal.training.losses import (
@@ -128,7 +128,7 @@ def test_re_is_the_mean_over_axes_cameras_and_fiducials():
 @pytest.mark.parametrize("lens", KINDS)
 @pytest.mark.parametrize("config", KINDS_OF_LOSS, ids=["robust", "paper"])
 def test_the_gradient_reaches_the_coefficients_that_each_lens_has(asymmetric8, lens, config):
-    factory = lensed(load_rig("T4"), lens)
+    factory = lensed(read_rig("T4"), lens)
     made = synthesize(factory, asymmetric8, B, torch.Generator().manual_seed(1), drift=DRIFT)
     rigs, spread = Prediction(made.rig, made.rig_from_object), DRIFT.std(factory)
     seen = made.rig.project(made.rig_from_object.apply(asymmetric8.points)).uv

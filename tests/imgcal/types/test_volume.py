@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.types.volume import Volume
+from imgcal.types.volume import ConvexVolume
 
 
 def test_a_tetrahedron_is_no_box():
-    volume = Volume(((0, 0, 0), (10, 0, 0), (0, 10, 0), (0, 0, 10)))
+    volume = ConvexVolume(((0, 0, 0), (10, 0, 0), (0, 10, 0), (0, 0, 10)))
     assert not volume.is_box and volume.high == (10.0, 10.0, 10.0)
     assert volume.contains(np.array([[1, 1, 1], [9, 9, 9], [-1, 1, 1], [0, 0, 0]])).tolist() == [
         True, False, False, True,
@@ -14,8 +14,8 @@ def test_a_tetrahedron_is_no_box():
 
 
 def test_a_box_is_one_whatever_the_order_of_its_corners():
-    volume = Volume.box((0, 0, 0), (1, 2, 3))
-    assert Volume(volume.points[::-1]).is_box
+    volume = ConvexVolume.box((0, 0, 0), (1, 2, 3))
+    assert ConvexVolume(volume.points[::-1]).is_box
 
 
 @pytest.mark.parametrize(
@@ -24,4 +24,4 @@ def test_a_box_is_one_whatever_the_order_of_its_corners():
 )
 def test_what_encloses_nothing_is_refused(points):
     with pytest.raises(InputError, match="expected"):
-        Volume(points)
+        ConvexVolume(points)

@@ -7,12 +7,12 @@ import numpy as np
 import torch
 
 from imgcal.errors import InputError
-from imgcal.io import load_object, load_rig, write_text
+from imgcal.io import load_object, read_rig, write_text
 from imgcal.online.events import Event
 from imgcal.online.keeper import RigKeeper
 from imgcal.synthesis.captures import simulate_truth, true_detections
 
-RIG, OBJECT = load_rig("T4"), load_object("asymmetric8")
+RIG, OBJECT = read_rig("T4"), load_object("asymmetric8")
 
 
 def some_state(events=(), time=1.0):

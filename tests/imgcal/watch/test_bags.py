@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.watch.bags import Bag
 from imgcal.watch.exposures import Exposure, Unreadable
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2")
 typesys = pytest.importorskip("rosbags.typesys")
 
-RIG = load_rig("T4")
+RIG = read_rig("T4")
 STORE = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 PLUGINS = {"mcap": rosbag2.StoragePlugin.MCAP, "sqlite": rosbag2.StoragePlugin.SQLITE3}
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.io.frames import write_frame
 from imgcal.watch import folder as module
 from imgcal.watch.exposures import Exposure, Unreadable
 from imgcal.watch.folder import Folder
 from imgcal.watch.source_reader import SourceReader
 
-RIG = load_rig("T4")
+RIG = read_rig("T4")
 HEIGHT, WIDTH = 1088, 2048
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from imgcal.errors import InputError
 from imgcal.formats import parse_xml
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.online import RigKeeper
 from imgcal.watch.exposures import Exposure, Unreadable
 from imgcal.watch.qualisys import COMMANDS, Qualisys, find_cameras
@@ -17,7 +17,7 @@ from imgcal.watch.source_reader import SourceReader
 from tests.imgcal.streams import Stream
 from tests.imgcal.watch.qtm import Qtm, frame, general, packet
 
-RIG = load_rig("O10")
+RIG = read_rig("O10")
 SIZES = RIG.image_size.tolist()
 PARAMETERS = general(range(10), SIZES)
 RANDOM = np.random.default_rng(0)

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.io import load_rig
+from imgcal.io import read_rig
 from imgcal.types.observations import BlobFlag, Detections
 from imgcal.watch.recordings import BlobTable, Videos, holds_videos
 
-RIG = load_rig("T4")
+RIG = read_rig("T4")
 
 
 def write_video(path: Path, levels, rate=10.0):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.io import load_rig, load_rig_covariance
+from imgcal.io import load_rig_covariance, read_rig
 from imgcal.watch.rig_files import RigFiles
 from tests.imgcal.watch.states import some_state
 
@@ -28,7 +28,7 @@ def test_the_rig_with_its_standard_deviations_and_its_history(state, tmp_path):
     files.write(state)
     files.write(replace(state, time=1.7e9 + 3600), keep=True)
     files.close()
-    assert torch.allclose(load_rig(tmp_path / "rig.yaml").focal_length, state.rig.focal_length)
+    assert torch.allclose(read_rig(tmp_path / "rig.yaml").focal_length, state.rig.focal_length)
     assert torch.allclose(load_rig_covariance(tmp_path / "rig.yaml").std, state.std, rtol=1e-5)
     assert [str(path.relative_to(tmp_path)) for path in tmp_path.glob("history/*/*")] == [
         "history/2023-11-14/231320.000.yaml"
@@ -56,7 +56,7 @@ def test_a_reader_never_finds_half_a_rig(state, tmp_path):
     def read():
         while not stop.is_set():
             if (tmp_path / "rig.yaml").exists():
-                found.append(load_rig(tmp_path / "rig.yaml").num_cameras)
+                found.append(read_rig(tmp_path / "rig.yaml").num_cameras)
             time.sleep(0.02)
 
     reader = threading.Thread(target=read)
