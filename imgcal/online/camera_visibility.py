@@ -17,9 +17,9 @@ MARGIN = 0.05
 """Margin at the image border, as a share of the image size, in which a fiducial may be out of view."""
 DOUBTED = 3
 """Successive snapshots in which a camera sees nothing of what it should see until it is in doubt."""
-ASTRAY = 2
-"""Snapshots in which a camera sees something, but not the object where it should be, until it counts as lost: a single
-one may be garbage. It is in doubt at once."""
+ASTRAY_SNAPSHOTS, ASTRAY_SECONDS = 2, 0.4
+"""Snapshots and seconds for which a camera must see a possible object in the wrong place until it counts as lost. Hands
+and passers-by last less. The camera is in doubt at once."""
 ABSENT_SECONDS, ABSENT_SNAPSHOTS = 2.0, 30
 """Seconds and snapshots for which a camera must miss what it should see until it counts as lost: arms hide objects."""
 SILENT_SECONDS = 0.5
@@ -57,7 +57,7 @@ class CameraVisibility:
     missing: dict[int, tuple[float, int]] = field(default_factory=dict)  # not lost yet: start, number of snapshots
     silent: dict[int, float] = field(default_factory=dict)  # start of the silence
     heard: dict[int, deque[float]] = field(default_factory=dict)  # latest times of data
-    astray: dict[int, tuple[float, int]] = field(default_factory=dict)  # start, number of snapshots
+    astray: dict[int, tuple[float, int, float]] = field(default_factory=dict)  # start, number of snapshots, latest
 
     @property
     def doubtful_cameras(self) -> frozenset[int]:
@@ -73,12 +73,17 @@ class CameraVisibility:
         labelled = set(np.flatnonzero(count >= least_back(look.predicted.shape[1])).tolist()) - look.astray
         self._listen(look)
         absent = self._should_see(rig, look.predicted) - some - look.astray - look.silent
-        for cameras, missed in ((absent, self.missing), (look.astray, self.astray)):
-            for camera in labelled & missed.keys():
-                del missed[camera]
-            for camera in cameras:
-                first, times = missed.get(camera, (look.time, 0))
-                missed[camera] = min(first, look.time), times + 1  # clocks may be set back
+        for camera in labelled:
+            self.missing.pop(camera, None)
+            self.astray.pop(camera, None)
+        for camera in absent:
+            first, times = self.missing.get(camera, (look.time, 0))
+            self.missing[camera] = min(first, look.time), times + 1  # clocks may be set back
+        for camera in look.astray:
+            first, times, latest = self.astray.get(camera, (look.time, 0, look.time))
+            if look.time - latest > self._patience(camera):  # it has seen nothing since: this is something else
+                first, times = look.time, 0
+            self.astray[camera] = min(first, look.time), times + 1, look.time
         events = []
         for camera in range(len(self.names)):
             why = self._why(camera, look)
@@ -108,8 +113,8 @@ class CameraVisibility:
         return max(SILENT_SECONDS, RESTS * float(np.median(np.diff(times))))
 
     def _why(self, camera: int, look: VisibleObject) -> tuple[float, str] | None:
-        first, times = self.astray.get(camera, (look.time, 0))
-        if times >= ASTRAY:
+        first, times, latest = self.astray.get(camera, (look.time, 0, look.time))
+        if times >= ASTRAY_SNAPSHOTS and latest - first >= ASTRAY_SECONDS:
             return min(first, self.missing.get(camera, (first, 0))[0]), (
                 "sees what may be the object, but in the wrong place: the camera has moved far; move the object "
                 "through the middle of its image, and the camera will be found again"

@@ -41,12 +41,28 @@ def test_a_camera_that_is_astray_or_silent_is_lost() -> None:
     assert kinds(sightings, [look(0.0, [0, 1, 3], astray=frozenset({2}))]) == []  # it may be garbage ...
     assert sightings.doubtful_cameras == {2}
     assert kinds(sightings, [look(0.1, [0, 1, 2, 3])]) == [] and not sightings.doubtful_cameras  # ... as it was
-    astray = [look(0.2 + s / 10, [0, 1, 2, 3], astray=frozenset({2})) for s in range(3)]  # a label by chance is none
+    astray = [look(0.2 + s / 10, [0, 1, 2, 3], astray=frozenset({2})) for s in range(6)]  # a label by chance is none
     assert kinds(sightings, astray) == [("camera_lost", "c", 0.2)]
     given = [look(1 + s / 10, [0, 1, 3], silent=frozenset({1})) for s in range(7)]
     # Labels of a camera without a frame come from nowhere here: it is back at once.
     assert ("camera_lost", "b", 1.0) in kinds(sightings, given)
     assert sightings.lost.keys() >= {2}
+
+
+def test_what_is_in_a_wrong_place_for_a_moment_only_is_no_loss_however_often() -> None:
+    """A hand, or another person's markers: in 3 snapshots, or twice with seconds between."""
+    sightings = CameraVisibility(("a", "b", "c", "d"))
+    for start in (1.0, 2.0, 5.0, 9.0):
+        odd = [look(start + s / 60, [0, 1, 3], astray=frozenset({2})) for s in range(3)]
+        rest = [look(start + s / 60, [0, 1, 3]) for s in range(3, 60)]
+        for given in rest:
+            given.predicted[2] = np.nan  # then the object is out of this camera's view
+        assert kinds(sightings, [*odd, *rest]) == [] and sightings.doubtful_cameras == {2}
+    slow = CameraVisibility(("a", "b", "c", "d"))
+    looks = [
+        look(float(s), [0, 1, 2, 3] if s < 5 else [0, 1, 3], astray=frozenset({2} if s > 4 else ())) for s in range(7)
+    ]
+    assert kinds(slow, looks) == [("camera_lost", "c", 5.0)]  # two snapshots last long enough
 
 
 def test_clocks_that_are_set_back_keep_no_camera_from_being_told_lost() -> None:
