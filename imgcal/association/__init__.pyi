@@ -2,12 +2,10 @@ from .ambiguities import lattice_shifts, near_symmetries
 from .assignment import distances_to_nearest, mutual_nearest
 from .blobs import pattern_prior, undistort
 from .identification import identify, relocalize, track
+from .identity import Identity, IdentityOptions, PipelineOptions, Status, orient
 from .lights import Lights, align_camera, align_rig, associate_lights, background_rows, image_error, predicted_misses
 from .merging import drop_merged, find_merged, merging_distance
-from .options import PipelineOptions
-from .orientation import orient
 from .proposals import Proposal, Proposer, Sight, Snapshot, judge, proposal_rows
-from .result import Identity, IdentityOptions, Status
 from .series import (
     Associations,
     Progress,

@@ -26,8 +26,8 @@ from imgcal.association.hypotheses import (
     has_many_triples,
     likely_blobs,
 )
+from imgcal.association.identity import Identity, IdentityOptions, Status
 from imgcal.association.minimal_labels import compare_labellings, has_minimal_blobs
-from imgcal.association.result import Identity, IdentityOptions, Status
 from imgcal.association.search import VERIFIED, Search
 from imgcal.association.stick_poses import fit_sticks
 from imgcal.association.verification import (

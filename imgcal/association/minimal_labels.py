@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 from scipy.stats import chi2
 
 from imgcal.association.hypotheses import Poses
-from imgcal.association.result import Identity, IdentityOptions, Status
+from imgcal.association.identity import Identity, IdentityOptions, Status
 from imgcal.association.verification import Fits, Scene, evidence, fit, make_problem, rig_and_pose, start
 from imgcal.estimation import State, initial_pose, levenberg_marquardt_cpu
 from imgcal.types import Observations

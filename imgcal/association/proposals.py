@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from imgcal.association.identification import track
-from imgcal.association.result import Identity, IdentityOptions
+from imgcal.association.identity import Identity, IdentityOptions
 from imgcal.detection import DetectionOptions, Frame
 from imgcal.geometry import RigidTransform
 from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.association.options import PipelineOptions
+from imgcal.association.identity import PipelineOptions
 from imgcal.association.proposals import Sight
 from imgcal.association.tracker import SnapshotIdentity, Tracker, to_observations
 from imgcal.errors import InputError, RefusedError

@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from imgcal.association.options import PipelineOptions
-from imgcal.association.result import Identity
+from imgcal.association.identity import Identity, PipelineOptions
 from imgcal.association.series import NOT_TRIED, Associations, Patience, Progress
 from imgcal.association.tracker import MOST_REMEMBERED, LearntRig, SnapshotIdentity, Tracker
 from imgcal.errors import InputError

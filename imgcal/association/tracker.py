@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.association.identification import identify
-from imgcal.association.options import PipelineOptions
-from imgcal.association.orientation import orient
+from imgcal.association.identity import Identity, PipelineOptions, Status, orient
 from imgcal.association.proposals import Sight, Snapshot, judge
-from imgcal.association.result import Identity, Status
 from imgcal.errors import InputError
 from imgcal.estimation import estimate, flat_std, has_poses
 from imgcal.geometry import RigidTransform, geodesic_angle

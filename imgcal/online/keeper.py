@@ -21,8 +21,9 @@ from imgcal.online.camera_health import camera_health, describe_health, take_hea
 from imgcal.online.camera_visibility import VisibleObject
 from imgcal.online.clock_correction import clock_shifts, shift_blobs
 from imgcal.online.clock_offsets import ClockOffsets, unsynchronized_event
-from imgcal.online.default_tests import default_tests
 from imgcal.online.events import Event, snapshot_name
+from imgcal.online.foreign_object import ForeignObject
+from imgcal.online.image_quality import ImageQuality
 from imgcal.online.keeper_file import KeeperFile, read_state, unusable
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.labelling import Labelling
@@ -80,7 +81,7 @@ class RigKeeper:
                 decrease as the rig may have drifted. A longer horizon is more accurate but slower to follow changes.
                 From two on, one and up to a quarter more count at times. A camera that none of the snapshots shows
                 keeps its last values.
-            tests: other tests of each snapshot; None = `default_tests`.
+            tests: other tests of each snapshot; None = for worse images, clock slips, and a different object.
         """
         obj = obj.as_unknown()
         if horizon is not None and horizon < 1:
@@ -89,8 +90,10 @@ class RigKeeper:
             raise InputError("horizon: with unknown lights, the rig needs all snapshots; leave the horizon out")
         self.options = _for_keeping(options)
         self._memory = KeeperMemory.from_factory(rig, obj, drift, self.options, horizon)
-        usual = () if obj.unknown_markers else default_tests(rig.num_cameras)  # all need a rigid object
-        self.tests = tuple(usual if tests is None else tests)
+        if tests is None:
+            cameras, rigid = rig.num_cameras, not obj.unknown_markers  # these tests all need a rigid object
+            tests = (ImageQuality(cameras), ClockOffsets(cameras), ForeignObject()) if rigid else ()
+        self.tests = tuple(tests)
         clocks = (test for test in self.tests if isinstance(test, ClockOffsets))
         self._clock = next(clocks, ClockOffsets(rig.num_cameras))
         self._labelling = Labelling(self._memory.factory, obj, self.options, detection, detector)

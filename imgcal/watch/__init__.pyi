@@ -16,8 +16,7 @@ from .qualisys import Qualisys
 from .recordings import BlobTable, Videos, holds_videos
 from .rig_files import CURRENT, RigFiles, put_aside
 from .source_reader import Known, SourceReader
-from .synchronization import COUNTS, Synchronizer, TimedSnapshot
-from .timing import Timing
+from .synchronization import COUNTS, Synchronizer, TimedSnapshot, Timing
 from .zeromq import ZeroMQ
 
 __all__ = [

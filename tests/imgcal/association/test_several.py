@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from imgcal.association import Associations, PipelineOptions, Tracker, associate
-from imgcal.association.options import IdentityOptions
+from imgcal.association.identity import IdentityOptions
 from imgcal.association.several import place_objects
 from imgcal.association.tracker import LearntRig
 from imgcal.pipeline import calibrate

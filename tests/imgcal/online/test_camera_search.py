@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.options import PipelineOptions
+from imgcal.association.identity import PipelineOptions
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.monitoring import RigBelief
 from imgcal.online import camera_search

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.options import PipelineOptions
+from imgcal.association.identity import PipelineOptions
 from imgcal.errors import RefusedError
 from imgcal.pipeline.checks import require_fit, require_most_labels, require_near_prior
 from imgcal.types.rig import RigPrior

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imgcal.association.options import PipelineOptions
+from imgcal.association.identity import PipelineOptions
 from imgcal.association.series import associate
 from imgcal.errors import RefusedError
 from imgcal.pipeline import LabelCounts, calibrate

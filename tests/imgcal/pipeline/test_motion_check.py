@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.options import PipelineOptions
+from imgcal.association.identity import PipelineOptions
 from imgcal.association.series import associate
 from imgcal.errors import RefusedError
 from imgcal.pipeline import calibrate, score

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from imgcal.association.options import PipelineOptions
+from imgcal.association.identity import PipelineOptions
 from imgcal.io import read_rig
 from imgcal.pipeline.scoring import rms_length, score
 from imgcal.synthesis.captures import simulate_truth, true_detections

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from imgcal.association import Tracker, associate
-from imgcal.association.options import PipelineOptions
+from imgcal.association.identity import PipelineOptions
 from imgcal.errors import InputError
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
