@@ -21,7 +21,7 @@ DYING = """
 import os, signal, sys
 from imgcal.cli.main import run
 from imgcal.io import atomic
-from imgcal.watch import event_log, loop
+from imgcal.watch import event_log, loop, rig_files
 
 moment, number = sys.argv.pop(1).split(":")
 loop.SAVED_EVERY = 0.0
@@ -55,6 +55,10 @@ if moment == "learnt":  # the state of a while ago is what is there
 elif moment == "told":
     after(event_log.EventLog, "append", lambda self, event: event.kind == "moved")
 elif moment == "saving":  # the new state is written beside the old one, and has not taken its place
+    # Each save is written before the next snapshot: the thread leaves out those that it has no time for.
+    rig_files.RigFiles.write = lambda self, state, *, keep=False, also=None, then=None: self._write(
+        also, then, state, [state] if keep else []
+    )
     before(atomic.os, "replace", lambda source, target: str(target).endswith("state.json"))
 run()
 """

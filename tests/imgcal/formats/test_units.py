@@ -25,7 +25,7 @@ def test_what_the_file_says_is_not_asked_for() -> None:
 
 def test_what_it_does_not_say_is_never_guessed() -> None:
     unknown = type(RIG)(RIG.format, RIG.cameras, None, RIG.frame)
-    with pytest.raises(InputError, match=r"file.yaml: its unit of length is not said"):
+    with pytest.raises(InputError, match=r"file.yaml: the file does not state its unit of length"):
         in_millimetres(unknown, "file.yaml")
     alone = type(RIG)(RIG.format, RIG.cameras[:1], None, RIG.frame)
     assert in_millimetres(alone, "x").unit == "mm"  # one camera has no lengths
