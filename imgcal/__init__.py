@@ -1,6 +1,6 @@
 """imgcal: recalibration of infrared multi-camera rigs from images of a known calibration object.
 
-What is public stands in `__init__.pyi`, here and in every room, and is imported when it is first used, so that
+Public names are listed in `__init__.pyi`, here and in every subpackage, and are imported on first use, so that
 `import imgcal` does not wait for PyTorch.
 """
 

@@ -1,4 +1,4 @@
-"""`python -m imgcal` is the command `imgcal`."""
+"""Run the `imgcal` command as `python -m imgcal`."""
 
 from imgcal.cli.interruption import end_at_once
 

@@ -1,4 +1,4 @@
-"""The two ways in which a run can end without a result. Commands turn them into exit codes 2 and 3."""
+"""Exceptions for the two ways a run can end without a result. Commands turn them into exit codes 2 and 3."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class InputError(ValueError):
 
 
 class RefusedError(RuntimeError):
-    """Raise when the input is sound but cannot decide the answer (identity unclear, too few fiducials, bad fit).
+    """Raise when the input is valid but does not determine the answer (identity unclear, too few fiducials, bad fit).
 
-    What helps has one wording for Python, which is part of the message, and one for the command line.
+    The advice has two wordings: one for Python, which is part of the message, and one for the command line.
 
     Examples:
         >>> import torch, imgcal
@@ -34,12 +34,12 @@ class RefusedError(RuntimeError):
     """
 
     def __init__(self, reason: str, *, python: str = "", command: str = "") -> None:
-        """Keep the reason, and what to do about it in either interface.
+        """Store the reason and the advice for both interfaces.
 
         Args:
             reason: what was found and what was expected.
-            python: what a caller can do.
-            command: the same for somebody who types `imgcal ...`.
+            python: advice for callers from Python.
+            command: advice for users of the `imgcal` command.
         """
         super().__init__(f"{reason}; {python}" if python else reason)
         self.reason = reason

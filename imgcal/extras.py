@@ -1,4 +1,4 @@
-"""What does not come with the core: which extra brings which library."""
+"""Optional dependencies: which extra installs which library."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ EXTRAS = {
     "onnx": ("onnx", "onnxruntime"),
     "lsl": ("pylsl",),
 }
-"""Libraries of each extra, by the names that they are imported by; `pyproject.toml` has the versions."""
+"""Libraries of each extra, by import name; `pyproject.toml` has the versions."""
 
 
 def missing(*libraries: str) -> str | None:
-    """Name the first of some libraries that is not installed; None where all are. Imports none of them.
+    """Name the first of the given libraries that is not installed, None if all are. Nothing is imported.
 
     Examples:
         >>> missing("json", "a_library_that_nobody_has")
@@ -27,7 +27,7 @@ def missing(*libraries: str) -> str | None:
 
 
 def advice(library: str | None) -> str | None:
-    """Say what to install for a library of an extra; None for any other.
+    """Say what to install for a library of an extra; None for any other library.
 
     Examples:
         >>> advice("timm")

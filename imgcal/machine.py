@@ -1,10 +1,10 @@
-"""What the machine offers this process."""
+"""Resources of the machine that this process may use."""
 
 import os
 
 
 def usable_cores() -> int:
-    """Count the cores that this process may use; all of the machine's where the system does not say (macOS, Windows).
+    """Count the cores that this process may use; all cores on systems that do not report this (macOS, Windows).
 
     Examples:
         >>> usable_cores() >= 1

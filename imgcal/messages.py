@@ -1,4 +1,4 @@
-"""The words of messages: how much of what others wrote is repeated in them, and how."""
+"""Text of messages: how quotations, names and values are shortened."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ LONGEST = 1000  # characters of a message
 
 
 def shorten(text: str) -> str:
-    """Keep a name or a cell that a message quotes to a readable length."""
+    """Shorten a name or a table cell to a readable length."""
     return text if len(text) <= 40 else text[:37] + "..."
 
 
 def quote(text: str) -> str:
-    """Keep what a message repeats of another program's words, or of a whole value, to a readable length."""
+    """Shorten a quotation from another program, or a whole value, to a readable length."""
     return text if len(text) <= MOST_QUOTED else text[: MOST_QUOTED - 3] + "..."
 
 
 def list_names(names: Iterable[str]) -> str:
-    """List names, as many as fit."""
+    """Join names by commas; a long list shows only the first few and the total."""
     whole = list(names)
     shown = [shorten(name) for name in whole]
     if len(", ".join(shown)) <= MOST_QUOTED:
@@ -30,13 +30,13 @@ def list_names(names: Iterable[str]) -> str:
 
 
 def one_line(message: str) -> str:
-    """Make one line of it that a terminal takes for text: no line breaks, no control characters, not endless."""
+    """Make a message safe for one line of a terminal: no line breaks, no control characters, limited length."""
     text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in " ".join(message.split()))
     return text if len(text) <= LONGEST else f"{text[: LONGEST - MOST_QUOTED - 3]}...{text[-MOST_QUOTED:]}"
 
 
 def brief(value: Any) -> str:
-    """Write a value as people read it: of tensors and arrays the type and shape, of long tuples the beginning."""
+    """Write a value for people: tensors and arrays as type and shape, long tuples as their first and last entry."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{str(value.dtype).removeprefix('torch.')}{tuple(value.shape)}"
     if isinstance(value, tuple) and len(value) > 4:
@@ -45,6 +45,6 @@ def brief(value: Any) -> str:
 
 
 def brief_repr(self: Any) -> str:
-    """Be the `__repr__` of a dataclass of tensors: shapes instead of walls of numbers."""
+    """Serve as the `__repr__` of a dataclass of tensors: shapes instead of walls of numbers."""
     parts = (f"{field.name}={brief(getattr(self, field.name))}" for field in fields(self) if field.repr)
     return f"{type(self).__name__}({', '.join(parts)})"

@@ -1,8 +1,8 @@
-"""Functions whose control flow depends on values, as operators of PyTorch.
+"""PyTorch operators for functions whose control flow depends on values.
 
-A solver that iterates until it has converged, or a list of the pixels that are not black, cannot be traced. As an
-`Operator` such a function is one node of a graph, for `torch.compile` and `torch.export`, and has derivatives in both
-directions and under `torch.func.vmap`.
+A solver that iterates until it converges, or a list of the pixels that are not black, cannot be traced. As an
+`Operator`, such a function is one node of a graph for `torch.compile` and `torch.export`. It has derivatives in both
+directions, also under `torch.func.vmap`.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ class Operator:
     Attributes:
         name: of the operator, in the namespace `imgcal`.
         inputs: names of the tensors that it takes.
-        outputs: names of the tensors that it returns, two at least.
-        differentiable: inputs and outputs that derivatives belong to.
-        batched: inputs whose first axis is a batch, which all outputs have, too: `vmap` then makes the batch longer,
-            where it maps over no other input. Else it calls the function again and again.
+        outputs: names of the tensors that it returns, at least two.
+        differentiable: names of the inputs and outputs that have derivatives.
+        batched: names of the inputs and outputs whose first axis is a batch. If all outputs and all mapped inputs have
+            one, `vmap` makes a single call with a longer batch; otherwise it calls the function once per entry.
         compute: the function, called without gradients.
-        attach: `(inputs, outputs, options) -> outputs`, the same values by operations that autograd knows; the given
-            outputs are those of `compute`, so that nothing must be sought again. Only differentiable ones count.
+        attach: `(inputs, outputs, options) -> outputs`: the same values from operations that autograd supports. The
+            given outputs are those of `compute`, so that no search is repeated. Only differentiable ones matter.
         like: `(inputs, options) -> outputs` of the right shapes and types, without reading values.
     """
 
@@ -59,31 +59,31 @@ class Operator:
 
     @property
     def leaves(self) -> list[str]:
-        """Names of the inputs that derivatives belong to."""
+        """Names of the differentiable inputs."""
         return [name for name in self.inputs if name in self.differentiable]
 
     @property
     def pulled(self) -> list[str]:
-        """Names of all that a gradient is computed from: inputs, outputs, and gradients by outputs."""
+        """Names of the tensors that gradients are computed from: inputs, outputs, and gradients of outputs."""
         return [*self.inputs, *self.outputs, *self.select_differentiable(self.outputs, self.outputs)]
 
     @property
     def pushed(self) -> list[str]:
-        """Names of all that a tangent is computed from: inputs, outputs, and tangents of inputs."""
+        """Names of the tensors that tangents are computed from: inputs, outputs, and tangents of inputs."""
         return [*self.inputs, *self.outputs, *self.leaves]
 
     def select_differentiable(self, names: Sequence[str], values: Iterable[Any]) -> list[Any]:
-        """Keep what belongs to differentiable inputs or outputs."""
+        """Keep the values of differentiable inputs or outputs."""
         return [value for name, value in zip(names, values, strict=True) if name in self.differentiable]
 
     def evaluate(self, inputs: Tensors, options: str) -> Tensors:
-        """Return the outputs, contiguous and nobody's views, without gradient."""
+        """Return the outputs without gradient, as contiguous tensors that are not views."""
         with torch.no_grad():
             found = self.compute(tuple(x.detach() for x in inputs), options)
             return tuple(x.clone(memory_format=torch.contiguous_format) for x in found)
 
     def gradients(self, inputs: Tensors, outputs: Tensors, upstream: Tensors, options: str) -> Tensors:
-        """Pull gradients by differentiable outputs back to those by differentiable inputs."""
+        """Pull gradients of differentiable outputs back to differentiable inputs."""
         leaves, pairs = self._attach(inputs, outputs, upstream, options)
         if not pairs:
             return tuple(torch.zeros_like(x, memory_format=torch.contiguous_format) for x in leaves)
@@ -92,7 +92,7 @@ class Operator:
         return tuple(x.contiguous() for x in found)
 
     def tangents(self, inputs: Tensors, outputs: Tensors, tangents: Tensors, options: str) -> Tensors:
-        """Push tangents of differentiable inputs forward to those of differentiable outputs.
+        """Push tangents of differentiable inputs forward to differentiable outputs.
 
         Pulling back is linear; its transpose pushes forward.
         """
@@ -124,7 +124,7 @@ class Operator:
 
 
 def _register(operator: Operator) -> None:
-    """Make the operator known to PyTorch, and another one for its gradient."""
+    """Register the operator with PyTorch, and a second one for its gradient."""
     inputs = ", ".join(f"Tensor {name}" for name in operator.inputs)
     outputs = ", ".join(f"Tensor {name}_" for name in operator.outputs)
     upstream = ", ".join(
@@ -178,7 +178,7 @@ def _register(operator: Operator) -> None:
 
 
 class _Outputs(torch.autograd.Function):
-    """Outputs of an operator outside of graphs: what `torch.library` offers has no forward mode."""
+    """Outputs of an operator outside of graphs: `torch.library` does not support forward mode."""
 
     @staticmethod
     def forward(operator: Operator, *given: Any) -> Tensors:
@@ -219,7 +219,7 @@ class _Outputs(torch.autograd.Function):
 
 
 class _Linear(torch.autograd.Function):
-    """What derivatives do with a vector, itself not to be differentiated."""
+    """Product of a derivative and a vector; second derivatives are not supported."""
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:
@@ -265,7 +265,7 @@ def _gradients(operator: Operator, *given: Any) -> Tensors:
 
 
 def _call_with_autograd(work: Callable[[], Tensors]) -> Tensors:
-    """Call where autograd records: PyTorch switches it off inside of operators, but not for other threads."""
+    """Call with autograd recording: PyTorch turns it off inside operators, but only in the current thread."""
     with torch.enable_grad():
         records = (torch.zeros((), requires_grad=True) + 0).requires_grad
     if records:
@@ -275,7 +275,7 @@ def _call_with_autograd(work: Callable[[], Tensors]) -> Tensors:
 
 
 def _split(operator: Operator, given: Tensors) -> tuple[Tensors, Tensors, Tensors]:
-    """Inputs, outputs, and what else is given."""
+    """Split the arguments into inputs, outputs and the rest."""
     first, second = len(operator.inputs), len(operator.inputs) + len(operator.outputs)
     return given[:first], given[first:second], given[second:]
 
@@ -286,7 +286,7 @@ def _save(ctx: Any, operator: Operator, inputs: tuple[Any, ...], output: Tensors
 
 
 def _spread(operator: Operator, gradients: Iterable[Tensor]) -> tuple[Tensor | None, ...]:
-    """Gradients of all inputs, the options included."""
+    """Gradients of all inputs and the options; None where there is none."""
     found = iter(gradients)
     return (*(next(found) if name in operator.differentiable else None for name in operator.inputs), None)
 
@@ -300,7 +300,7 @@ def _map(
     names: Sequence[str],
     returned: Sequence[str],
 ) -> tuple[Tensors, tuple[int, ...]]:
-    """Call with one more axis: by a longer batch where everything that is mapped has one, else again and again."""
+    """Call with one more axis: once with a longer batch if everything mapped has a batch, else once per entry."""
     batched = [name in operator.batched for name in names]
     if operator.batched.issuperset(returned) and all(
         axis is None or has for axis, has in zip(axes, batched, strict=True)
