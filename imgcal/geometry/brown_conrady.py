@@ -1,9 +1,9 @@
-"""The lens of most cameras: a radial polynomial of three coefficients, and decentering.
+"""Brown-Conrady, the lens model of most cameras: a radial polynomial of three coefficients, and decentering.
 
 Source: Brown 1966, "Decentering Distortion of Lenses"; coefficients and their order as in OpenCV.
 """
 
-# The same functions work on tensors and, compiled, on numbers.
+# The same functions work on tensors and, once compiled, on scalars.
 # ruff: noqa: ANN001, ANN201
 # mypy: allow-untyped-defs
 
@@ -18,25 +18,25 @@ from imgcal.geometry.lens_model import LensModel
 
 
 def radial(one, s, k):
-    """Factor of the radius."""
+    """Distorted radius divided by the radius."""
     return one + s * (k[0] + s * (k[1] + s * k[4]))
 
 
 def growth(one, s, k):
-    """Twice its derivative by the squared radius."""
+    """Twice the derivative of `radial` with respect to the squared radius."""
     two = one + one
     return two * (k[0] + s * (two * k[1] + (two + one) * s * k[4]))
 
 
 def by_coefficients(one, s, k):
-    """Its derivatives by k1, k2, p1, p2, k3."""
+    """Derivatives of `radial` with respect to k1, k2, p1, p2, k3."""
     return s, s * s, s, s, s * s * s
 
 
 def is_before_fold(rr: Tensor, k: tuple[Tensor, ...]) -> Tensor:
     """Tell where 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3, the derivative of the distorted radius, is positive for all s <= rr.
 
-    The smallest value of a cubic on an interval is at an end or at its one local minimum.
+    The smallest value of a cubic on an interval is at an endpoint or at its only local minimum.
     """
     a, b, c = 3 * k[0], 5 * k[1], 7 * k[4]
 
@@ -52,7 +52,7 @@ def is_before_fold(rr: Tensor, k: tuple[Tensor, ...]) -> Tensor:
 
 
 def blind_from(k):
-    """Squared radius at which the derivative has dipped to zero or below and may recover, like `is_before_fold`."""
+    """Squared radius of a local minimum of the slope that is not positive; infinite if none. See `is_before_fold`."""
     a, b, c = 3 * k[0], 5 * k[1], 7 * k[4]
     root = np.sqrt(b * b - 3 * a * c)
     lowest = -a / (b + root) if b > 0 else (root - b) / (3 * c)

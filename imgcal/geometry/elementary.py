@@ -1,6 +1,6 @@
-"""Functions that the formulas of lenses need, of tensors and, in compiled code, of numbers: one text serves both."""
+"""Elementary functions for lens formulas, of tensors and, in compiled code, of scalars: one source serves both."""
 
-# Numba takes types from arguments, and compares the signatures.
+# Numba infers types from arguments, and requires overloads to have the same signature.
 # ruff: noqa: ANN001, ANN202
 # mypy: allow-untyped-defs
 
@@ -18,17 +18,17 @@ def sqrt(x: Tensor) -> Tensor:
 
 
 def arctan(x: Tensor) -> Tensor:
-    """Angle of a slope, rad."""
+    """Arctangent, rad."""
     return torch.arctan(x)
 
 
 def tan(x: Tensor) -> Tensor:
-    """Slope of an angle."""
+    """Tangent of an angle in rad."""
     return torch.tan(x)
 
 
 def minimum(x: Tensor, limit: float) -> Tensor:
-    """The smaller of both."""
+    """The smaller of the two."""
     return x.clamp_max(limit)
 
 

@@ -1,12 +1,12 @@
-"""The fisheye: a point at the angle t from the optical axis comes to the radius t (1 + k1 t^2 + ... + k4 t^8).
+"""The fisheye lens: a point at angle t from the optical axis has the image radius t (1 + k1 t^2 + ... + k4 t^8).
 
-Points of the z = 1 plane are what a camera can see: angles below 90 degrees.
+A camera sees points of the z = 1 plane only: angles below 90 degrees.
 
 Source: Kannala and Brandt 2006, "A Generic Camera Model and Calibration Method for Conventional, Wide-Angle, and
-Fish-Eye Lenses"; coefficients and their order as OpenCV's `fisheye` has them.
+Fish-Eye Lenses"; coefficients and their order as in OpenCV's `fisheye`.
 """
 
-# The same functions work on tensors and, compiled, on numbers.
+# The same functions work on tensors and, once compiled, on scalars.
 # ruff: noqa: ANN001, ANN201
 # mypy: allow-untyped-defs
 
@@ -16,12 +16,12 @@ from imgcal.geometry.elementary import arctan, minimum, sqrt, tan
 from imgcal.geometry.kornia_distortion import kannala_brandt_distortion
 from imgcal.geometry.lens_model import LensModel
 
-TINY = 1e-30  # of squared radii: the axis itself needs no case of its own
-WIDEST = 1.57  # rad, of the inverse
+TINY = 1e-30  # added to squared radii, so that the axis is not a special case
+WIDEST = 1.57  # rad, largest angle of the inverse
 
 
 def radial(one, s, k):
-    """Factor of the radius."""
+    """Distorted radius divided by the radius."""
     r = sqrt(s + one * TINY)
     t = arctan(r)
     u = t * t
@@ -29,7 +29,7 @@ def radial(one, s, k):
 
 
 def growth(one, s, k):
-    """Twice its derivative by the squared radius."""
+    """Twice the derivative of `radial` with respect to the squared radius."""
     two = one + one
     three, four = two + one, two + two
     s = s + one * TINY
@@ -44,7 +44,7 @@ def growth(one, s, k):
 
 
 def by_coefficients(one, s, k):
-    """Its derivatives by k1, k2, k3, k4."""
+    """Derivatives of `radial` with respect to k1, k2, k3, k4."""
     r = sqrt(s + one * TINY)
     t = arctan(r)
     u = t * t
@@ -53,7 +53,7 @@ def by_coefficients(one, s, k):
 
 
 def inverse(one, s, k):
-    """Factor that takes the distorted radius back: Newton's method for the angle."""
+    """Radius divided by the distorted radius, by Newton's method for the angle."""
     two = one + one
     three = two + one
     five, seven, nine = three + two, three + two + two, three * three

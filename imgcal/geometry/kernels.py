@@ -1,7 +1,7 @@
-"""Small compiled functions that the compiled loops of several rooms share: rotations, Cholesky factors, ranks.
+"""Small compiled functions shared by the compiled loops of several subpackages: rotations, Cholesky factors, ranks.
 
-`rotations.py` says the same in tensors, and is what these are tested against; lenses are in `lens_kernels.py`. Arrays
-are filled in place; the floating-point type is that of the arguments.
+Tests compare them with the tensor versions in `rotations.py`; lenses are in `lens_kernels.py`. Arrays are filled in
+place; the floating-point type is that of the arguments.
 """
 
 # Compiled functions take their types from their arguments.
@@ -15,17 +15,17 @@ import numpy as np
 from renderers.compiling import njit
 
 FAST = {"contract", "reassoc", "nsz"}
-"""Of floating-point arithmetic; nan and inf keep their meaning: a bad step must show."""
+"""Permitted floating-point optimizations; nan and inf keep their meaning, so that a bad step shows."""
 LINE = 1e-3
-"""Breadth of points on one line, in parts of their greatest distance from the origin: no turn about it can be seen."""
+"""Largest distance of collinear points from their line, relative to their largest distance from the origin."""
 
 
 @njit(cache=True, fastmath=FAST)
 def fill_free_turns(points, turns):
-    """Fill the projector (3, 3) onto those turns about the origin that leave points (N, 3) where they are.
+    """Fill the projector (3, 3) onto rotations about the origin that leave points (N, 3) in place.
 
     Returns:
-        How many there are: 0 of a solid or a plane, 1 of a line through the origin, 3 of the origin alone.
+        Number of such rotation axes: 0 for a solid or a plane, 1 for a line through the origin, 3 for the origin alone.
     """
     far, greatest = 0, 0.0
     for n in range(len(points)):
@@ -121,7 +121,7 @@ def cholesky_solve(lower, right):
 
 @njit(fastmath=FAST)
 def subtract_gram(matrix, tall):
-    """Subtract tall.T @ tall from the lower triangle; the number of rows is divisible by three, as 6, 15 and 18 are."""
+    """Subtract tall.T @ tall from the lower triangle; the number of rows must be divisible by three (6, 15, 18)."""
     # Three rows at once: the matrix is read and written a third as often.
     for r in range(0, tall.shape[0], 3):
         for i in range(tall.shape[1]):
@@ -132,7 +132,7 @@ def subtract_gram(matrix, tall):
 
 @njit(nogil=True)
 def select_rank(values, count, rank):
-    """Value of a rank among the first `count` ones, which are reordered: none before it is larger then (Hoare)."""
+    """Select a rank among the first `count` values, which are reordered so that none before it is larger (Hoare)."""
     low, high = 0, count - 1
     while low < high:
         pivot, i, j = values[(low + high) // 2], low, high

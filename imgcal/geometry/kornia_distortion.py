@@ -1,4 +1,4 @@
-"""Kornia's distortions on the z = 1 plane: what the formulas of the lens models are compared with."""
+"""Kornia's distortion functions on the z = 1 plane, with which the formulas of the lens models are compared."""
 
 from __future__ import annotations
 

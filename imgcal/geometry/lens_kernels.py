@@ -1,8 +1,8 @@
-"""Images of lenses and their derivatives in compiled loops: `lenses.py` says the same of tensors, model by model.
+"""Lens distortion and its derivatives for compiled loops; `lenses.py` does the same for tensors, model by model.
 
-A camera's model is its number among `LENS_MODELS`: see `lens_codes`. The functions that choose by it are made from the
-models' formulas. Where all lenses are of the usual kind, the numbers are None, which is another type: what is compiled
-for that knows no other lens, and loses no time.
+A camera's model is given by its index in `LENS_MODELS`: see `lens_codes`. The functions that select by this index are
+built from the models' formulas. If all lenses are of the default model, None replaces the indices. To numba this is
+another type, and the code compiled for it handles no other lens and loses no time.
 """
 
 # Compiled functions take their types from their arguments.
@@ -24,26 +24,26 @@ from imgcal.geometry.lens_model import Formula, LensModel
 from imgcal.geometry.lenses import DEFAULT, FOLD_RADII, FOLD_SHARES, LENS_MODELS
 from renderers.compiling import njit
 
-LEAST_RADIAL = 0.2  # of `undistort`: beyond the fold of the image there is nothing to find
+LEAST_RADIAL = 0.2  # lower bound in `undistort`: beyond the fold of the image there is no solution
 FOLD_SQUARES, FOLD_PARTS = FOLD_RADII.square().numpy(), FOLD_SHARES.numpy()
 
 
 class CompiledLens(NamedTuple):
-    """The compiled functions of one model, `one` and the coefficients k as in `LensModel`."""
+    """The compiled functions of one model; `one` and the coefficients k are as in `LensModel`."""
 
     name: str
     distort: Formula  # (one, x, y, k) -> distorted x, y; Jacobian xx, xy, yy; x^2 + y^2; slope of the distorted radius
     by_coefficients: Formula  # (x, y, x^2 + y^2, k, fx, fy, at, rows (2, R)): puts fx, fy times derivatives into rows
     undistort: Formula  # (distorted x, y, k) -> x, y to far less than a pixel
-    start: Formula  # the same: where an exact iteration starts
-    blind_from: Formula  # (k) -> squared radius from which the slope need not be looked at any more
+    start: Formula  # the same, as the initial guess of an exact iteration
+    blind_from: Formula  # (k) -> squared radius from which on a point is beyond the fold, whatever its slope
 
 
 def compile_as(name: str, **options: Any) -> Callable[[Formula], Formula]:
-    """Do what `njit` does to one of several functions of the same name in the source, without a cache of its own.
+    """Apply `njit` to one of several functions of the same name in the source, without a cache of its own.
 
-    Code that different processes have cached calls its parts by their names, and counts: parts of one name would be
-    taken for each other.
+    Cached code refers to the functions it calls by name and a counter. In code from different processes, functions of
+    the same name would be confused.
     """
 
     def decorate(function: Formula) -> Formula:
@@ -145,13 +145,13 @@ USUAL_WIDTH = len(LENS_MODELS[DEFAULT].coefficients)
 
 
 def each_lens(make: Formula) -> tuple[Formula, ...]:
-    """Compiled functions of all models; `make` takes a `CompiledLens` and the number of its coefficients."""
+    """Compile a function for each model; `make` takes a `CompiledLens` and the number of its coefficients."""
     sizes = (len(model.coefficients) for model in LENS_MODELS.values())
     return tuple(make(lens, size) for lens, size in zip(COMPILED_LENSES, sizes, strict=True))
 
 
 def _chosen(kind: str, functions: tuple[Formula, ...], number: int = 0) -> Formula:
-    """One function of those of all models: called with a model's number before the rest."""
+    """Combine the models' functions into one, whose first argument is the index of the model to use."""
     here = functions[number]
     if number == len(functions) - 1:
 
@@ -172,9 +172,9 @@ def _chosen(kind: str, functions: tuple[Formula, ...], number: int = 0) -> Formu
 
 
 def chain_models(kind: str, functions: tuple[Formula, ...], number: int = 0) -> Formula:
-    """One function that calls those of all models one after another, each with its model's number before the rest.
+    """Combine the models' functions into one that calls them in turn, each with its model's index as first argument.
 
-    Each of them does what belongs to cameras of its model, all that there is where the models are None.
+    Each function handles the cameras of its own model. If the models are None, the default one handles all cameras.
     """
     here = functions[number]
     if number == len(functions) - 1:
@@ -242,13 +242,13 @@ _usual_image, _usual_coefficients, _usual_inverse = _IMAGES[USUAL], _COEFFICIENT
 
 
 def image_of(models, camera, px, py, depth, radius_squared, k):
-    """Image of a point (mm, in the camera) or of a sphere around it, and its derivatives, like `linearization._lens`.
+    """Image of a point (mm, camera frame) or of a sphere around it, and its derivatives, like `linearization._lens`.
 
-    Compiled only; models are `lens_codes`.
+    For compiled code only; `models` comes from `lens_codes`.
 
     Returns:
-        x / px; the derivative of log x by depth; x, y, x^2 + y^2, the distorted x and y, and the symmetric Jacobian of
-        the distortion: xx, xy, yy.
+        x / px; the derivative of log x with respect to depth; x, y, x^2 + y^2, the distorted x and y, and the symmetric
+        Jacobian of the distortion: xx, xy, yy.
     """
     raise NotImplementedError
 
@@ -263,8 +263,10 @@ def _image_of(models, camera, px, py, depth, radius_squared, k):
 
 
 def by_coefficients(models, camera, x, y, rr, k, along, down, at, rows):
-    """Fill the columns of rows (2, R) from `at` on: derivatives of distorted x times `along`, of distorted y times
-    `down`, by the coefficients; zero where the lens has fewer than there are. Like `lenses.distort_by_coefficients`.
+    """Fill the columns of rows (2, R) from `at` on with derivatives with respect to the coefficients.
+
+    The first row is for distorted x, times `along`; the second for distorted y, times `down`. Coefficients that the
+    lens does not have get zero. Like `lenses.distort_by_coefficients`.
     """
     raise NotImplementedError
 
@@ -281,7 +283,7 @@ def _by_coefficients(models, camera, x, y, rr, k, along, down, at, rows):
 
 
 def width_of(models, k):
-    """Number of coefficients, D, of an array (C, D): a constant for the usual lenses, whose loops are unrolled."""
+    """Number of coefficients, D, of an array (C, D): a constant for default lenses, so that loops are unrolled."""
     raise NotImplementedError
 
 
@@ -293,7 +295,7 @@ def _width_of(models, k):
 
 
 def undistort(models, camera, xd, yd, k):
-    """Point x, y of the z = 1 plane, good to far less than a pixel; `lenses.undistort` is exact."""
+    """Undistorted x, y on the z = 1 plane, accurate to far less than a pixel; `lenses.undistort` is exact."""
     raise NotImplementedError
 
 

@@ -1,6 +1,6 @@
-"""What a lens model is: a radial profile, and the decentering that models share."""
+"""Definition of a lens model: a radial profile, and the decentering that models share."""
 
-# The same functions work on tensors and, compiled, on numbers.
+# The same functions work on tensors and, once compiled, on scalars.
 # mypy: allow-untyped-defs
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ Formula = Callable[..., Any]
 
 @dataclass(frozen=True)
 class LensModel:
-    """A lens: a point (x, y) of the z = 1 plane comes to (x, y) g(x^2 + y^2), plus the decentering by p1 and p2.
+    """A lens: it maps a point (x, y) of the z = 1 plane to (x, y) g(x^2 + y^2), plus the decentering by p1 and p2.
 
-    The formulas are plain arithmetic (and `elementary`'s functions), which serves tensors and, compiled, numbers. Each
-    is given `one`, which is 1 in the type of the arithmetic (a literal would make double precision of single), a
-    squared radius s, and k, the coefficients in the order of `coefficients`.
+    The formulas are plain arithmetic (and functions of `elementary`), for tensors and, once compiled, scalars. Each
+    takes `one`, a squared radius s, and k, the coefficients in the order of `coefficients`. `one` is 1 in the
+    floating-point type of the arithmetic: a literal would turn single precision into double.
     """
 
     name: str  # in rig files
@@ -30,12 +30,12 @@ class LensModel:
     by_coefficients: Formula  # (one, s, k) -> dg/dk of each coefficient, anything for p1 and p2
     kornia: Callable[[Tensor, Tensor], Tensor]  # (B, N, 2), (B, coefficients) -> (B, N, 2), through kornia's function
     inverse: Formula | None = None  # (one, squared distorted radius, k) -> 1 / g; None = by iteration
-    # (s, k) -> whether the distorted radius grows up to s, of tensors, and compiled (k) -> squared radius from which
-    # the slope there says no more; None = from samples.
+    # Tensors (s, k) -> whether the distorted radius increases up to s; compiled (k) -> squared radius from which on a
+    # point is beyond the fold, whatever its slope. None = from samples.
     is_before_fold: Callable[[Tensor, tuple[Tensor, ...]], Tensor] | None = None
     blind_from: Formula | None = None
 
     @property
     def decentering(self) -> tuple[int, int] | None:
-        """Where p1 and p2 stand among the coefficients; None = a lens without."""
+        """Indices of p1 and p2 among the coefficients; None = no decentering."""
         return (self.coefficients.index("p1"), self.coefficients.index("p2")) if "p1" in self.coefficients else None

@@ -1,7 +1,7 @@
-"""The lens models that there are, and what follows from the formulas of one: images, derivatives, fold, inverse.
+"""The available lens models, and functions based on their formulas: distortion, derivatives, fold, inverse.
 
-Tensors (*B, C, N) of C cameras; coefficients (*B, C, D), where lenses with fewer than D have zeros behind their own.
-Which model a camera has is one name for all of them, or a name for each. `lens_kernels.py` is the same compiled.
+Coordinates are (*B, C, N) for C cameras. Coefficients are (*B, C, D), padded with zeros for lenses with fewer than D.
+Models are one name for all cameras, or a name for each. `lens_kernels.py` is the compiled version.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from imgcal.geometry.lens_model import LensModel
 from imgcal.geometry.rational import RATIONAL
 
 LENS_MODELS = {model.name: model for model in (BROWN_CONRADY, RATIONAL, EQUIDISTANT)}
-"""By the name in rig files. To add one: a file beside `rational.py`, and its place here."""
+"""By their names in rig files. To add a model, write a file like `rational.py` and list it here."""
 
 ModelNames: TypeAlias = str | tuple[str, ...]
 """One name for all cameras, or a name for each."""
 
 DEFAULT = BROWN_CONRADY.name
 FOLD_RADII = 0.003 * 1.05 ** torch.arange(214, dtype=torch.float64)
-"""Radii on the z = 1 plane, 0.2 to 89.4 degrees, where the fold of a lens without a formula for it is looked for."""
+"""Radii on the z = 1 plane, 0.2 to 89.4 degrees, at which the fold of a lens without a formula is searched for."""
 
 FOLD_SHARES = torch.arange(65, dtype=torch.float64) / 64
-"""Of the way from one of these, squared, to the next, where it is looked for more closely."""
+"""Shares of the interval between two of these radii, squared, at which the search is refined."""
 
 Components: TypeAlias = tuple[Tensor, ...]
 
@@ -42,21 +42,21 @@ def lens_names(models: ModelNames, cameras: int) -> tuple[str, ...]:
 
 
 def lens_label(names: Sequence[str]) -> ModelNames:
-    """Say it with one name where all cameras have the same lens: what is fastest."""
+    """Reduce the names to one if all cameras have the same lens, which is fastest."""
     return names[0] if len(set(names)) == 1 else tuple(names)
 
 
 def lens_width(models: ModelNames) -> int:
-    """Width D of the coefficients of such cameras together: five at least, which most rigs have."""
+    """Width D of the coefficients for these models: at least five, as most rigs have."""
     names = {models} if isinstance(models, str) else set(models)
     return max(len(BROWN_CONRADY.coefficients), *(len(LENS_MODELS[name].coefficients) for name in names))
 
 
 @cache
 def lens_codes(models: ModelNames, cameras: int, width: int) -> NDArray[np.int64] | None:
-    """Number of each camera's model among `LENS_MODELS`, as compiled functions know it: (C,), not to be written to.
+    """Index of each camera's model in `LENS_MODELS`, for compiled functions: (C,), not to be modified.
 
-    None where all are of the usual kind, and their coefficients (C, D) no wider than that.
+    None if all are of the default model, and their coefficients (C, D) no wider than it needs.
     """
     if {*lens_names(models, cameras)} <= {DEFAULT} and width == len(LENS_MODELS[DEFAULT].coefficients):
         return None
@@ -82,7 +82,7 @@ def distort_with_jacobian(x: Tensor, y: Tensor, distortion: Tensor, models: Mode
 
 
 def distort_by_coefficients(x: Tensor, y: Tensor, distortion: Tensor, models: ModelNames = DEFAULT) -> Components:
-    """Derivatives of distorted x and y by the coefficients: two of (*B, C, N, D), zero where a lens has fewer."""
+    """Derivatives of distorted x and y by the coefficients: (*B, C, N, D) each, zero where a lens has fewer."""
     width = distortion.shape[-1]
     found = _by_model(_distort_by_coefficients, models, (x, y), distortion)
     return torch.stack(found[:width], dim=-1), torch.stack(found[width:], dim=-1)
@@ -147,7 +147,7 @@ def _by_model(
     points: Components,
     distortion: Tensor,
 ) -> Components:
-    """Call a function for the cameras of each model; what it takes and returns is (*B, C, N), but the distortion."""
+    """Call a function for the cameras of each model; all inputs and outputs but the distortion are (*B, C, N)."""
     if isinstance(models, str):
         return function(LENS_MODELS[models], points, distortion)
     order: list[int] = []
@@ -163,7 +163,7 @@ def _by_model(
 
 
 def _own(model: LensModel, distortion: Tensor) -> Components:
-    """Coefficients (*B, C, 1) that the model has."""
+    """The model's own coefficients, (*B, C, 1) each."""
     return distortion.unsqueeze(-2).unbind(-1)[: len(model.coefficients)]
 
 
@@ -216,7 +216,7 @@ def _is_before_fold(model: LensModel, points: Components, distortion: Tensor) ->
 
 
 def _bracket(model: LensModel, s: Tensor, k: Components) -> Components:
-    """Neighbours (*B, C, 1) of squared radii (*B, C, R) between which the image folds; infinite where it does not.
+    """Neighbours (*B, C, 1) among squared radii (*B, C, R) between which the image folds; infinite if it does not.
 
     It folds where the slope of the distorted radius falls to zero, or before that at a pole.
     """
@@ -229,7 +229,7 @@ def _bracket(model: LensModel, s: Tensor, k: Components) -> Components:
 
 
 def _start(model: LensModel, points: Components, distortion: Tensor) -> Components:
-    """First guess of the undistorted points."""
+    """Initial guess of the undistorted points."""
     x, y = points
     if model.inverse is None:
         return x, y

@@ -1,4 +1,4 @@
-"""Turns of an object that nothing of it shows: those of a stick about itself, all of a single light."""
+"""Unobservable rotations of an object: those of a stick about its axis, and all of a single marker."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from imgcal.geometry.kernels import fill_free_turns
 
 
 def free_turns(points: Tensor) -> Tensor:
-    """Projector (3, 3) onto the turns about the origin that leave points (N, 3) where they are.
+    """Projector (3, 3) onto rotations about the origin that leave points (N, 3) in place.
 
     Examples:
         >>> free_turns(torch.tensor([[0.0, 0.0, -250.0], [0.0, 0.0, 250.0]])).diagonal()
@@ -22,7 +22,7 @@ def free_turns(points: Tensor) -> Tensor:
 
 
 def pose_rank(points: Tensor) -> int:
-    """How many of the 6 numbers of a pose some points (N, 3) show: 3 of one point, 5 of a line, else 6.
+    """Number of a pose's 6 degrees of freedom that points (N, 3) determine: 3 for one point, 5 for a line, else 6.
 
     Examples:
         >>> pose_rank(torch.zeros(1, 3)), pose_rank(torch.eye(3))

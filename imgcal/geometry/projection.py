@@ -1,4 +1,4 @@
-"""Pinhole projection with any lens of `lenses.py`: kornia's ops for training, a fused path for speed, proven equal.
+"""Pinhole projection with any lens of `lenses.py`: kornia's ops for training, an equivalent fused path for speed.
 
 Conventions: OpenCV camera frame (x right, y down, z forward); pixel (0, 0) is the centre of the top-left pixel.
 """
@@ -13,13 +13,13 @@ from torch import Tensor
 from imgcal.geometry.lenses import DEFAULT, ModelNames, distort, distort_kornia, is_before_fold
 from imgcal.messages import brief_repr
 
-# Nearer than this (mm) a point counts as behind the camera; its pixel is computed at this depth and stays finite.
+# A point nearer than this (mm) counts as behind the camera; its pixel is computed at this depth and stays finite.
 NEAREST_DEPTH = 1e-3
 
 
 @dataclass(frozen=True)
 class Projection:
-    """Image of points in cameras; `visible` alone says whether a pixel means anything.
+    """Image of points in cameras; only `visible` tells whether a pixel is valid.
 
     Examples:
         >>> import imgcal
@@ -37,7 +37,7 @@ class Projection:
 
 
 def resized_pixels(uv: Tensor, scale: Tensor | float) -> Tensor:
-    """Take pixels to the same image in another size, by the pixel-centre rule u' + 1/2 = scale (u + 1/2).
+    """Convert pixels to the same image at another size, by the pixel-centre rule u' + 1/2 = scale (u + 1/2).
 
     Examples:
         >>> resized_pixels(torch.tensor([0.0, 9.0]), 0.5)
@@ -100,7 +100,7 @@ def project_components(
     radius: Tensor | None = None,
     models: ModelNames = DEFAULT,
 ) -> Projection:
-    """Do the work of `project` on separate x, y, z components (*B, C, N) mm: contiguous components are fastest."""
+    """Project like `project`, from separate x, y, z components (*B, C, N) mm: contiguous components are fastest."""
     px, py, depth = points_cam
     inverse_depth = apparent_centre_scale(depth, radius) / depth.clamp_min(NEAREST_DEPTH)
     x, y = px * inverse_depth, py * inverse_depth

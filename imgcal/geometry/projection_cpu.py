@@ -1,6 +1,6 @@
 """Projection without gradients on CPUs: `CameraRig.project` compiled to one loop, without temporaries.
 
-`projection.py` says the same in tensors, runs on any device, and is what this is tested against.
+`projection.py` does the same with tensors on any device; tests compare the two.
 """
 
 # Compiled functions take their types from their arguments.
@@ -33,10 +33,10 @@ def project_cpu(
     radius: Tensor | None = None,
     models: ModelNames = DEFAULT,
 ) -> Projection:
-    """Do the work of `projection.project_components` for tensors on the CPU: without gradients, several times faster.
+    """Project like `projection.project_components`, for tensors on the CPU: without gradients, several times faster.
 
     Args:
-        points_rig: (B, N, 3) mm; its floating-point type is that of all others.
+        points_rig: (B, N, 3) mm; all others have the same floating-point type.
         cam_from_rig: (B, C).
         focal_length: (B, C, 2) pixels.
         principal_point: (B, C, 2) pixels.
@@ -67,7 +67,7 @@ def _projection(lens: CompiledLens, size: int) -> Formula:
         number, models, points, radius_squared, rotation, translation, focal_length, principal_point, distortion,
         image_size, image,
     ):  # fmt: skip
-        # One output array and constants of the points' own type: with more of either, the inner loop is not vectorized.
+        # One output array, and constants of the points' own type: otherwise the inner loop is not vectorized.
         kind = points.dtype.type
         nearest, zero, half, one = kind(NEAREST_DEPTH), kind(0), kind(0.5), kind(1)
         for b in range(rotation.shape[0]):
@@ -110,7 +110,7 @@ def _project(models, given):
 
 
 def undistort_cpu(xy_distorted: Tensor, distortion: Tensor, models: ModelNames = DEFAULT) -> tuple[Tensor, Tensor]:
-    """Do the work of `lenses.undistort` for tensors on the CPU, without gradients, until nothing changes any more.
+    """Undistort like `lenses.undistort`, for tensors on the CPU: without gradients, until it converges.
 
     Args:
         xy_distorted: (*B, C, N, 2) distorted coordinates on the z = 1 plane.

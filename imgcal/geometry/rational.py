@@ -1,10 +1,10 @@
-"""The lens of wide angles below the fisheye: a quotient of two radial polynomials, and decentering.
+"""The rational lens model, for wide angles short of a fisheye: a quotient of two radial polynomials, and decentering.
 
 Source: Claus and Fitzgibbon 2005, "A Rational Function Lens Distortion Model for General Cameras"; coefficients and
-their order as OpenCV's CALIB_RATIONAL_MODEL has them.
+their order as in OpenCV's CALIB_RATIONAL_MODEL.
 """
 
-# The same functions work on tensors and, compiled, on numbers.
+# The same functions work on tensors and, once compiled, on scalars.
 # ruff: noqa: ANN001, ANN201
 # mypy: allow-untyped-defs
 
@@ -15,12 +15,12 @@ from imgcal.geometry.lens_model import LensModel
 
 
 def radial(one, s, k):
-    """Factor of the radius."""
+    """Distorted radius divided by the radius."""
     return (one + s * (k[0] + s * (k[1] + s * k[4]))) / (one + s * (k[5] + s * (k[6] + s * k[7])))
 
 
 def growth(one, s, k):
-    """Twice its derivative by the squared radius."""
+    """Twice the derivative of `radial` with respect to the squared radius."""
     two = one + one
     three = two + one
     above, below = one + s * (k[0] + s * (k[1] + s * k[4])), one + s * (k[5] + s * (k[6] + s * k[7]))
@@ -30,7 +30,7 @@ def growth(one, s, k):
 
 
 def by_coefficients(one, s, k):
-    """Its derivatives by k1, k2, p1, p2, k3, k4, k5, k6."""
+    """Derivatives of `radial` with respect to k1, k2, p1, p2, k3, k4, k5, k6."""
     above, below = one + s * (k[0] + s * (k[1] + s * k[4])), one + s * (k[5] + s * (k[6] + s * k[7]))
     up = s / below
     down = -up * above / below

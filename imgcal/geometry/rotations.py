@@ -174,7 +174,7 @@ def euler_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def _matrices(entries: tuple[Tensor, ...]) -> Tensor:
-    """Nine entries (*B), row by row, to matrices (*B, 3, 3); the entries stay apart in memory, in long rows."""
+    """Assemble nine entries (*B), row by row, into matrices (*B, 3, 3); in memory each entry stays one long row."""
     return torch.stack(entries).unflatten(0, (3, 3)).movedim((0, 1), (-2, -1))
 
 

@@ -43,17 +43,17 @@ class RigidTransform:
 
     @classmethod
     def stack(cls, parts: Sequence[RigidTransform]) -> RigidTransform:
-        """Put several together along a new first batch axis."""
+        """Stack several along a new first batch axis."""
         return cls.combine(parts, torch.stack)
 
     @classmethod
     def cat(cls, parts: Sequence[RigidTransform]) -> RigidTransform:
-        """Put several together along their first batch axis."""
+        """Concatenate several along their first batch axis."""
         return cls.combine(parts, torch.cat)
 
     @classmethod
     def combine(cls, parts: Sequence[RigidTransform], join: Join) -> RigidTransform:
-        """Make one of several; `join` takes the list of their rotations, then of their translations."""
+        """Combine several into one; `join` takes the list of their rotations, then of their translations."""
         return cls(join([part.rotation for part in parts]), join([part.translation for part in parts]))
 
     def __matmul__(self, other: RigidTransform) -> RigidTransform:
@@ -76,14 +76,14 @@ class RigidTransform:
         return RigidTransform(self.rotation.mT, -self.origin_image())
 
     def origin_image(self) -> Tensor:
-        """Return `rotation^T @ translation`: (*B, 3) mm, minus the destination's origin seen from the source."""
+        """Return `rotation^T @ translation`: (*B, 3) mm, minus the destination's origin in the source frame."""
         return rotate(self.rotation.mT, self.translation)
 
     def apply(self, points_source: Tensor) -> Tensor:
         """Transform points (*B, N, 3) mm; the batch axes broadcast against the transform's."""
         if points_source.dim() == 2:
-            # Else PyTorch makes one tall product of them all, for which the threads of MKL wait for one another: for
-            # 97 transforms of eight points that is 10 us on an idle machine, and 30 ms where the cores have other work.
+            # Otherwise PyTorch computes one tall product, for which the threads of MKL wait for each other: for 97
+            # transforms of eight points this takes 10 us on an idle machine, and 30 ms on a busy one.
             points_source = points_source.expand(*self.rotation.shape[:-2], -1, -1)
         return (self.rotation @ points_source.mT).mT + self.translation[..., None, :]
 
