@@ -1,4 +1,4 @@
-"""Value types: rigs, objects, what cameras have seen, what networks predict; and which values are plausible."""
+"""Value types: rigs, objects, observations and network predictions; and the plausible ranges of values."""
 
 import lazy_loader as lazy
 

@@ -14,15 +14,15 @@ from imgcal.errors import InputError
 
 BoardKind = Literal["charuco", "aprilgrid", "checkerboard", "circles"]
 WARP = 0.002
-"""Of the longer side: deflection in its middle, one standard deviation, of a board whose file does not say."""
+"""Standard deviation of the middle's deflection, as a share of the longer side, where a board's file does not say."""
 
 
 @dataclass(frozen=True)
 class Board:
     """A printed board: x to the right along its rows, y down, z into it; lengths in mm.
 
-    Fiducials are numbered row by row from the top left: the inner corners of a chessboard, the circles, or four corners
-    a tag (clockwise from its top left; tags as they are numbered).
+    Fiducials are numbered row by row from the top left: the inner corners of a chessboard, the circles, or the
+    four corners of each tag (clockwise from its top left; tags in order of their numbers).
 
     Examples:
         >>> board = Board("charuco", columns=5, rows=7, pitch=30.0, marker=22.0, dictionary="DICT_4X4_50")
@@ -43,7 +43,7 @@ class Board:
     legacy: bool = False  # a ChArUco board as OpenCV printed it before 4.6
     asymmetric: bool = False  # every second row of circles is shifted by half of their distance
     bend: tuple[float, float] = (0.0, 0.0)  # mm, known deflection of the middle along x and y: positive = away, +z
-    warp: float | None = None  # mm, what the deflections may be off; None = `WARP` of the longer side; 0 = exactly flat
+    warp: float | None = None  # mm, standard deviation of the deflections; None = `WARP` of the longer side; 0 = exact
 
     def __post_init__(self) -> None:
         least = 3 if self.kind in ("charuco", "checkerboard") else 1 if self.kind == "aprilgrid" else 2
@@ -58,12 +58,12 @@ class Board:
 
     @property
     def is_coded(self) -> bool:
-        """Tell whether markers say which corner is which, so that part of the board is enough."""
+        """Tell whether markers identify the corners, so that part of the board is enough."""
         return self.kind in ("charuco", "aprilgrid")
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Fiducials in a row, and rows of them; of tags, tags."""
+        """Number of fiducials in a row, and of rows; for an AprilGrid, of tags."""
         if self.kind in ("charuco", "checkerboard"):
             return self.columns - 1, self.rows - 1
         return self.columns, self.rows
@@ -84,7 +84,7 @@ class Board:
 
     @property
     def modes(self) -> NDArray[np.float64]:
-        """Displacements (2, N, 3) mm of the fiducials by one standard deviation of each deflection; (0, N, 3): flat."""
+        """Displacements (2, N, 3) mm of fiducials by one standard deviation of each deflection; (0, N, 3) if exact."""
         flat, std = self._flat, self.warp_std
         return std * self._deflections(flat) if std > 0 else np.zeros((0, *flat.shape))
 
@@ -108,7 +108,7 @@ class Board:
         return np.concatenate((xy, np.zeros((len(xy), 1))), axis=1)
 
     def deflection_at(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far places (K, 2) mm of the board are from its plane: (K,) mm along z."""
+        """Deflection of positions (K, 2) mm on the board from its plane: (K,) mm along z."""
         low, extent = self._flat[:, :2].min(0), np.maximum(np.ptp(self._flat[:, :2], axis=0), 1e-300)
         share = (xy - low) / extent
         return 4 * (share * (1 - share)) @ np.array(self.bend)
@@ -126,9 +126,9 @@ class Board:
 
     @cached_property
     def turns(self) -> tuple[tuple[float, NDArray[np.int64]], ...]:
-        """Turns that an image cannot tell apart: angle about z (rad), and onto which fiducial each one (N,) falls.
+        """Rotations that an image cannot distinguish: angle about z (rad), and the fiducial that each one (N,) maps to.
 
-        The first is no turn at all. Boards with markers have no other.
+        The first is the identity. Boards with markers have no other.
         """
         if self.is_coded:
             return ((0.0, np.arange(len(self.points))),)
@@ -141,7 +141,7 @@ class Board:
         if not colour or (self.columns + self.rows) % 2 == 0:
             found.append((math.pi, number[::-1, ::-1].ravel()))
         if across == down and not self.asymmetric and (not colour or self.columns % 2 == 1):
-            # Turned by a quarter, the point at (row, column) comes to (column, last - row): x goes to y, y to -x.
+            # A quarter turn maps the point at (row, column) to (column, last - row): x to y, y to -x.
             place = number[:, ::-1].T.ravel()
             back = np.empty_like(place)
             back[place] = np.arange(len(place))

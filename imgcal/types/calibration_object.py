@@ -1,4 +1,4 @@
-"""`CalibrationObject`: known fiducials in the object's frame, and the motions that cannot be told apart."""
+"""`CalibrationObject`: known fiducials in the object's frame, and its symmetries."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from imgcal.geometry import pose_rank
 from imgcal.types.board import Board
 
 ANY_LABEL = 1_000_000
-"""Labels of a table of unknown markers are below this; nothing is made of them."""
+"""Labels in a table of unknown markers are below this; they are ignored."""
 MOST_LIGHTS = 16
-"""Lights of one snapshot from which a running rig learns; of more, those that most cameras see."""
+"""Most markers per snapshot that a running rig learns from; of more, those that most cameras see."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class Symmetry:
 
     rotation: NDArray[np.float64]  # (3, 3)
     translation: NDArray[np.float64]  # (3,) mm: moved = rotation @ point + translation
-    permutation: NDArray[np.int64]  # (N,) fiducial onto which each one falls, -1 = onto none
-    residual: float  # mm, RMS distance of the fiducials that fall onto one
+    permutation: NDArray[np.int64]  # (N,) fiducial that each one maps to, -1 = none
+    residual: float  # mm, RMS distance of the fiducials that map to one
 
 
 @dataclass(frozen=True)
@@ -54,14 +54,14 @@ class CalibrationObject:
     tolerance: Tensor | None = None  # (N,) mm, one standard deviation of each coordinate; None = exact
     scale_tolerance: float = 0.0  # relative, one standard deviation of all distances together
     board: Board | None = None  # the printed pattern whose points these are; None = markers
-    modes: Tensor | None = None  # (K, N, 3) mm: shapes of which it has as much as a standard normal says; None = rigid
-    labels: tuple[int, ...] = ()  # what tables call the fiducials; empty = by their rows
+    modes: Tensor | None = None  # (K, N, 3) mm: deformations with standard normal coefficients; None = rigid
+    labels: tuple[int, ...] = ()  # of the fiducials in tables; empty = their row numbers
     unknown_markers: bool = False  # every blob may be a marker of its own: see `unknown`
     parts: tuple[CalibrationObject, ...] = ()  # several objects in one capture, see `of_several`; empty = one object
     origin: Tensor | None = None  # (3,) mm in the frame of the object's file: the origin of `points`; None = the same
 
     def __repr__(self) -> str:
-        """Say what it is: `CalibrationObject('cube8': 8 fiducials)`; points, radii and tolerances are attributes."""
+        """Summarize: `CalibrationObject('cube8': 8 fiducials)`; points, radii and tolerances are attributes."""
         if self.unknown_markers:
             return f"CalibrationObject({self.name!r}: unknown markers)"
         if self.parts:
@@ -92,7 +92,7 @@ class CalibrationObject:
 
     @classmethod
     def of_board(cls, board: Board, name: str = "board") -> CalibrationObject:
-        """Make the object that a printed board is."""
+        """Make an object from a printed board."""
         from renderers import palette
 
         points, modes = torch.from_numpy(board.points), torch.from_numpy(board.modes)
@@ -101,15 +101,15 @@ class CalibrationObject:
 
     @classmethod
     def unknown(cls, name: str = "lights", most: int = 1) -> CalibrationObject:
-        """Make the object that says: every blob may be a marker of its own, and nothing is known of them.
+        """Make an object of unknown markers: every blob may be a marker of its own, at an unknown position.
 
-        In a capture each marker at each moment is an object of one point. A running rig numbers the markers of a
-        moment: its object has a point for each number, and its pose is a transform (S, N) whose translation is where
-        marker n is, nan for a number that no marker has.
+        In a capture, each marker at each moment is an object of one point. A running rig numbers the markers of a
+        moment: its object has a point for each number. The pose is a transform (S, N) whose translation is the position
+        of marker n, nan for unused numbers.
 
         Args:
             name: of the object.
-            most: markers of one moment that can have a number, N.
+            most: largest number of markers at one moment, N.
 
         Examples:
             >>> lights = CalibrationObject.unknown(most=4)
@@ -120,11 +120,11 @@ class CalibrationObject:
         return cls(points, colours, name=name, unknown_markers=True)
 
     def as_unknown(self) -> CalibrationObject:
-        """Take an object for unknown markers, as a running rig does with all that is no single rigid body.
+        """Replace an object by unknown markers, as a running rig does unless it is a single rigid body.
 
         Returns:
-            Up to `MOST_LIGHTS` markers at once, of the radius that all of the object's have. A single rigid body is
-            returned as it is.
+            Up to `MOST_LIGHTS` markers at once, with the object's radius if all fiducials have the same. A single rigid
+            body is returned unchanged.
 
         Examples:
             >>> stick = torch.tensor([[0.0, 0.0, 0.0], [500.0, 0.0, 0.0]])
@@ -142,20 +142,20 @@ class CalibrationObject:
     def of_several(cls, objects: Sequence[CalibrationObject]) -> CalibrationObject:
         """Put the fiducials of several objects into one set, for captures in which any of them may be visible.
 
-        Each object keeps its own pose: an image of the set in one pose means nothing. A snapshot becomes one row for
-        each object, and a row sees only the columns of its own object.
+        Each object has its own pose, so do not project the whole set with one pose. A snapshot becomes one row for each
+        object, and a row uses only the columns of its own object.
 
         Args:
-            objects: at least one; two of the same name get a number. A single one is returned as it is. One of several
-                may be unknown markers, or a single one, which is the same: of them any number may be in view.
+            objects: at least one; objects of the same name are numbered. A single object is returned unchanged. One of
+                several may be a single marker or unknown markers, which are treated alike: any number may be in view.
 
         Returns:
-            All fiducials in the order of the objects, unknown markers last, those of each about its own centroid;
-            `parts` holds the objects with these coordinates.
+            All fiducials in the order of the objects, unknown markers last. Coordinates are relative to the centroid of
+            each object; `parts` holds the objects with these coordinates.
 
         Raises:
-            InputError: a printed board, or an object whose scale has a tolerance, among several; or only markers of
-                which nothing is known.
+            InputError: a printed board or an object with a scale tolerance among several, or single or unknown markers
+                twice.
 
         Examples:
             >>> import imgcal
@@ -204,17 +204,17 @@ class CalibrationObject:
 
     @property
     def each(self) -> tuple[CalibrationObject, ...]:
-        """The objects that there are: `parts`, or the object itself."""
+        """The individual objects: `parts`, or the object itself."""
         return self.parts or (self,)
 
     @cached_property
     def part_of(self) -> NDArray[np.int64]:
-        """Number of the object to which each fiducial belongs: (N,); zero of a single object."""
+        """Index of the object that each fiducial belongs to: (N,); zeros for a single object."""
         return np.repeat(np.arange(len(self.each)), [len(part.points) for part in self.each])
 
     @property
     def has_lights(self) -> bool:
-        """Tell whether the last of several objects is unknown markers."""
+        """Tell whether the last of several objects stands for unknown markers."""
         return bool(self.parts) and self.parts[-1].unknown_markers
 
     @property
@@ -223,13 +223,13 @@ class CalibrationObject:
         return self.scale_tolerance == 0 and (self.tolerance is None or not bool(self.tolerance.any()))
 
     def require_rigid(self, use: str) -> None:
-        """Refuse lights and sticks where they are not supported yet.
+        """Refuse several objects, sticks, and single or unknown markers where they are not supported yet.
 
         Args:
             use: what the object is for, in words.
 
         Raises:
-            InputError: its fiducials lie on one line, there is only one, or nothing is known of them.
+            InputError: several objects, unknown markers, only one fiducial, or all fiducials on one line.
         """
         if self.parts:
             raise InputError(f"objects: found {len(self.parts)}, expected a single one {use}")
@@ -258,9 +258,9 @@ class CalibrationObject:
 
     @property
     def rows(self) -> int | tuple[int, ...] | tuple[tuple[str, int], ...]:
-        """What tables call the fiducials: so many rows, or numbers of their own; of several, with the object's name.
+        """Labels of the fiducials in tables: the number of rows, or explicit labels; for several objects, with names.
 
-        Unknown markers have any number.
+        Unknown markers may have any label.
         """
         if self.unknown_markers:
             return ANY_LABEL
@@ -277,9 +277,9 @@ class CalibrationObject:
 
     @cached_property
     def pose_rank(self) -> int:
-        """How many of its pose's 6 numbers it shows: 3 of a light, 5 of fiducials on one line, else 6.
+        """Observable degrees of freedom of its pose: 3 for a single marker, 5 for collinear fiducials, else 6.
 
-        Of several objects, that of the one that shows most.
+        For several objects, the largest.
         """
         return max(part.pose_rank for part in self.parts) if self.parts else pose_rank(self.points)
 
@@ -291,22 +291,22 @@ class CalibrationObject:
 
     @cached_property
     def symmetries(self) -> tuple[Symmetry, ...]:
-        """Proper rotations that map the object onto itself, the identity first; found when first asked for.
+        """Proper rotations that map the object onto itself, the identity first; computed on first use.
 
-        With more than one, unlabelled blobs cannot decide between them, but the relations between cameras are the same
-        for all as long as every camera uses the same one.
+        If there are several, unlabelled blobs cannot distinguish them. The relative poses of the cameras are the same
+        for all, as long as every camera uses the same one.
         """
         return self.near_symmetries(tolerance=1e-3 * self.size)
 
     def near_symmetries(self, tolerance: float) -> tuple[Symmetry, ...]:
-        """Find rotations about the centroid that map every fiducial to within `tolerance` (mm) of one of its radius.
+        """Find rotations about the centroid that map every fiducial to within `tolerance` (mm) of one of equal radius.
 
         Returns:
-            Self-motions in order of residual, the identity first; `permutation` has no -1. Of several objects only the
-            identity: ask each.
+            Symmetries in order of residual, the identity first; `permutation` has no -1. For several objects, only the
+            identity: call this for each of them.
 
         Source: every symmetry of a finite set fixes its centroid and is determined by the images of two points that are
-        not in line with it.
+        not collinear with it.
         """
         if self.parts:
             return (Symmetry(np.eye(3), np.zeros(3), np.arange(self.num_fiducials), 0.0),)
@@ -334,12 +334,12 @@ class CalibrationObject:
 
 
 def _or_zero(radius: Tensor | None, points: Tensor) -> Tensor:
-    """Radii (N,) mm of fiducials; zero of points."""
+    """Radii (N,) mm of fiducials; zeros for points."""
     return torch.zeros_like(points[:, 0]) if radius is None else radius.to(points)
 
 
 def _turns_to_try(points: NDArray[np.float64], rank: int, tolerance: float) -> NDArray[np.float64]:
-    """Rotations (R, 3, 3) that may map points (N, 3) about their centroid onto each other; half a turn of a stick."""
+    """Candidate rotations (R, 3, 3) of centred points (N, 3) onto each other; for a stick, half a turn."""
     if rank == 6:
         return _rotations_of_pairs(points, _base_pair(points), tolerance)
     if rank == 3:
@@ -351,7 +351,7 @@ def _turns_to_try(points: NDArray[np.float64], rank: int, tolerance: float) -> N
 
 
 def _base_pair(points: NDArray[np.float64]) -> tuple[int, int]:
-    """Two points far from the centroid (at the origin) and far from being in line with it."""
+    """Two points far from the centroid (at the origin) and far from collinear with it."""
     first = int(np.linalg.norm(points, axis=1).argmax())
     second = int(np.linalg.norm(np.cross(points, points[first]), axis=1).argmax())
     if np.linalg.norm(np.cross(points[second], points[first])) < 1e-6 * np.sum(points[first] ** 2):

@@ -1,4 +1,4 @@
-"""Whether two rigs, or two objects, are the same but for what writing them as text does to numbers."""
+"""Compare two rigs or two objects, apart from the rounding of numbers written as text."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torch import Tensor
 from imgcal.types.calibration_object import CalibrationObject
 from imgcal.types.rig import CameraRig
 
-# Two values that agree to this (relative; mm, pixels and rad alike) are the same: both came through text.
+# Two values that agree to this (relative; mm, pixels and rad alike) are the same: both were read from text.
 SAME = 1e-6
 
 
 def rig_difference(rig: CameraRig, expected: CameraRig) -> str | None:
-    """Name the first camera and value in which a rig is not the expected one; None = they are the same.
+    """Name the first camera and value in which a rig differs from the expected one; None = they are the same.
 
     Examples:
         >>> import imgcal
@@ -48,7 +48,7 @@ def rig_difference(rig: CameraRig, expected: CameraRig) -> str | None:
 
 
 def object_difference(obj: CalibrationObject, expected: CalibrationObject) -> str | None:
-    """Name the first fiducial whose place or radius is not the expected one; None = they are the same."""
+    """Name the first fiducial whose position or radius differs from the expected one; None = they are the same."""
     if obj.num_fiducials != expected.num_fiducials:
         return f"found {obj.num_fiducials} fiducials, expected {expected.num_fiducials}"
     columns = [

@@ -1,7 +1,7 @@
-"""What is plausible: every number that enters, from a file or from Python, is compared with the range of its kind.
+"""Plausible ranges: every input number, from a file or from Python, is compared with the range of its kind.
 
-The ranges are wide (a microscope and an airfield fit). Outside of them is a damaged file or another unit, and
-arithmetic that overflows.
+The ranges are wide (a microscope and an airfield fit). Values outside of them come from a damaged file or another unit,
+and make arithmetic overflow.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ COORDINATE = Range(-1e6, 1e6, "mm")  # of a fiducial in its object
 FIDUCIAL_RADIUS = Range(1e-6, 1e5, "mm")
 TOLERANCE = Range(0.0, 1e3, "mm")  # of a fiducial's coordinates
 
-# Of what a rig file says about the drift to be expected; one standard deviation.
+# Expected drift as stated in a rig file; one standard deviation.
 PRIOR_FOCAL_LENGTH = Range(1e-9, 10.0, "of the focal length")
 PRIOR_PRINCIPAL_POINT = Range(1e-9, 1e6, "px")
 PRIOR_DISTORTION = Range(1e-12, 1e6, "")
@@ -62,7 +62,7 @@ PRIOR_POSITION = Range(1e-9, 1e7, "mm")
 
 
 def check_rig(rig: CameraRig) -> None:
-    """Raise `InputError` where a rig holds values that no rig has; files are checked when they are read."""
+    """Raise `InputError` if a rig has implausible values; files are checked when they are read."""
     unknown = [name for name in rig.lens_models if name not in geometry.LENS_MODELS]
     if unknown or len(rig.lens_models) != rig.num_cameras:
         found = f"the lens model {unknown[0]}" if unknown else f"{len(rig.lens_models)} lens models"
@@ -91,7 +91,7 @@ def check_rig(rig: CameraRig) -> None:
 
 
 def check_object(obj: CalibrationObject) -> None:
-    """Raise `InputError` where an object holds values that no object has."""
+    """Raise `InputError` if an object has implausible values."""
     columns = {"coordinate": (obj.points, COORDINATE)}
     if obj.radius is not None:
         columns["radius"] = obj.radius, FIDUCIAL_RADIUS
@@ -103,7 +103,7 @@ def check_object(obj: CalibrationObject) -> None:
 
 
 def check_observations(observations: Observations) -> None:
-    """Raise `InputError` where something seen has a standard deviation of zero or less."""
+    """Raise `InputError` if something seen has a standard deviation of zero or less."""
     sigma = observations.sigma.expand(observations.seen.shape)
     wrong = observations.seen & (sigma <= 0)
     if bool(wrong.any()):

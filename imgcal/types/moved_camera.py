@@ -1,4 +1,4 @@
-"""`MovedCamera`: a camera that moved while the rig was in use, in whichever way that was found."""
+"""`MovedCamera`: a camera that moved while the rig was in use, however this was detected."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ UNITS: dict[Kind, str] = {"rotation": "deg", "position": "mm", "focal_length": "
 
 @dataclass(frozen=True)
 class MovedCamera:
-    """One camera, the first snapshot that it saw from its new place, and how far it went."""
+    """One camera, the first snapshot after its move, and the size of the move."""
 
     camera: str
     snapshot: str | None  # name of the first snapshot after the move; None = it moved before the capture
-    kind: Kind  # what explains the change best; unknown = nothing of what it saw afterwards could be labelled
+    kind: Kind  # best explanation of the change; unknown = none of its later blobs could be labelled
     size: float | None = None  # in `unit`; None = not known
     sigma: float | None = None  # one standard deviation of the size
 
@@ -32,7 +32,7 @@ class MovedCamera:
         return UNITS[self.kind]
 
     def as_values(self) -> dict[str, str | float | None]:
-        """The form that scripts read."""
+        """Values in the form that scripts read."""
         return {
             "camera": self.camera,
             "snapshot": self.snapshot,
@@ -43,7 +43,7 @@ class MovedCamera:
         }
 
     def __str__(self) -> str:
-        """Say it in words."""
+        """Describe the move in words."""
         moment = "the capture" if self.snapshot is None else f"snapshot {self.snapshot}"
         where = f"camera {self.camera} moved before {moment}"
         if self.size is None or self.sigma is None:
@@ -52,21 +52,21 @@ class MovedCamera:
 
 
 class MovedError(RefusedError):
-    """Raise where cameras moved during a capture: one rig cannot be right for all of it."""
+    """Raise when cameras moved during a capture: no single rig is right for all of it."""
 
     def __init__(
         self, moved: Sequence[MovedCamera], since: int, total: int, explained: bool = True,
         labelled: Detections | None = None,
     ) -> None:  # fmt: skip
-        """Say which, and what can be had instead.
+        """Name the cameras and say what can be done instead.
 
         Args:
-            moved: in the order of time.
+            moved: in order of time.
             since: snapshots after the last move.
             total: snapshots.
-            explained: the snapshots before the last move and those since then each fit a rig that stands still; False =
-                that they do not agree may have another cause.
-            labelled: all blobs, with the labels that they got.
+            explained: the snapshots before the last move and those since then each fit a static rig; False = their
+                disagreement may have another cause.
+            labelled: all blobs, with their labels.
         """
         self.moved, self.since, self.labelled = tuple(moved), since, labelled
         shown = "; ".join(map(str, moved[:MOST_TOLD])) + ("; ..." if len(moved) > MOST_TOLD else "")

@@ -1,4 +1,4 @@
-"""What a rig has seen: unlabelled blobs (`Detections`, ragged) and labelled fiducials (`Observations`, dense)."""
+"""Observations of a rig: unlabelled blobs (`Detections`, ragged) and labelled fiducials (`Observations`, dense)."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ class BlobFlag(IntFlag):
     MERGED = 2  # two or more blobs in one
     SATURATED = 4  # clipped grey values; the centre is less certain, its sigma says by how much
     MASKED = 8  # inside a mask of known reflections
-    OUTLIER = 16  # labelled, and not where the calibrated rig has this fiducial
-    REFLECTION = 32  # no marker, a learned measurer says
+    OUTLIER = 16  # labelled, but not where the calibrated rig predicts this fiducial
+    REFLECTION = 32  # not a marker, according to a learned measurer
 
 
 UNUSABLE = BlobFlag.BORDER | BlobFlag.MERGED | BlobFlag.MASKED | BlobFlag.REFLECTION
 
 
 class BlobKind(IntEnum):
-    """What a blob shows, as a learned measurer tells them apart."""
+    """What a blob shows, as classified by a learned measurer."""
 
-    WHOLE = 0  # a marker, all of it and evenly bright
+    WHOLE = 0  # a whole marker, evenly bright
     PARTIAL = 1  # a marker that is half hidden, or unevenly bright
     MERGED = 2  # a marker and something else that touches it
-    FALSE = 3  # no marker
+    FALSE = 3  # not a marker
 
 
 @dataclass(frozen=True)
 class Detections:
-    """Blobs of all cameras and snapshots as flat columns, one row a blob.
+    """Blobs of all cameras and snapshots as flat columns, one row per blob.
 
     Convention: pixel (0, 0) is the centre of the top-left pixel; u right, v down.
 
@@ -66,7 +66,7 @@ class Detections:
     snapshot_names: tuple[str, ...]  # S
 
     def __repr__(self) -> str:
-        """Count: `Detections(523 blobs, 294 labelled, 10 cameras, 4 snapshots)`."""
+        """Summarize the table: `Detections(523 blobs, 294 labelled, 10 cameras, 4 snapshots)`."""
         labelled = int((self.fiducial >= 0).sum())
         cameras, snapshots = len(self.camera_names), len(self.snapshot_names)
         return f"Detections({len(self)} blobs, {labelled} labelled, {cameras} cameras, {snapshots} snapshots)"
@@ -85,7 +85,7 @@ class Detections:
         return self.fiducial >= 0
 
     def count_by_camera(self, rows: NDArray[np.bool_] | slice = slice(None)) -> NDArray[np.int64]:
-        """Count the blobs of each camera: (C,); `rows` marks those that count."""
+        """Count the blobs of each camera: (C,); only those that `rows` marks."""
         return np.bincount(self.camera[rows], minlength=len(self.camera_names))
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Detections:
@@ -124,7 +124,7 @@ class Observations:
     __repr__ = brief_repr
 
     def of_snapshots(self, rows: Tensor | Sequence[int] | int) -> Observations:
-        """Keep some snapshots; or captures, where these are the first axis."""
+        """Keep some snapshots, or some captures if those are the first axis."""
         shake = None if self.shake is None else self.shake[rows]
         return Observations(self.uv[rows], self.sigma[rows], self.seen[rows], shake)
 

@@ -1,4 +1,4 @@
-"""The paper's vectors of a camera, 21 and 18 numbers, and the rig that they stand for."""
+"""Convert rigs to the paper's vectors of 21 and 18 numbers per camera, and back."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from imgcal.types.rig import CameraRig
 
 
 def pack21(rig: CameraRig) -> Tensor:
-    """Pack the paper's 21 numbers a camera: rotation (9, row-major), translation, f, principal point, distortion (5).
+    """Pack the paper's 21 numbers per camera: rotation (9, row-major), translation, f, principal point, distortion (5).
 
     Args:
         rig: a rig in the object's frame (`CameraRig.from_object`).
@@ -30,7 +30,7 @@ def pack21(rig: CameraRig) -> Tensor:
 
 
 def pack18(rig: CameraRig) -> Tensor:
-    """Pack the paper's 18 network outputs a camera: `pack21` with the 6D rotation for the matrix; (*B, C, 18)."""
+    """Pack the paper's 18 network outputs per camera: `pack21` with a 6D rotation for the matrix; (*B, C, 18)."""
     return torch.cat((sixd_from_rotation(rig.cam_from_rig.rotation), _pack_rest(rig)), dim=-1)
 
 

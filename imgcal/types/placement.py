@@ -1,4 +1,4 @@
-"""`CropPlacement`: where square crops lie in their images, and how much they are reduced; how they are cut."""
+"""`CropPlacement`: the position and scale of square crops in their images, and how crops are cut."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-# What networks for frames are trained on and what they are given must be cut alike.
+# Networks for frames must be given crops like those they were trained on.
 CROP_MARGIN = 0.06
-"""Share of the focal length that is left around the expected object: drift of 3 degrees."""
+"""Margin around the expected object, as a share of the focal length: a drift of 3 degrees."""
 PATCH_SIZE = 24
 """Pixels, width and height of a patch around one marker."""
 
@@ -27,7 +27,7 @@ class CropPlacement:
     """
 
     corner: Tensor  # (*B, 2) pixels, the outer corner of the crop: a whole number minus 1/2
-    scale: Tensor  # (*B) image pixels a crop pixel
+    scale: Tensor  # (*B) image pixels per crop pixel
     size: int  # crop pixels, each way
 
     @classmethod
@@ -36,7 +36,7 @@ class CropPlacement:
 
         Args:
             uv: (*B, N, 2) pixels.
-            seen: (*B, N) bool, points that count; where none does, the crop lies at the image's corner.
+            seen: (*B, N) bool, points to include; without any, the crop lies at the image's corner.
             margin: (*B) pixels to be left on each side.
             size: crop pixels, each way.
         """

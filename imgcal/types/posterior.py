@@ -1,4 +1,4 @@
-"""`RigPosterior`: how well a calibration knows a rig and its object, jointly."""
+"""`RigPosterior`: joint uncertainty of a calibrated rig and its object."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from imgcal.types.rig import CameraRig
 
 @dataclass(frozen=True)
 class RigPosterior:
-    """The joint posterior of a rig's values and of the object's shape, as `monitoring.RigBelief` has it.
+    """Joint posterior of a rig's values and the object's shape, in the form of `monitoring.RigBelief`.
 
-    D = K C + M errors in units: of C cameras, and M values of the object.
+    D = K C + M errors: K for each of C cameras, in units of `unit`, and M of the object, in standard deviations.
     """
 
     rig: CameraRig  # the most probable one, float64, without batch axes
     points: Tensor  # (N, 3) mm, fiducials as the object's file says
-    tolerance: Tensor  # (N,) mm, by which they may be off; zeros = exact
+    tolerance: Tensor  # (N,) mm, one standard deviation of each coordinate; zeros = exact
     scale_tolerance: float
     object_offset: Tensor  # (M,) in standard deviations of that tolerance; M = 0 where the object is exact
     factor: Tensor  # (D, D) lower Cholesky factor of the information
     unit: Tensor  # (C, K) rad, mm, pixels, 1
-    snapshots: int  # from which it was made
-    time: float | None = None  # s since the epoch, when that was; None = not known
+    snapshots: int  # number of snapshots behind it
+    time: float | None = None  # s since the epoch, when it was made; None = unknown
 
     def belongs_to(self, rig: CameraRig) -> bool:
-        """Tell whether this is about a rig with just these values: not one that has been changed since."""
+        """Tell whether this describes a rig with exactly these values, not one that has been changed since."""
         mine, others = (
             (one.cam_from_rig.rotation, one.cam_from_rig.translation, one.focal_length, one.principal_point,
              one.distortion)

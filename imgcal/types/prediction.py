@@ -1,4 +1,4 @@
-"""What a network is given (`Views`) and what it returns (`Prediction`)."""
+"""Input (`Views`) and output (`Prediction`) of a network."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Views:
 
 @dataclass(frozen=True)
 class Prediction:
-    """A rig and the object's pose in it. Only their product, the cameras seen from the object, is what images show."""
+    """A rig and the object's pose in it. Images determine only their product, the cameras in the object's frame."""
 
     rig: CameraRig  # (B,)
     rig_from_object: RigidTransform  # (B,)
@@ -51,7 +51,7 @@ class Prediction:
 
     @property
     def cameras_from_object(self) -> CameraRig:
-        """The cameras in the object's frame: what the paper's 21 numbers a camera describe."""
+        """The cameras in the object's frame: what the paper's 21 numbers per camera describe."""
         return self.rig.from_object(self.rig_from_object)
 
     @classmethod
@@ -59,11 +59,11 @@ class Prediction:
         """Split cameras in the object's frame into a rig near the factory's, and the object's pose.
 
         Args:
-            cameras: (B,) rigs whose cam_from_rig is cam_from_object, each camera on its own (the paper's networks).
+            cameras: (B,) rigs whose cam_from_rig is cam_from_object, each camera independent (the paper's networks).
             factory: the factory rig, without batch axes.
 
         Returns:
-            The same cameras; the pose is the mean over cameras of what each says with its factory place in the rig.
+            The same cameras. The pose is the mean of the poses that each camera implies with its factory extrinsics.
         """
         each = factory.to(cameras.focal_length.dtype).cam_from_rig.inverse() @ cameras.cam_from_rig  # (B, C)
         rotation = rotation_from_6d(sixd_from_rotation(each.rotation.mean(-3)))
@@ -81,22 +81,22 @@ class Prediction:
 
     @classmethod
     def stack(cls, parts: Sequence[Prediction]) -> Prediction:
-        """Put several together along a new first batch axis."""
+        """Stack several along a new first batch axis."""
         return cls.combine(parts, torch.stack)
 
     @classmethod
     def cat(cls, parts: Sequence[Prediction]) -> Prediction:
-        """Put several together along their first batch axis."""
+        """Concatenate several along their first batch axis."""
         return cls.combine(parts, torch.cat)
 
     @classmethod
     def combine(cls, parts: Sequence[Prediction], join: Join) -> Prediction:
-        """Make one of several as `CameraRig.combine` does; `log_sigma` is left out."""
+        """Combine several like `CameraRig.combine`; `log_sigma` is left out."""
         poses = RigidTransform.combine([part.rig_from_object for part in parts], join)
         return cls(CameraRig.combine([part.rig for part in parts], join), poses)
 
     def detach(self) -> Prediction:
-        """Cut the graph."""
+        """Detach all tensors from the graph."""
         pose = RigidTransform(self.rig_from_object.rotation.detach(), self.rig_from_object.translation.detach())
         log_sigma = None if self.log_sigma is None else self.log_sigma.detach()
         return Prediction(self.rig.map_tensors(lambda tensor, _: tensor.detach()), pose, log_sigma)

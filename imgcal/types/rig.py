@@ -45,7 +45,7 @@ PARAMETER_KINDS = {
     "principal_point": slice(8, 10),
     "distortion": slice(10, None),
 }
-"""Where each kind of value, as a rig file's `prior` names it, stands among the parameters of a camera."""
+"""Position of each kind of value, named as in a rig file's `prior`, among the parameters of a camera."""
 
 
 def parameter_names(lens_models: Sequence[str], width: int | None = None) -> tuple[str, ...]:
@@ -62,7 +62,7 @@ def parameter_names(lens_models: Sequence[str], width: int | None = None) -> tup
 
 
 PARAMETER_NAMES = parameter_names(["brown_conrady"])
-"""Of a camera with a Brown-Conrady lens."""
+"""Parameter names of a camera with a Brown-Conrady lens."""
 PARAMETERS = len(PARAMETER_NAMES)
 
 
@@ -87,7 +87,7 @@ class RigPrior:
     position: float = 10.0  # mm, each axis
 
     def std(self, rig: CameraRig) -> Tensor:
-        """Spread over the parameters of each camera: (*B, C, K), in the order of `CameraRig.parameter_names`.
+        """Standard deviations of the parameters: (*B, C, K), in the order of `CameraRig.parameter_names`.
 
         Zero for coefficients that a camera's lens does not have.
         """
@@ -107,10 +107,10 @@ class RigPrior:
 
 @dataclass(frozen=True)
 class DriftRate:
-    """How fast each value wanders while the rig is in use: one standard deviation of a random walk after an hour.
+    """How fast each value drifts while the rig is in use: one standard deviation of a random walk after an hour.
 
-    The defaults are for cameras on a rigid mount indoors: lenses and sensors follow the temperature by some hundredths
-    of a per cent, mounts creep. After four hours each is twice as large.
+    The defaults are for cameras on a rigid mount indoors: lenses and sensors change with temperature by a few
+    hundredths of a percent, and mounts creep. After four hours each deviation is twice as large.
 
     Examples:
         >>> import imgcal
@@ -125,13 +125,13 @@ class DriftRate:
     position: float = 0.05  # mm, each axis
 
     def std(self, rig: CameraRig) -> Tensor:
-        """Spread over the parameters of each camera after an hour: (*B, C, K); see `CameraRig.parameter_names`."""
+        """Standard deviations of the parameters after an hour: (*B, C, K); see `CameraRig.parameter_names`."""
         return RigPrior(**vars(self)).std(rig)
 
 
 @dataclass(frozen=True)
 class CameraRig:
-    """Cameras fixed to a common frame: whatever the factory says it is; only relations between cameras matter.
+    """Cameras fixed to a common frame. The factory chooses this frame: only relations between cameras matter.
 
     Examples:
         >>> import imgcal
@@ -147,7 +147,7 @@ class CameraRig:
 
     focal_length: Tensor  # (*B, C, 2) pixels: fx, fy
     principal_point: Tensor  # (*B, C, 2) pixels: cx, cy
-    distortion: Tensor  # (*B, C, D): coefficients in the order of each camera's lens model, zeros behind them
+    distortion: Tensor  # (*B, C, D): coefficients in the order of each camera's lens model, padded with zeros
     cam_from_rig: RigidTransform  # (*B, C)
     image_size: Tensor  # (C, 2) pixels: width, height
     camera_names: tuple[str, ...]  # C
@@ -155,22 +155,22 @@ class CameraRig:
     working_distance: float | None = None  # mm, from the rig's origin to the object
     prior: RigPrior | None = None
     drift_rate: DriftRate | None = None  # None = the defaults
-    volume: ConvexVolume | None = None  # where it is used, in the rig frame
+    volume: ConvexVolume | None = None  # working volume, in the rig frame
     lens_model: ModelNames = "brown_conrady"  # a name of `geometry.LENS_MODELS` for all cameras, or one for each
     posterior: Callable[[], RigPosterior] | None = field(default=None, metadata={"saved": False})
-    """How well a calibration knows these values, if one made them."""
+    """Uncertainty of these values, if they come from a calibration."""
 
     def __repr__(self) -> str:
-        """Say what it is: `CameraRig('O10': 10 cameras, cam01 to cam10)`; `print` shows the values of each camera."""
+        """Summarize: `CameraRig('O10': 10 cameras, cam01 to cam10)`; `print` shows the values of each camera."""
         batch = f" x {tuple(self.batch_shape)}" if self.batch_shape else ""
         first, last = self.camera_names[0], self.camera_names[-1]
         cameras = f"camera {first}" if first == last else f"{self.num_cameras} cameras, {first} to {last}"
         return f"CameraRig({self.name!r}{batch}: {cameras})"
 
     def __str__(self) -> str:
-        """List the cameras, with the unit of each value and the lens by its model and its own coefficients.
+        """List the cameras, with the unit of each value, and each lens with its model and coefficients.
 
-        A rig with batch axes is only named.
+        A rig with batch axes is only summarized.
         """
         if self.batch_shape:
             return repr(self)
@@ -181,7 +181,7 @@ class CameraRig:
         columns = zip(self.camera_names, self.image_size.tolist(), *(value.tolist() for value in values), strict=True)
         for model, (name, (w, h), focal, centre, lens, position) in zip(self.lens_models, columns, strict=True):
             pixels = "".join(f"{a:9.2f} {b:9.2f} " for a, b in (focal, centre))
-            coefficients = zip(LENS_MODELS[model].coefficients, lens, strict=False)  # behind its own there are zeros
+            coefficients = zip(LENS_MODELS[model].coefficients, lens, strict=False)  # the rest is padding
             words = ", ".join(f"{coefficient} {value: .5f}" for coefficient, value in coefficients)
             place = " ".join(f"{x:9.2f}" for x in position)
             rows.append(f"{name:<{width}}  {w:>4} x {h:<4} {pixels} {place}  {model}: {words}")
@@ -204,12 +204,12 @@ class CameraRig:
 
     @property
     def num_parameters(self) -> int:
-        """Number of parameters of a camera, K: ten, and the width D of the distortion."""
+        """Number of parameters of a camera, K: ten plus the width D of the distortion."""
         return len(PINHOLE) + self.distortion.shape[-1]
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the K parameters; of what is a coefficient of this lens and that lens, both: "p1/k3".
+        """Names of the K parameters; coefficients that differ between lens models have both names: "p1/k3".
 
         Examples:
             >>> import imgcal
@@ -229,7 +229,7 @@ class CameraRig:
         return (torch.arange(self.distortion.shape[-1]) < count[:, None]).to(self.distortion.device)
 
     def only_existing(self, std: Tensor) -> Tensor:
-        """Let standard deviations (*B, C, K) be zero where a camera's lens has no such coefficient."""
+        """Set standard deviations (*B, C, K) to zero where a camera's lens has no such coefficient."""
         names = (self.lens_model,) if isinstance(self.lens_model, str) else self.lens_model
         if all(len(LENS_MODELS[name].coefficients) == self.distortion.shape[-1] for name in names):
             return std
@@ -250,7 +250,7 @@ class CameraRig:
         Returns:
             uv (*B, C, N, 2), depth and visible (*B, C, N); differentiable.
         """
-        # Components apart, and fiducials first in memory: each step then runs over one long row of all cameras.
+        # Separate components, and fiducials first in memory: each step then runs over one long row of all cameras.
         components = points_rig.movedim((-1, -2), (0, 1)).contiguous().unsqueeze(-1)  # (3, N, *B, 1)
         x, y, z = components.expand(*components.shape[:-1], self.num_cameras).contiguous().movedim(1, -1)  # (*B, C, N)
         rows = self.cam_from_rig.rotation.unsqueeze(-3).unbind(-2)
@@ -263,10 +263,10 @@ class CameraRig:
         return project_components(tuple(points_cam), *lens, self.image_size, radius, self.lens_model)
 
     def project_values(self, points_rig: Tensor, radius: Tensor | None = None) -> Projection:
-        """Do the work of `project` without gradients: several times faster on the CPU.
+        """Project like `project` but without gradients: several times faster on the CPU.
 
         Args:
-            points_rig: (B, N, 3) mm, for the (B,) rigs of this one; same floating-point type.
+            points_rig: (B, N, 3) mm, one set for each of the (B,) rigs; same floating-point type.
             radius: (N,) mm of spherical fiducials; None = points.
         """
         if points_rig.device.type != "cpu" or is_traced():
@@ -353,17 +353,17 @@ class CameraRig:
 
     @classmethod
     def stack(cls, parts: Sequence[CameraRig]) -> CameraRig:
-        """Put several together along a new first batch axis."""
+        """Stack several along a new first batch axis."""
         return cls.combine(parts, torch.stack)
 
     @classmethod
     def cat(cls, parts: Sequence[CameraRig]) -> CameraRig:
-        """Put several together along their first batch axis."""
+        """Concatenate several along their first batch axis."""
         return cls.combine(parts, torch.cat)
 
     @classmethod
     def combine(cls, rigs: Sequence[CameraRig], join: Join) -> CameraRig:
-        """Make one of several; `join` takes the list of their focal lengths, and so on. The rest is the first one's."""
+        """Combine several into one; `join` takes the list of focal lengths, and so on. The rest comes from the first."""
         return replace(
             rigs[0],
             focal_length=join([rig.focal_length for rig in rigs]),

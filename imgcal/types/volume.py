@@ -1,4 +1,4 @@
-"""`ConvexVolume`: where a rig is used."""
+"""`ConvexVolume`: the working volume of a rig."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from imgcal.errors import InputError
 
 Corner = tuple[float, float, float]
 FLAT = 1e-6
-"""Parts of a volume's length that it must be thick."""
+"""Least thickness of a volume, relative to its length."""
 
 
 @dataclass(frozen=True)
 class ConvexVolume:
-    """Where objects are used: the smallest convex body that holds some points of the rig frame, a box for example.
+    """Working volume: the convex hull of points in the rig frame, for example a box.
 
     Examples:
         >>> room = ConvexVolume.box((-1000, -1000, 0), (1000, 1000, 2000))
@@ -30,7 +30,7 @@ class ConvexVolume:
     points: tuple[Corner, ...]  # mm in the rig frame, 4 or more, not all in one plane
 
     def __post_init__(self) -> None:
-        """Refuse what encloses nothing.
+        """Refuse points that enclose no volume.
 
         Raises:
             InputError: fewer than four points, or all in one plane.
@@ -54,7 +54,7 @@ class ConvexVolume:
 
     @property
     def low(self) -> Corner:
-        """Least x, y and z, mm."""
+        """Smallest x, y and z, mm."""
         x, y, z = np.array(self.points).min(0).tolist()
         return x, y, z
 
@@ -70,7 +70,7 @@ class ConvexVolume:
         return len(self.points) == 8 and set(self.points) == set(ConvexVolume.box(self.low, self.high).points)
 
     def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which points (M, 3) mm are inside, a hair's breadth of rounding included: (M,)."""
+        """Tell which points (M, 3) mm are inside, with a small tolerance for rounding: (M,)."""
         slack = FLAT * float(np.ptp(np.array(self.points), axis=0).max())
         inside = np.all(points @ _planes(self.points)[:, :3].T + _planes(self.points)[:, 3] <= slack, axis=1)
         return np.asarray(inside)
@@ -78,7 +78,7 @@ class ConvexVolume:
 
 @lru_cache(maxsize=16)
 def _planes(points: tuple[Corner, ...]) -> NDArray[np.float64]:
-    """Outward normals and offsets of the faces of the body that holds some points: (F, 4)."""
-    from scipy.spatial import ConvexHull  # slow to import, and few ask
+    """Outward normals and offsets of the faces of the convex hull of points: (F, 4)."""
+    from scipy.spatial import ConvexHull  # slow to import, and rarely needed
 
     return np.asarray(ConvexHull(np.array(points)).equations)
