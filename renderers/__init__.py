@@ -1,4 +1,4 @@
-"""Renderers: pixels, colours and visibility in, images out. A leaf package that knows no camera."""
+"""Renderers: from pixels, colours and visibility to images. A leaf package without camera models."""
 
 import lazy_loader as lazy
 

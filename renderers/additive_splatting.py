@@ -1,4 +1,4 @@
-"""Add Gaussian splats to images with tensors: an outer product each, so one matrix product an image."""
+"""Add Gaussian splats to images with tensors: each splat is an outer product, so one matrix product per image."""
 
 import math
 from typing import NamedTuple
@@ -8,18 +8,18 @@ from torch import Tensor
 
 
 class Splats(NamedTuple):
-    """What is drawn: all of one floating-point type, at least float32."""
+    """Splats to draw: tensors of one floating-point type, at least float32."""
 
     uv: Tensor  # (B, N, 2) pixels
     sizes: Tensor  # (B, N) standard deviations in pixels
     weight: Tensor  # (B, N) intensities
     colours: Tensor  # (B, N, K)
-    visible: Tensor  # (B, N) bool; the others may hold anything
+    visible: Tensor  # (B, N) bool; invisible splats may hold anything
 
     def drawn(self) -> "Splats":
-        """Replace what is invisible or not finite by numbers that draw nothing.
+        """Replace splats that are invisible or not finite by ones that draw nothing.
 
-        Replaced, not multiplied by zero: a NaN times zero is still a NaN, in the image and in the gradient.
+        Multiplying by zero is not enough: NaN times zero is still NaN, in the image and in the gradient.
         """
         drawn = self.uv.isfinite().all(-1) & self.visible
         return Splats(
@@ -54,7 +54,7 @@ def splat_additively(splats: Splats, image_size: tuple[int, int], out: Tensor | 
     """Draw splats into images.
 
     Args:
-        splats: What is drawn.
+        splats: Splats to draw.
         image_size: Height and width.
         out: (B, K, H, W) contiguous images of the same dtype, overwritten; not differentiable.
 

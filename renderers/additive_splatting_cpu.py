@@ -1,7 +1,7 @@
 """Add Gaussian splats to images on CPUs: compiled, so that only pixels that a splat reaches are touched.
 
-Tensors cannot add windows without an index for every pixel of every window, or a matrix product over whole images; both
-cost several times what is done here. `additive_splatting.py` says the same in tensors, and this is tested against it.
+With tensors, adding windows takes an index for every pixel of every window, or a matrix product over whole images.
+Both cost several times as much. `additive_splatting.py` is the tensor version, with which tests compare this one.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ Places = NDArray[np.int32]
 REACH = {torch.float32: 6.0, torch.float64: 8.6}
 # Fewer images than this are not worth the start of another thread.
 IMAGES_PER_THREAD = 64
-NOWHERE = -(2**31)  # where the windows of splats start that are not drawn
+NOWHERE = -(2**31)  # window start of splats that are not drawn
 FAST = {"contract", "reassoc", "nsz"}
 
 
 def drawn(splats: Splats, image_size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Draw splats as `draw` does into fresh images (B, K, H, W), which come first."""
+    """Draw splats into new images (B, K, H, W); return the images, then what `draw` returns."""
     kind = np.float64 if splats.uv.dtype == torch.float64 else np.float32
-    # NumPy asks Linux for huge pages: most of the time of a large fresh tensor goes into faults of small ones.
+    # NumPy asks Linux for huge pages: a large new tensor spends most of its time on faults of small pages.
     images = torch.from_numpy(np.empty((len(splats.uv), splats.colours.shape[2], *image_size), dtype=kind))
     return images, *draw(images, splats)
 
 
 def draw(images: Tensor, splats: Splats) -> tuple[Tensor, Tensor]:
-    """Overwrite images (B, K, H, W); return what `windows` does."""
+    """Draw splats, overwriting images (B, K, H, W); return what `windows` returns."""
     steps, starts = windows(splats, max(images.shape[2:]))
     _in_threads(_add, [images.numpy(), *_arrays(splats.sizes, splats.weight, splats.colours, steps, starts)])
     return steps, starts
@@ -51,7 +51,7 @@ def windows(splats: Splats, longest: int) -> tuple[Tensor, Tensor]:
     """Find the pixels that each splat reaches, in images whose longer side is given.
 
     Returns:
-        (B, N, 2, w + 1) error function at the edges of the pixels of each window, and where it starts (B, N, 2).
+        (B, N, 2, w + 1) error function at the pixel edges of each window, and (B, N, 2) first pixel of each window.
 
     """
     uv, sizes, visible = _arrays(splats.uv, splats.sizes, splats.visible)
@@ -59,11 +59,11 @@ def windows(splats: Splats, longest: int) -> tuple[Tensor, Tensor]:
     edges = torch.empty((*splats.uv.shape, 2 * half + 2), dtype=splats.uv.dtype)
     starts = torch.empty(splats.uv.shape, dtype=torch.int32)
     _place(uv, sizes, visible, longest, *_arrays(edges, starts))
-    return edges.erf_(), starts  # of all edges at once, where it is vectorized
+    return edges.erf_(), starts  # all edges at once, which is vectorized
 
 
 def gradients(upstream: Tensor, splats: Splats, steps: Tensor, starts: Tensor) -> tuple[Tensor, ...]:
-    """Take the gradient by images (B, K, H, W) to those by all but `visible`; windows as `windows` returns them."""
+    """Pull the gradient of images (B, K, H, W) back to all inputs but `visible`; windows as returned by `windows`."""
     values = splats[:4]
     found = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in values]
     _in_threads(_gradients, _arrays(upstream, *values, steps, starts, *found))
@@ -110,7 +110,7 @@ def _place(uv: Array, sizes: Array, visible: Flags, longest: int, edges: Array, 
                 continue
             scale = 1 / (math.sqrt(2) * sizes[b, n])
             for axis in range(2):
-                # Far outside the image is as good as just out of reach, and fits into an integer.
+                # Clamp positions far outside the image to just out of reach, which fits into an integer.
                 start = round(min(max(uv[b, n, axis], -half - 1.0), longest + half + 1.0)) - half
                 starts[b, n, axis] = start
                 first = start - 0.5 - uv[b, n, axis]
@@ -165,8 +165,8 @@ def _gradients(
             by_across, by_down = by_profiles[0, first - left : last - left], by_profiles[1]
             for k in range(upstream.shape[1]):
                 light, by_light = colours[b, n, k] * weight[b, n], zero
-                # Two loops over the window, the second finds it in the cache: a sum alone is vectorized, without
-                # checks whether what is written overlaps what is read.
+                # Two loops over the window; the second finds it in the cache. A sum alone is vectorized without checks
+                # for overlapping reads and writes.
                 for i in range(max(top, 0), min(top + length, height)):
                     row, total = upstream[b, k, i, first:last], zero
                     for j in range(len(across)):
@@ -195,12 +195,12 @@ def _profiles(steps: Array, size: float, profiles: Array) -> None:
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _through_profile(by_profile: Array, values: Array, start: float, size: float) -> Any:
-    """Take a gradient by a profile's pixels to one by its centre and one by its size."""
+    """Pull a gradient of a profile's pixels back to its centre and its size."""
     by_centre = by_size = before = by_profile.dtype.type(0)
     for j in range(len(values)):
         edge = (start + j - 0.5) / size
         gaussian = math.exp(-0.5 * edge * edge)
-        # This edge is the right one of the pixel before, and the left one of this pixel.
+        # This is the right edge of the previous pixel, and the left edge of this pixel.
         change = by_profile[j] - before
         by_centre += change * gaussian
         by_size += change * edge * gaussian + by_profile[j] * values[j] / size

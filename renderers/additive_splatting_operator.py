@@ -1,8 +1,8 @@
-"""Adding splats on CPUs as an operator of PyTorch: for eager code, for `torch.func`, for `torch.compile` and export.
+"""Addition of splats on CPUs as a PyTorch operator: for eager code, `torch.func`, `torch.compile` and export.
 
-Eager code keeps what the gradient needs beside the images, and has derivatives in both directions, of any order, under
-any number of `torch.func.vmap`. A graph sees one opaque operator, which draws the windows again in its backward pass: a
-graph cannot hold tensors whose size depends on values.
+Eager code keeps what the gradient needs besides the images. It has derivatives in both directions, of any order, under
+any number of nested `torch.func.vmap`. A graph sees one opaque operator, which computes the windows again in its
+backward pass: a graph cannot hold tensors whose size depends on values.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Function = Callable[..., Any]
 
 
 def splat_additively(splats: Splats, image_size: tuple[int, int], out: Tensor | None = None) -> Tensor:
-    """Do the work of `additive_splatting.splat_additively`, which has the arguments, for tensors on the CPU."""
+    """Draw like `additive_splatting.splat_additively`, with the same arguments, for tensors on the CPU."""
     if torch.compiler.is_compiling():
         images: Tensor = add_splats(*splats, *image_size)
         return images if out is None else out.copy_(images)
@@ -69,7 +69,7 @@ class _Added(torch.autograd.Function):
 
 
 class _AddedPlainly(torch.autograd.Function):
-    """Do the work of `_Added` outside of `torch.func`, where PyTorch needs less time to call it."""
+    """The same as `_Added` for use outside of `torch.func`, where PyTorch calls this form faster."""
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> Tensor:
@@ -91,7 +91,7 @@ class _AddedPlainly(torch.autograd.Function):
 
 
 class _Gradients(torch.autograd.Function):
-    """Gradients of images by all but `visible`."""
+    """Gradients of images with respect to all inputs but `visible`."""
 
     @staticmethod
     def forward(*inputs: Tensor) -> tuple[Tensor, ...]:
@@ -139,7 +139,7 @@ def add_splats(
 def add_splats_gradients(
     upstream: Tensor, uv: Tensor, sizes: Tensor, weight: Tensor, colours: Tensor, visible: Tensor
 ) -> tuple[Tensor, ...]:
-    """Take the gradient by the images to those by all but `visible`."""
+    """Pull the gradient of the images back to all inputs but `visible`."""
     splats = Splats(uv, sizes, weight, colours, visible)
     windows = additive_splatting_cpu.windows(splats, max(upstream.shape[2:]))
     return additive_splatting_cpu.gradients(upstream, splats, *windows)
@@ -183,7 +183,7 @@ def _(info: Any, in_dims: tuple[int | None, ...], *inputs: Tensor) -> tuple[tupl
 
 
 def _images_by(visible: Tensor, image_size: tuple[int, int]) -> Function:
-    """Images as a function of tensors."""
+    """Return a function from tensors to images."""
 
     def images(uv: Tensor, sizes: Tensor, weight: Tensor, colours: Tensor) -> Tensor:
         return additive_splatting.splat_additively(Splats(uv, sizes, weight, colours, visible), image_size)
@@ -192,7 +192,7 @@ def _images_by(visible: Tensor, image_size: tuple[int, int]) -> Function:
 
 
 def _gradients_by(visible: Tensor) -> Function:
-    """Gradients as a function of tensors: the one by the images first."""
+    """Return a function from tensors to gradients; its first argument is the gradient of the images."""
 
     def gradients(upstream: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
         pull: Function = torch.func.vjp(_images_by(visible, (upstream.shape[2], upstream.shape[3])), *values)[1]
@@ -208,7 +208,7 @@ def _second_gradients(upstream: Sequence[Tensor], *inputs: Tensor) -> tuple[Tens
 
 
 def _tangent(function: Function, primals: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> Any:
-    """Push tangents forward by pulling back twice: pulling back is linear, and its transpose is what is wanted."""
+    """Push tangents forward by pulling back twice: pulling back is linear, and its transpose pushes forward."""
     value, pull = torch.func.vjp(function, *primals)[:2]
     zero = torch.zeros_like(value) if isinstance(value, Tensor) else tuple(map(torch.zeros_like, value))
     push: Function = torch.func.vjp(pull, zero)[1]
@@ -217,7 +217,7 @@ def _tangent(function: Function, primals: Sequence[Tensor], tangents: Sequence[T
 
 
 def _folded(size: int, in_dims: Sequence[int | None], tensors: Sequence[Tensor]) -> list[Tensor]:
-    """Make the mapped axis a part of the first: (B, ...) each."""
+    """Fold the mapped axis into the first: (B, ...) each."""
     moved = (
         x.expand(size, *x.shape) if axis is None else x.movedim(axis, 0)
         for x, axis in zip(tensors, in_dims, strict=True)

@@ -1,4 +1,4 @@
-"""What frames show beside their markers: reflections, streaks, textures, neighbours, occluders and drapes."""
+"""Clutter in frames besides the markers: reflections, streaks, textures, neighbours, occluders and drapes."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ EDGES = 4  # of a drape
 
 @dataclass(frozen=True)
 class Clutter:
-    """The truth about a frame's clutter."""
+    """Ground truth of a frame's clutter."""
 
     false_blobs: Spots  # (*B, M), behind all markers
-    occluders: Spots  # (*B, N), one for each marker, before all markers; visible where the marker is partly covered
+    occluders: Spots  # (*B, N), one for each marker, in front of all markers; visible where it partly covers its marker
     large: tuple[Spots, ...] = ()  # streaks and textures, behind everything else
     drapes: Tensor | None = None  # (*B, D, 4, 3) normal n (unit) and offset o of the edges: hidden where all n p <= o
 
@@ -38,8 +38,8 @@ def sample_clutter(
         generator: On the device of the markers.
 
     Returns:
-        The clutter, which is also the truth about it: reflections come first in ``false_blobs``, then small blobs,
-        speckles of textures, neighbours of markers. Drapes have cut the false blobs; ``drape_spots`` cuts the markers.
+        The clutter, which is also its ground truth. ``false_blobs`` has reflections first, then small blobs, speckles
+        of textures, neighbours of markers. It is already cut by the drapes; ``drape_spots`` cuts the markers.
     """
     batch = markers.uv.shape[:-2]
 
@@ -69,7 +69,7 @@ def sample_clutter(
 def drape_spots(spots: Spots, drapes: Tensor) -> Spots:
     """Cut spots at the edges of drapes that they lie next to.
 
-    A drape is large beside a spot: the edge that is nearest to being passed cuts it. Exact but at a drape's corners.
+    A drape is large compared with a spot, so only the nearest edge cuts it. Exact except at a drape's corners.
 
     Args:
         spots: (*B, N).
@@ -79,7 +79,7 @@ def drape_spots(spots: Spots, drapes: Tensor) -> Spots:
     outside, edge = distance.max(dim=-1)  # (*B, D, N) px, positive outside of a drape
     normals = drapes[..., None, :, :2].expand(*distance.shape, 2)
     normal = normals.gather(-2, edge[..., None, None].expand(*edge.shape, 1, 2)).squeeze(-2)
-    # Kept is what lies beyond the edge: n (p - uv) >= -outside.
+    # Keep what lies beyond the edge: n (p - uv) >= -outside.
     cuts = torch.cat([-normal, outside[..., None]], dim=-1).movedim(-3, -2)
     old = spots.surface
     surface = Surface(cuts) if old is None else replace(old, cuts=torch.cat([old.cuts, cuts], dim=-2))
@@ -136,7 +136,7 @@ def _speckles(model: ClutterModel, regions: Spots, uniform: Uniform) -> Spots:
 
 
 def _neighbours(model: ClutterModel, markers: Spots, uniform: Uniform) -> Spots:
-    """Put a false blob beside some markers, so near that the two merge."""
+    """Put a false blob beside some markers, so close that the two merge."""
     count = markers.uv.shape[-2]
     angle, distance = uniform((0.0, 2 * math.pi), count), uniform(model.neighbour_distance, count)
     direction = torch.stack([angle.cos(), angle.sin()], dim=-1) * distance[..., None]

@@ -1,4 +1,4 @@
-"""What frames may show beside their markers, as counts and intervals."""
+"""Clutter that frames may show besides their markers, as counts and intervals."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from renderers.sensor_model import LARGEST_LEVEL
 
 @dataclass(frozen=True)
 class BlobRange:
-    """How many blobs a frame, and the intervals that they are drawn from, uniformly."""
+    """Number of blobs per frame, and the intervals that their values are drawn from uniformly."""
 
     count: int  # blobs in each frame
     radius: tuple[float, float]  # px, semi-major axis
     aspect: tuple[float, float]  # semi-major over semi-minor axis
     intensity: tuple[float, float]  # of the light, in units of a marker's
-    fewest: int | None = None  # the number is drawn from this one up to `count` in each frame; None = always `count`
+    fewest: int | None = None  # the number in each frame is drawn from this to `count`; None = always `count`
 
     def __post_init__(self) -> None:
-        """Refuse what no frame shows."""
+        """Refuse values out of range."""
         if not 0 <= self.count <= 10_000:
             raise ValueError(f"count must be from 0 to 10000, found {self.count}")
         if self.fewest is not None and not 0 <= self.fewest <= self.count:
@@ -34,7 +34,7 @@ NO_BLOBS = BlobRange(0, (1.0, 1.0), (1.0, 1.0), (1.0, 1.0))
 
 @dataclass(frozen=True)
 class ClutterModel:
-    """What a frame shows besides its markers."""
+    """Clutter of a frame besides its markers."""
 
     reflections: BlobRange = BlobRange(2, (6.0, 30.0), (2.0, 6.0), (0.5, 2.0))
     blobs: BlobRange = BlobRange(4, (1.0, 6.0), (1.0, 1.5), (0.2, 1.0))
@@ -49,7 +49,7 @@ class ClutterModel:
     drape_size: tuple[float, float] = (0.05, 0.2)  # from the middle to the edges, shares of the frame's height
 
     def __post_init__(self) -> None:
-        """Refuse shares outside 0 to 1."""
+        """Refuse values out of range."""
         low, high = self.occluded_diameter
         if not (0 <= self.occluded <= 1 and 0 <= low <= high <= 1):
             raise ValueError(f"occluded, occluded_diameter must be shares, found {self.occluded}, {low} to {high}")

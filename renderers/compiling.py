@@ -1,11 +1,11 @@
-"""Compiled functions: numba's `njit`, with one place for what it compiles.
+"""Compile functions by numba's `njit`, with one folder for the machine code.
 
-Machine code is kept in NUMBA_CACHE_DIR where that is set, else in `imgcal/<version>` in the user's cache folder: an
-installation may be read-only, and code of an earlier version is never mistaken for that of this one. A folder that can
-be read but not written, such as that of an image that was warmed up when it was built, is used as it is.
+Machine code is kept in NUMBA_CACHE_DIR if that is set, else in `imgcal/<version>` in the user's cache folder: an
+installation may be read-only, and code of an earlier version must not be used for this one. A read-only folder, such as
+one in a container image that was warmed up when it was built, is used as it is.
 
-Machine code contains that of the functions it calls, and the constants. Numba compiles a function again when its own
-file has changed; here also when one has that its file imports.
+Machine code includes the functions it calls and the constants. Numba compiles a function again when its own file
+changes. Here it also does so when a file changes that this file imports.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def njit(**options: Any) -> Callable[[Function], Function]:
-    """Do what `numba.njit` does, with the cache of this package; options as there."""
-    # Compiled code is called from Python or from compiled code; the third way in costs a tenth of the compilation.
+    """Apply `numba.njit` with the cache of this package; the options are the same."""
+    # Functions are called from Python or compiled code only: a wrapper for C costs a tenth of the compilation.
     options = {"cache": True, "no_cfunc_wrapper": True} | options
 
     def decorate(function: Function) -> Function:
         if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # for coverage and debuggers
             return function
         _RESTING.ours.add(function)
-        # Numba chooses the folder when it decorates. Only then: what others compile is theirs to keep.
+        # Numba chooses the folder when it decorates. Restore the setting afterwards: other packages use their own.
         before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, cache_folder()  # type: ignore[attr-defined]
         try:
             compiled = numba.njit(**options)(function)
@@ -58,10 +58,10 @@ def njit(**options: Any) -> Callable[[Function], Function]:
 
 
 def _keep_cached(compiled: Any) -> Any:
-    """Keep machine code as long as all that went into it stays the same, and let no other process save meanwhile.
+    """Keep machine code until one of its sources changes, and lock the cache while saving.
 
-    Numba numbers the files of a function's signatures without a lock: of two processes that save two of them at once,
-    one may find the code of the other under its own name.
+    Numba numbers the files of a function's signatures without a lock: if two processes save at once, one may find the
+    code of the other under its own name.
     """
     cache = compiled._cache
     cache._cache_file._source_stamp = source_digest(compiled.py_func.__module__)
@@ -86,7 +86,7 @@ def _alone() -> Iterator[None]:
 
 
 class _Rest(event.Listener):
-    """Lets Python's garbage collector rest while a function of ours is compiled: it takes an eighth of that time."""
+    """Pause Python's garbage collector while a function of ours is compiled: it takes an eighth of that time."""
 
     def __init__(self) -> None:
         self.ours: set[Callable[..., Any]] = set()
@@ -124,7 +124,7 @@ def cache_folder() -> str:
 
 
 def is_shared() -> bool:
-    """Tell whether other processes find what this one compiles, and this one what they do."""
+    """Tell whether this process shares compiled code with others."""
     given = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     return fcntl is not None and cache_folder() == str(Path(given) if given else _user_folder())
 
@@ -139,7 +139,7 @@ def _user_folder() -> Path:
 
 
 def _link_folder(folder: Path) -> str:
-    """Make a folder of this process, which numba takes because it can be written, with links to all that is there."""
+    """Make a writable folder for this process, with links to all files of a read-only folder, for numba to use."""
     links = Path(tempfile.mkdtemp(prefix="imgcal-compiled-"))
     shutil.copytree(folder, links, copy_function=os.symlink, dirs_exist_ok=True)
     process = os.getpid()

@@ -43,15 +43,15 @@ def composite_windows(
     Memory is that of the windows plus the images; the loop runs over fiducials, the batch is vectorized.
 
     Args:
-        canvas: What lies in front.
+        canvas: Images so far, which lie in front.
         alpha: (B, N, h, w) opacity in [0, 1] on each window, nearest fiducial first.
         colours: (B, N, K) colour of each fiducial.
         rows: (B, N) first image row of each window.
         columns: (B, N) first image column of each window.
-        light: (B, N, h, w) what shines where it is not what hides: `transmittance * light * colour` is added.
+        light: (B, N, h, w) emitted light where it differs from `alpha`: adds `transmittance * light * colour`.
 
     Returns:
-        (B, N) sum of each fiducial's opacity over the pixels, as far as nothing nearer hides it.
+        (B, N) sum of each fiducial's opacity over the pixels, less what nearer fiducials hide.
     """
     (batch, count, window_height, window_width), channels = alpha.shape, colours.shape[-1]
     height, width = canvas.images.shape[-2:]

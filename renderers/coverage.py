@@ -1,4 +1,4 @@
-"""Light of blurred ellipses on the pixels of local windows: outlines, uneven surfaces, cut and smeared ones."""
+"""Light of blurred ellipses on the pixels of local windows: uniform, uneven, cut and smeared ones."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from renderers.spots import Smear, Surface
 
-PIECES = 12  # that a slab of an uneven surface is cut into
+PIECES = 12  # in each slab of an uneven surface
 LEVEL = 1e-6  # slope below which the edge of a cut counts as horizontal
 
 
@@ -20,7 +20,7 @@ class Windows(NamedTuple):
     rows: Tensor  # (P,) first row
     columns: Tensor  # (P,) first column
     size: tuple[int, int]  # height and width
-    finer: int = 1  # samples a pixel, each of which integrates over a whole pixel around it
+    finer: int = 1  # samples per pixel, each of which integrates over a whole pixel around it
 
 
 def ellipse_coverage(
@@ -28,10 +28,11 @@ def ellipse_coverage(
 ) -> Tensor:
     """Integrate blurred ellipses over the pixels of local windows.
 
-    An ellipse is cut into horizontal slabs, thinner towards its ends. A slab is a rectangle of the slab's exact area; a
-    rectangle blurred by a Gaussian and integrated over a pixel is a product of two exact terms, so the sum over slabs
-    is one small matrix product. The result is point-symmetric: cutting moves no centroid. What an edge cuts away is
-    missing from the slabs; where the surface is uneven, slabs are rows of pieces, each of the brightness of its middle.
+    An ellipse is divided into horizontal slabs, thinner towards its ends. Each slab is replaced by a rectangle of the
+    same area. A rectangle blurred by a Gaussian and integrated over a pixel is a product of two exact terms, so the sum
+    over slabs is one small matrix product. The result is point-symmetric: slabs do not move the centroid. Edges that
+    cut the ellipse shorten the slabs. On an uneven surface, each slab is a row of pieces, each with the brightness of
+    its middle.
 
     Args:
         centre: (P, 2) pixels.
@@ -39,10 +40,10 @@ def ellipse_coverage(
         windows: of P blobs.
         blur: Standard deviation of the blur in pixels, positive.
         slabs: Number of slabs.
-        surface: (P, ...) of these blobs, default even and whole.
+        surface: (P, ...) of these blobs, default uniform and whole.
 
     Returns:
-        (P, K, h, w): what hides, in [0, 1], and, with a surface, what shines. h and w count samples.
+        (P, K, h, w): opacity in [0, 1] and, with an uneven surface, emitted light. h and w count samples.
     """
     turn = torch.linspace(0, math.pi, slabs + 1, dtype=torch.float64, device=centre.device)
     cut = -turn.cos()  # slab edges on the unit disc, from -1 to 1
@@ -66,7 +67,7 @@ def ellipse_coverage(
         return (along_v.mT @ hiding).clamp(0, 1)[:, None]
     x, edges = (torch.lerp(e[..., :1], e[..., 1:], torch.linspace(0, 1, PIECES + 1).to(e)) for e in (x, edges))
     light = _brightness(surface, (x[..., 1:] + x[..., :-1]) / 2, middle[:, None])
-    # The sum of pieces w_j (T(x_j) - T(x_j+1)) is one of edges: (w_j - w_j-1) T(x_j).
+    # The sum over pieces w_j (T(x_j) - T(x_j+1)) is a sum over edges: (w_j - w_j-1) T(x_j).
     step = torch.nn.functional.pad(light, (1, 1)).diff(dim=-1)
     shining = _pixels(
         (step[..., None, :] @ _twice_integrated(edges, windows.size[1], windows.finer, blur))[..., 0, :], windows.finer
@@ -76,15 +77,15 @@ def ellipse_coverage(
 
 
 def smear_windows(fine: Tensor, smear: Smear, finer: int) -> Tensor:
-    """Spread windows along straight paths and over discs of confusion, and keep one sample a pixel.
+    """Spread windows along straight paths and over discs of confusion, and keep one sample per pixel.
 
-    Both are exact factors of the spectrum: sinc(k path / 2) of a uniform way, 2 J1(R |k|) / (R |k|) of a disc. The
+    Both are exact factors of the spectrum: sinc(k path / 2) for uniform motion, 2 J1(R |k|) / (R |k|) for a disc. The
     windows must hold all light before and after.
 
     Args:
         fine: (P, K, h, w) samples, dense enough for the blur that they already have.
         smear: (P, ...) of these blobs. Differentiable in the path, not in the radius.
-        finer: samples a pixel.
+        finer: samples per pixel.
 
     Returns:
         (P, K, h / finer, w / finer).
@@ -102,9 +103,9 @@ def smear_windows(fine: Tensor, smear: Smear, finer: int) -> Tensor:
 
 
 def _cut_chords(cuts: Tensor, axes: tuple[Tensor, Tensor, Tensor], y: Tensor, chord: Tensor) -> Tensor:
-    """Find what cuts leave of each chord: (P, S, 2) its ends in surface coordinates.
+    """Find the ends of each chord after the cuts: (P, S, 2) in surface coordinates.
 
-    A cut by n p <= o is a x + b y <= o there, with a, b = L^T n; what it keeps of a chord is an interval.
+    A cut n p <= o is a x + b y <= o in these coordinates, with a, b = L^T n; it keeps an interval of each chord.
     """
     half_width, half_height, slant = (axis[:, None] for axis in axes)
     a = cuts[..., 0] * half_width  # (P, Q)
@@ -137,7 +138,7 @@ def _blur_box(low: Tensor, high: Tensor, length: int, finer: int, blur: float) -
 def _twice_integrated(start: Tensor, length: int, finer: int, blur: float) -> Tensor:
     """Integrate a Gaussian at `start` (...) twice, up to the edges of all samples: (..., edges).
 
-    Without the term x / 2, which cancels in the difference of neighbouring pixels.
+    The term x / 2 is left out: it cancels in the difference of neighbouring pixels.
     """
     edges = torch.arange((length + 1) * finer, dtype=start.dtype, device=start.device) / finer - 0.5
     x = edges - start[..., None]

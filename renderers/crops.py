@@ -1,4 +1,4 @@
-"""Crops of infrared frames, drawn alone: the same physics as whole frames, thousands of them at a time."""
+"""Crops of infrared frames without the rest: the same physics as whole frames, thousands of crops at a time."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from torch import Tensor
 from renderers.infrared import render_blobs
 from renderers.spots import Spots, in_crop
 
-LEAST_BLUR = 0.15  # px of the crop: smear is computed on two samples a pixel, which hold no sharper ones
-AT_ONCE = 2**22  # pixels of crops and blobs that are worked on together: more leave the caches, and fill the memory
+LEAST_BLUR = 0.15  # px of the crop: smear is computed on two samples per pixel, too few for a sharper blur
+AT_ONCE = 2**22  # pixels of crops times blobs that are processed together: more overflow the caches and memory
 
 
 def render_crops(
@@ -23,15 +23,15 @@ def render_crops(
     *,
     extent: tuple[float, float] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Draw the light of crops only: means over squares of the frame's pixels.
+    """Render the light of crops only; their pixels are means over squares of the frame's pixels.
 
     Args:
-        spots: (B, N) in pixels of the frame, false ones among them; what is nearer hides what is farther.
-        centre: (B, 2) px of the frame on which the middle of each crop lies.
-        scale: Pixels of the frame a pixel of the crop.
+        spots: (B, N) in pixels of the frame, including false ones; nearer spots hide farther ones.
+        centre: (B, 2) px of the frame, the middle of each crop.
+        scale: Pixels of the frame per pixel of the crop.
         size: height and width of the crops.
         blur: of the lens, standard deviation in pixels of the frame.
-        extent: as of ``render_blobs``, in pixels of the crop; without it a GPU has to wait.
+        extent: as for ``render_blobs``, in pixels of the crop; without it a GPU has to synchronize.
 
     Returns:
         Light (B, h, w), and (B, N), the share of each blob's area that is inside the crop and not hidden.

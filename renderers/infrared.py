@@ -17,13 +17,13 @@ from renderers.spots import Spots
 
 # Windows reach this many standard deviations of the blur beyond the ellipse: 3e-7 of the light lies outside.
 REACH_SIGMAS = 5.0
-# Slabs that an ellipse is cut into: thin against the blur, and enough for a round outline without blur.
+# Slabs that an ellipse is divided into: thin compared with the blur, and enough for a round outline without blur.
 SLABS_PER_BLUR = 6.0
 SLABS = (48, 512)
 FEW_SLABS = 24  # for blobs of a pixel or two
-SLABS_PER_CUT = 2  # times as many where edges cut blobs: an edge is placed to within a slab
-SHARP = 0.05  # blur below which the optics count as this sharp, in pixels
-# Samples a pixel on which windows are smeared, by the least blur that keeps the spectrum within what they hold.
+SLABS_PER_CUT = 2  # times as many for blobs with cuts: an edge is placed to within a slab
+SHARP = 0.05  # least blur of the optics, in pixels; sharper optics are rendered with this blur
+# Samples per pixel for smearing windows: (least blur whose spectrum they can represent, samples).
 FINER = ((0.15, 2), (0.0, 4))
 
 
@@ -79,16 +79,16 @@ def render_blobs(
     Differentiable in the markers' centres, shapes, intensities and paths.
 
     Args:
-        markers: (*B, N) ellipses in pixels; what is invisible may hold NaN.
+        markers: (*B, N) ellipses in pixels; invisible ones may hold NaN.
         image_size: Height and width.
         blur: Standard deviation of the lens blur in pixels.
         clutter: From ``sample_clutter``, default none.
-        extent: Pixels, no marker's half extent is larger, without and with its smear. Without this the largest ones are
-            looked up, for which a GPU has to wait.
+        extent: Upper bounds of the markers' half extents in pixels, without and with their smear. By default the
+            largest ones are looked up, for which a GPU has to synchronize.
 
     Returns:
-        Light (*B, H, W), 0 on the ground and the intensity inside a blob, and (*B, N), the share of each marker's area
-        that is inside the frame and not hidden.
+        Light (*B, H, W), 0 on the background and the intensity inside a blob, and (*B, N), the share of each marker's
+        area that is inside the frame and not hidden.
 
     Examples:
         >>> one = torch.ones(1, 1)
@@ -124,7 +124,7 @@ def _composite(
     half = _half_extent(blobs)
     reach = half + REACH_SIGMAS * blur + 1
     size = torch.tensor([width, height], dtype=blobs.uv.dtype, device=blobs.uv.device)
-    # A comparison with NaN is false, so what is not finite, or no ellipse, is not drawn.
+    # A comparison with NaN is false, so blobs that are not finite, or not ellipses, are not drawn.
     near = ((blobs.uv > -reach) & (blobs.uv < size - 1 + reach)).all(-1)
     drawn = blobs.visible & near & (half > 0).all(-1) & (torch.linalg.det(blobs.shape) > 0)
     largest = (extent[0], extent[1], extent[1]) if extent is not None else _largest(blobs, half, drawn)
@@ -143,7 +143,7 @@ def _composite(
 def _windows(
     blobs: Spots, image_size: tuple[int, int], blur: float, largest: tuple[float, float, float]
 ) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
-    """Draw blobs (B, N) on windows inside the images: what hides, what shines if not the same, first rows, columns."""
+    """Draw blobs (B, N) on windows inside the images: opacity, light if different, first rows, first columns."""
     radius, *reach = largest
     length = [2 * math.ceil(x + REACH_SIGMAS * blur) + 1 for x in reach]
     inside = [min(n, most) for n, most in zip(length, image_size[::-1], strict=True)]
@@ -158,7 +158,7 @@ def _windows(
         windows = Windows(rows.flatten(), columns.flatten(), (inside[1], inside[0]))
         drawn = ellipse_coverage(flat.uv, flat.shape, windows, blur, slabs, flat.surface)
     else:
-        # Windows that hold all light, also what comes to lie outside of the image.
+        # Windows that hold all light, including what falls outside the image.
         finer = next(samples for least, samples in FINER if blur >= least)
         first = [(flat.uv[:, i].detach() - (length[i] - 1) / 2).round().long() for i in (0, 1)]
         windows = Windows(first[1], first[0], (length[1], length[0]), finer)
@@ -172,7 +172,7 @@ def _windows(
 
 
 def _cut_out(windows: Tensor, first: Tensor, length: int, dim: int) -> Tensor:
-    """Take `length` entries from `first` (P,) on along an axis of windows (P, K, h, w); 0 beyond their ends."""
+    """Take `length` entries, starting at `first` (P,), along an axis of windows (P, K, h, w); 0 beyond the ends."""
     index = first[:, None] + torch.arange(length, device=first.device)  # (P, length)
     within = (index >= 0) & (index < windows.shape[dim])
     index, within = (x[:, None, :, None] if dim == -2 else x[:, None, None, :] for x in (index, within))
@@ -182,7 +182,7 @@ def _cut_out(windows: Tensor, first: Tensor, length: int, dim: int) -> Tensor:
 
 
 def _half_extent(blobs: Spots) -> Tensor:
-    """Half of what blobs reach over along u and v: (*B, N, 2) px."""
+    """Half the extent of blobs along u and v: (*B, N, 2) px."""
     half = torch.diagonal(blobs.shape, dim1=-2, dim2=-1).clamp(min=0).sqrt()
     if blobs.smear is None:
         return half
@@ -200,7 +200,7 @@ def _largest(blobs: Spots, half: Tensor, drawn: Tensor) -> tuple[float, float, f
 
 
 def _nearest_first(blobs: Spots, drawn: Tensor, images: int, most: int) -> tuple[Spots, Tensor, Tensor]:
-    """Sort the blobs of each image by depth; what is not drawn comes last, as an invisible unit disc.
+    """Sort the blobs of each image by depth; those that are not drawn come last, as invisible unit discs.
 
     Returns:
         Blobs (B, most), their columns (B, most) and which of them are drawn.
@@ -217,7 +217,7 @@ def _nearest_first(blobs: Spots, drawn: Tensor, images: int, most: int) -> tuple
 
     eye = torch.eye(2, dtype=blobs.uv.dtype, device=blobs.uv.device)
     shape = torch.where(drawn[..., None, None], blobs.shape, eye)
-    # Drawn is what was found to be an ellipse: the unit discs must survive the mask.
+    # `arranged` sets the shapes of blobs that are not drawn to zero: replace them by unit discs.
     ordered = blobs.of_each(arranged)
     flat = shape.reshape(images, -1, 4).gather(1, order[..., None].expand(-1, -1, 4)).unflatten(-1, (2, 2))
     return replace(ordered, shape=flat), order, drawn.reshape(images, -1).gather(1, order)

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-GRID = 28  # candidate levels a channel
+GRID = 28  # candidate levels per channel
 # Least value of a colour's brightest channel. A splat fades towards black, so colours that differ in brightness alone
 # can be mistaken for each other: with 0.5 a green and its dark shade would both be among the first eight.
 BRIGHT = 0.7
@@ -26,7 +26,6 @@ def palette(count: int) -> Tensor:
 
     Raises:
         ValueError: A negative count, or more colours than candidates.
-
 
     Examples:
         >>> palette(8).shape

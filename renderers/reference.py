@@ -59,7 +59,7 @@ def ellipse_reference(
         shape: (2, 2) matrix A of the ellipse ``(x - centre)^T A^-1 (x - centre) <= 1``, square pixels.
         image_size: Height and width.
         blur: Standard deviation of the lens blur in pixels, 0 for none.
-        samples: Samples a pixel along each axis.
+        samples: Samples per pixel along each axis.
 
     Returns:
         (H, W) coverage in [0, 1].
@@ -82,11 +82,11 @@ def blob_reference(
     """Draw one blob with its surface and its smear by brute force: many sharp pictures, averaged, blurred, binned.
 
     Args:
-        spot: without batch axes, N = 1; visible, before an empty ground.
+        spot: without batch axes, N = 1; visible, on an empty background.
         image_size: Height and width.
         blur: Standard deviation of the lens blur in pixels.
-        samples: Samples a pixel along each axis.
-        moments: Pictures along the path; a quarter of the points on the disc of confusion.
+        samples: Samples per pixel along each axis.
+        moments: Pictures along the path; the disc of confusion has four times as many points.
 
     Returns:
         (H, W) light.

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-LARGEST_LEVEL = 1000.0  # of anything that is a share of full scale
+LARGEST_LEVEL = 1000.0  # of any value given as a share of full scale
 SENSOR_LIMITS = (
     ("blur", 0, 100), ("read_noise", 0, 65535), ("shot_noise", 0, 65535), ("row_noise", 0, 65535), ("hot_pixels", 0, 1),
     ("exposure", 0, LARGEST_LEVEL), ("saturation", 0, LARGEST_LEVEL), ("background", -LARGEST_LEVEL, LARGEST_LEVEL),
@@ -34,7 +34,7 @@ class SensorModel:
     row_noise: float = 0.0  # grey levels, standard deviation of an offset common to a row, new in every frame
 
     def __post_init__(self) -> None:
-        """Refuse what no sensor has."""
+        """Refuse values out of range."""
         if self.bit_depth not in (8, 12, 16):
             raise ValueError(f"bit_depth must be 8, 12 or 16, found {self.bit_depth}")
         if self.polarity not in ("bright", "dark"):
@@ -60,16 +60,16 @@ class SensorModel:
         gain: float = 1.0,
         bit_depth: Literal[8, 12, 16] = 8,
     ) -> SensorModel:
-        """Count photons: a marker so dim that its brightest pixel stands `peak_snr` standard deviations out.
+        """Model photon counts: the brightest pixel of a dim marker is `peak_snr` standard deviations above the ground.
 
-        The variance of a pixel that collects n electrons is n + read^2 of them. The marker's m electrons solve
+        The variance of a pixel that collects n electrons is n + read^2 electrons. The marker's m electrons solve
         m = peak_snr sqrt(m + ground + read^2).
 
         Args:
             peak_snr: of a large marker's middle, in one pixel of one frame.
-            ground: electrons a pixel collects from the background.
+            ground: electrons per pixel from the background.
             read: electrons, standard deviation of the read noise.
-            gain: grey levels an electron.
+            gain: grey levels per electron.
             bit_depth: as above.
 
         Examples:

@@ -1,4 +1,4 @@
-"""Digest of a module: its source, and all modules of its package that it imports."""
+"""Digest of a module: its source, and the modules of its package that it imports."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ PACKAGES = ("imgcal", "renderers")
 
 
 def source_digest(module: str) -> str:
-    """Digest of the sources of an imported module, and of those it imports from its own package and from ours.
+    """Digest the sources of an imported module and of those it imports from its own package and from ours.
 
-    Imports inside functions do not count. A module without a file has the digest of nothing.
+    Imports inside functions do not count. A module without a file counts as empty.
     """
     packages = {*PACKAGES, module.partition(".")[0]}
     found, waiting = {module}, [module]
@@ -40,7 +40,7 @@ def _digest(module: str) -> str:
 
 @cache
 def _imported_modules(module: str) -> frozenset[str]:
-    """Modules that its import statements name; of a name that a package lends, the module that it comes from."""
+    """Modules named in its import statements; for a name that a package re-exports, the module that defines it."""
     source = _source(module).decode()
     found = set(re.findall(r"^import ([\w.]+)", source, re.MULTILINE))
     for origin, names in re.findall(r"^from ([\w.]+) import (\([^)]*\)|.*)", source, re.MULTILINE):

@@ -38,7 +38,7 @@ def splat(
     Where splats overlap, ``"add"`` sums their light, in any order (values may exceed 1 and are not clamped). ``"over"``
     composites front to back: a splat has the opacity ``intensity * profile``, clamped to [0, 1], and hides what lies
     deeper. Where nothing overlaps both give the same image; ``"over"`` costs several times more, cuts profiles off
-    beyond 5 sizes, and needs memory for the images plus one window a fiducial.
+    beyond 5 sizes, and needs memory for the images plus one window per fiducial.
 
     On a CPU ``"add"`` costs little more than clearing the images: a reused ``out`` that stays in the cache is fastest,
     while fresh memory costs page faults for every image. ``"over"`` gains from ``THP_MEM_ALLOC_ENABLE=1``, with which
@@ -63,7 +63,6 @@ def splat(
         ValueError: Shapes do not fit, a compositing mode is unknown, or ``out`` is used while gradients are recorded.
 
     Convention: pixel (0, 0) is the centre of the top-left pixel, u right, v down.
-
 
     Examples:
         >>> uv = torch.tensor([[10.0, 12.0], [20.0, 4.0]])  # centres of two fiducials

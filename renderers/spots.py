@@ -1,4 +1,4 @@
-"""Blobs as values: ellipses, what their surfaces look like, and how they smear while the shutter is open."""
+"""Value types of blobs: ellipses, the look of their surfaces, and their smear while the shutter is open."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Surface:
-    """How unevenly blobs shine, and what of them is cut away.
+    """Uneven brightness of blobs, and the parts that are cut away.
 
-    Surface coordinates (x, y) = L^-1 (p - uv), with A = L L^T and L upper triangular: the outline is the unit circle,
-    and of a disc x points right and y down.
+    Surface coordinates (x, y) = L^-1 (p - uv), with A = L L^T and L upper triangular: the outline is the unit circle.
+    For a disc, x points right and y down.
     """
 
-    cuts: Tensor  # (*B, N, Q, 3) unit normal n and offset o (px): kept is n (p - uv) <= o; an infinite o cuts nothing
+    cuts: Tensor  # (*B, N, Q, 3) unit normal n and offset o (px): keeps n (p - uv) <= o; an infinite o cuts nothing
     limb: Tensor | None = None  # (*B, N) darkening towards the limb: brightness 1 - limb (1 - sqrt(1 - x^2 - y^2))
     bumps: Tensor | None = None  # (*B, N, D, 4) x, y, radius r, gain g: factors 1 + g exp(-d^2 / 2 r^2); g < 0 is dirt
 
 
 @dataclass(frozen=True)
 class Smear:
-    """What the light of blobs is spread over, beside the blur of the lens. Invisible blobs may hold NaN."""
+    """Spread of the light of blobs besides the lens blur. Invisible blobs may hold NaN."""
 
-    path: Tensor  # (*B, N, 2) px, straight way during the exposure, in whose middle the blob is where its `uv` says
+    path: Tensor  # (*B, N, 2) px, straight path during the exposure; its midpoint is the blob's `uv`
     defocus: Tensor  # (*B, N) px, radius of the disc of confusion
 
 
@@ -44,7 +44,7 @@ class Spots:
     smear: Smear | None = None
 
     def of_each(self, change: Callable[[Tensor], Tensor]) -> Spots:
-        """Apply a function to every tensor, those of the surface and of the smear, too.
+        """Apply a function to every tensor, including those of the surface and the smear.
 
         Examples:
             >>> one = torch.ones(5, 1)
@@ -56,16 +56,16 @@ class Spots:
 
 
 def roll_rows(spots: Spots, speed: Tensor, reference_row: float) -> Spots:
-    """Expose one row after another: what moves is seen sheared, and where it was when its own rows were exposed.
+    """Apply a rolling shutter: moving spots are sheared, and seen where they are when their own rows are exposed.
 
     Args:
         spots: as they are when the reference row is exposed.
-        speed: (*B, N, 2) px, movement during the time from one row to the next, below 1 along v.
-        reference_row: row whose time the spots are given for.
+        speed: (*B, N, 2) px, displacement from one row to the next, below 1 along v.
+        reference_row: row at whose exposure the spots are given.
 
     Returns:
-        Spots as a rolling shutter shows them: exact, and ellipses again. A point p that moves by s a row is met by the
-        shutter at p' = p + s (p'_v - reference), a linear equation for p'.
+        Spots as a rolling shutter shows them, which are exactly ellipses again. A point p that moves by s per row is
+        exposed at p' = p + s (p'_v - reference), a linear equation for p'.
     """
     along = 1 / (1 - speed[..., 1])
     zero, one = torch.zeros_like(along), torch.ones_like(along)
@@ -80,8 +80,8 @@ def in_crop(spots: Spots, centre: Tensor, scale: float, size: tuple[int, int]) -
 
     Args:
         spots: (B, N) in pixels of the frame.
-        centre: (B, 2) px of the frame on which the middle of each crop lies.
-        scale: Pixels of the frame a pixel of the crop.
+        centre: (B, 2) px of the frame, the middle of each crop.
+        scale: Pixels of the frame per pixel of the crop.
         size: height and width of the crops.
     """
     by = 1 / scale
