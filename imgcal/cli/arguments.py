@@ -241,8 +241,8 @@ class Score:
 
     Prints JSON: median_px, p95_px, rms_px, outliers, rms_px_with_outliers, points, snapshots_used, snapshots_rejected,
     per_camera. All are of distances in the image; the RMS is that of OpenCV's calibrateCamera, sqrt(2) times the
-    paper's RE. Outliers are much farther off than most of their camera, as
-    half-hidden markers are; they count in median_px and p95_px.
+    paper's RE. Outliers are much farther off than most of their camera, as half-hidden markers are; they count in
+    median_px and p95_px.
     Example: imgcal score my_capture --rig out/rig.yaml --object object.csv
     """
 

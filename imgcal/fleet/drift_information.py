@@ -33,9 +33,7 @@ class DriftInformation:
     """
 
     camera_names: tuple[str, ...]
-    information: (
-        Tensor  # (D, P, P) float64, P parameters of all cameras in units of `parameter_units`; positive semidefinite
-    )
+    information: Tensor  # (D, P, P) float64, P parameters of all cameras in `parameter_units`; positive semidefinite
     score: Tensor  # (D, P) information times the offset that the images ask for
 
     def __post_init__(self) -> None:

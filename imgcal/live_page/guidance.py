@@ -48,7 +48,7 @@ def compute_guidance(
 
     Raises:
         RefusedError: the information is singular.
-        torch.linalg.LinAlgError: so is a determinant's matrix.
+        torch.linalg.LinAlgError: the matrix of a determinant is singular.
     """
     belief, factory, turn = pickle.loads(content["pickled"])
     rig, covariance = belief.rig, belief.covariance()

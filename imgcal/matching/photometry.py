@@ -15,10 +15,8 @@ from imgcal.matching.marker_fit import MISFIT, NEAR
 LEAST_SIGMA = 0.02  # px: best accuracy of a fit
 LEAST_SIGNIFICANCE = 5.0  # amplitude over its standard deviation
 HALF_HIDDEN = 0.7  # of the radius: possible shift of the centre per misfit
-UNEVEN, EVEN = (
-    0.2,
-    0.03,
-)  # of the radius: standard deviation of a whole marker's centre, per misfit beyond that of pixels
+# Of the radius: standard deviation of a whole marker's centre, per misfit beyond that of pixels.
+UNEVEN, EVEN = 0.2, 0.03
 LARGEST = 40  # px, largest half size of a window
 
 

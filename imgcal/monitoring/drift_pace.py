@@ -117,9 +117,8 @@ class DriftPaces:
         self.information[0], self.pull[0] = self._measure_drift(test, walk, stretch.seconds)
         model = self._model(test, walk)
         leader = int(self._ratios(model).amax((0, 2, 3)).argmax())
-        rest = self._measure_drift(
-            test.condition_on({leader: None}), walk, stretch.seconds
-        )  # a camera that creeps affects all others
+        # A camera that creeps affects all others.
+        rest = self._measure_drift(test.condition_on({leader: None}), walk, stretch.seconds)
         others = torch.arange(len(self.squared)) != leader
         self.information[0, others], self.pull[0, others] = rest[0][others], rest[1][others]
         ratios, was = self._ratios(model), self.squared

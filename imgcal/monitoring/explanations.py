@@ -217,8 +217,8 @@ def doubtful_cameras(
         options: how to minimize.
 
     Returns:
-        Cameras that have moved or are unsynchronized; empty if something else is as probable.
-        And whether they are surely unsynchronized.
+        Cameras that have moved or are unsynchronized, empty if something else is as probable; and whether they are
+        surely unsynchronized.
     """
     observations, poses = stack_snapshots(snapshots)
     count, found, evidence = observations.seen.shape[1], tuple[int, ...](), -math.inf

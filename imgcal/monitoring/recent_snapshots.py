@@ -280,9 +280,8 @@ class RecentSnapshots:
         score = float((pulls * torch.linalg.solve(blocks + least, pulls[..., None])[..., 0]).sum(-1).min())
         total = self._totals[0]
         gained = total[self._next % len(total)][camera] - total[number % len(total)][camera]
-        weight = (
-            gained[PRINCIPAL_POINT, PRINCIPAL_POINT] / self._unit[camera, PRINCIPAL_POINT] ** 2
-        )  # over all its labels
+        # The weight of all labels of the camera.
+        weight = gained[PRINCIPAL_POINT, PRINCIPAL_POINT] / self._unit[camera, PRINCIPAL_POINT] ** 2
         return score, math.sqrt(max(score, 0.0) / max(weight, 1e-12))
 
     def belief_before(self, age: int) -> RigBelief:

@@ -86,18 +86,16 @@ def object_pose(
     information = torch.einsum("mri,mrj->ij", weighted, by_pose)
     coupling = _sums(torch.einsum("mri,mrk->mik", weighted, by_error), camera, count)  # (C, 6, K)
     # A camera that shakes shifts all fiducials alike by an unknown amount, which is integrated out.
-    shift_pose, shift_error = (
-        _sums(part * weight[:, None, None], camera, count) for part in (by_pose, by_error)
-    )  # (C, 2, 6 or K)
+    # (C, 2, 6) and (C, 2, K):
+    shift_pose, shift_error = (_sums(part * weight[:, None, None], camera, count) for part in (by_pose, by_error))
     shared = 1 / (1 / torch.from_numpy(shake).double().square().clamp_min(1e-30) + _sums(weight, camera, count))
     information = information - torch.einsum("cri,c,crj->ij", shift_pose, shared, shift_pose)
     coupling = coupling - torch.einsum("cri,c,crk->cik", shift_pose, shared, shift_error)
     factor, failed = torch.linalg.cholesky_ex(information)
     if bool(failed) or not bool(factor.isfinite().all()):
         return None
-    across = torch.cat(
-        (coupling.transpose(0, 1).flatten(1), torch.einsum("mri,mrk->ik", weighted, by_object)), dim=1
-    )  # (6, D)
+    # (6, D):
+    across = torch.cat((coupling.transpose(0, 1).flatten(1), torch.einsum("mri,mrk->ik", weighted, by_object)), dim=1)
     follows = torch.cholesky_solve(across, factor)  # minus the derivative of the pose by the rig
     follows[:, : count * width] += common_motion(belief, rig_from_object, trusted)
     half = torch.linalg.solve_triangular(belief.factor, follows.mT, upper=False)

@@ -274,9 +274,8 @@ class ImageProblem:
             options=self.options.estimation,
         )
         brightness = self.colours.sum(-1)
-        stray = dots.light - (dots.believed * brightness[dots.colour]).sum(
-            -1
-        )  # saturation and borders only make it smaller
+        # Saturation and borders can only reduce it.
+        stray = dots.light - (dots.believed * brightness[dots.colour]).sum(-1)
         explained = (stray < PRESENT * brightness.min()).all(-1) & (result.chi2_per_dof < self.options.most_chi2)
         return replace(result, converged=result.converged & explained)
 

@@ -68,9 +68,7 @@ class TrainingConfig(StrictModel):
     compile: bool | Literal["graphs"] = False  # torch.compile of network and loss: fewer launches; graphs: CUDA's, too
     channels_last: bool = False  # memory order of convolutions' weights: faster on a GPU
     tf32: bool = False  # let a GPU round float32 matrix products to TF32
-    init_from: str | list[str] | None = (
-        None  # weights to start from: files, folders of runs, shipped names; the last wins
-    )
+    init_from: str | list[str] | None = None  # initial weights: files, folders of runs, shipped names; the last wins
     log_every: Count = 50  # steps between two rows of metrics
     validate_every: Count = 500  # steps between two validations
     validation_rigs: Annotated[int, Field(ge=0, le=10**6)] = 512  # rigs (images, ...) to validate on; 0 = none

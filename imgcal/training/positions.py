@@ -49,9 +49,7 @@ class PositionsExperiment(Experiment, NetworkSpec):
     task: Literal["positions"]
     rig: str  # shipped name or path: rig of the network in the file; does not affect the images
     object: str  # shipped name or path: only the number of its fiducials and their colours matter
-    levels: Annotated[Levels, Field(min_length=1)] = Field(
-        default=[0, 1, 2, 3, 4]
-    )  # difficulty levels of the images, in equal shares
+    levels: Annotated[Levels, Field(min_length=1)] = Field(default=[0, 1, 2, 3, 4])  # difficulties, in equal shares
 
     def make_task(self, device: torch.device, batch_size: int, weights: torch.Generator, fresh: bool) -> PositionsTask:
         """Build the network; see `Experiment.make_task`."""

@@ -40,9 +40,7 @@ class RigExperiment(Experiment, NetworkSpec):
     rig: str  # factory rig: shipped name or path
     object: str  # calibration object: shipped name or path
     corruption: Corruption = Corruption()  # defects of the views during training
-    levels: Levels = Field(
-        default=[]
-    )  # of image variants: difficulty of the images, in equal shares, instead of `corruption`
+    levels: Levels = Field(default=[])  # of image variants: difficulties in equal shares, instead of `corruption`
     loss: LossConfig = LossConfig()
 
     def load_rig(self) -> CameraRig:

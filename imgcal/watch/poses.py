@@ -30,9 +30,8 @@ COLUMNS = (
 class PoseRecord:
     """The object's pose in a snapshot.
 
-    Status: `ok`, all cameras are calibrated; `degraded`, some are not (lost, in doubt, being relearnt), and the pose
-        comes
-    from the others; `no_object`, there is no pose.
+    Status: `ok`, all cameras are calibrated; `degraded`, some are not (lost, in doubt, being relearnt), and the
+    pose comes from the others; `no_object`, there is no pose.
     """
 
     time: float  # s, of the snapshot
