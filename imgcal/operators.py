@@ -286,7 +286,7 @@ def _save(ctx: Any, operator: Operator, inputs: tuple[Any, ...], output: Tensors
 
 
 def _spread(operator: Operator, gradients: Iterable[Tensor]) -> tuple[Tensor | None, ...]:
-    """Gradients of all inputs and the options; None where there is none."""
+    """Gradients of all inputs and the options; None where an input has no derivative."""
     found = iter(gradients)
     return (*(next(found) if name in operator.differentiable else None for name in operator.inputs), None)
 

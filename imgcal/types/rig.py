@@ -363,7 +363,7 @@ class CameraRig:
 
     @classmethod
     def combine(cls, rigs: Sequence[CameraRig], join: Join) -> CameraRig:
-        """Combine several into one; `join` takes the list of focal lengths, and so on. The rest comes from the first."""
+        """Combine several into one; `join` takes the list of focal lengths, and so on. The rest is the first one's."""
         return replace(
             rigs[0],
             focal_length=join([rig.focal_length for rig in rigs]),
