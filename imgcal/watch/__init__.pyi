@@ -16,7 +16,8 @@ from .qualisys import Qualisys
 from .recordings import BlobTable, Videos, holds_videos
 from .rig_files import CURRENT, RigFiles, put_aside
 from .source_reader import Known, SourceReader
-from .synchronization import COUNTS, Synchronizer, TimedSnapshot, Timing
+from .synchronization import COUNTS, Synchronizer, TimedSnapshot
+from .timing import Timing
 from .zeromq import ZeroMQ
 
 __all__ = [

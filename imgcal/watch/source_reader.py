@@ -13,7 +13,8 @@ from imgcal.errors import InputError
 from imgcal.messages import one_line
 from imgcal.types import CameraRig
 from imgcal.watch.exposures import CameraBlobs, Exposure, Item, Source, Unreadable, check_exposure
-from imgcal.watch.synchronization import Synchronizer, TimedSnapshot, Timing
+from imgcal.watch.synchronization import Synchronizer, TimedSnapshot
+from imgcal.watch.timing import Timing
 
 MOST_WAITING = 8
 """Maximum length of the queue; beyond it, a live source drops the oldest snapshot, any other source waits."""

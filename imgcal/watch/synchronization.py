@@ -10,13 +10,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from imgcal.errors import InputError
 from imgcal.io import Frame
 from imgcal.types import Detections
 from imgcal.watch.exposures import CameraBlobs, Exposure
+from imgcal.watch.timing import LEAP, Timing
 
-LEAP = 10.0
-"""Maximum jump (s) of a clock: an exposure beyond it is left out, unless the other cameras' clocks jump equally."""
 MOST_PENDING = 32
 """Maximum number of unfinished snapshots; beyond it, the oldest is released as it is."""
 OUT_AFTER = 10
@@ -45,20 +43,6 @@ second exposure for the same snapshot. `astray`: its clock is off by more than `
 differed from the others' for long. These four are left out. `out_of_order`: earlier than a previous one; used if its
 snapshot has not been released.
 """
-
-
-@dataclass(frozen=True)
-class Timing:
-    """When exposures belong together, and how long to wait for missing ones."""
-
-    tolerance: float = 0.005  # maximum s between the earliest and the latest time stamp of a snapshot
-    patience: float = 0.1  # s to wait for missing exposures
-
-    def __post_init__(self) -> None:
-        for name in ("tolerance", "patience"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and 0 <= value <= LEAP / 2):
-                raise InputError(f"{name}: found {value:g}, expected 0 to {LEAP / 2:g} s")
 
 
 @dataclass(frozen=True)

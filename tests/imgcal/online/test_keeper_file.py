@@ -150,7 +150,7 @@ def test_files_that_were_changed_are_refused_in_one_line(saved, tmp_path: Path, 
     assert "\n" not in str(told.value)
 
 
-@pytest.mark.parametrize(("version", "age"), [(1, "earlier"), (5, "earlier"), (7, "later")])
+@pytest.mark.parametrize(("version", "age"), [(1, "earlier"), (6, "earlier"), (8, "later")])
 def test_the_state_of_another_version_is_refused_with_what_can_be_done(saved, tmp_path, version, age) -> None:
     path, content = tmp_path / "state.json", json.loads(saved[0].read_text())
     content["format"] = f"imgcal-keeper/{version}"
