@@ -225,7 +225,7 @@ class _Series:
 
     def _nearest_pose(self, s: int, accepted: NDArray[np.int64]) -> RigidTransform | None:
         """Pose of the nearest of the accepted snapshots, which may be the snapshot itself."""
-        return self.results[int(accepted[np.abs(accepted - s).argmin()])][0].rig_from_object
+        return self.results[_nearest(s, accepted)][0].rig_from_object
 
     def where_blobs_fail(self, sight: Sight, accepted: NDArray[np.int64]) -> None:
         """Search the frames of refused snapshots."""
@@ -307,8 +307,13 @@ def drop_snapshots(labelled: Associations, rows: Sequence[int]) -> Associations:
 
 def _gap(snapshot: int, accepted: NDArray[np.int64]) -> int:
     """Distance, in snapshots, to the nearest accepted one; `accepted` is ascending."""
+    return abs(_nearest(snapshot, accepted) - snapshot)
+
+
+def _nearest(snapshot: int, accepted: NDArray[np.int64]) -> int:
+    """Nearest of the accepted snapshots, which are ascending; the earlier of two."""
     near = int(np.searchsorted(accepted, snapshot))
-    return int(np.abs(accepted[max(near - 1, 0) : near + 1] - snapshot).min())
+    return min(accepted[max(near - 1, 0) : near + 1].tolist(), key=lambda s: abs(s - snapshot))
 
 
 @dataclass

@@ -16,7 +16,7 @@ from .frame_dataset import (
     load_splits,
 )
 from .infrared_task import InfraredExperiment, InfraredTask
-from .labelled_crops import cut_labelled, harvest, split
+from .labelled_crops import cut_labelled, split
 from .measurer_task import MeasurerExperiment, MeasurerTask
 from .rigs import RigExperiment, RigTask, checkpoint_experiment
 from .state import TrainingState, load_state, save_state
@@ -49,7 +49,6 @@ __all__ = [
     "change_experiment",
     "checkpoint_experiment",
     "cut_labelled",
-    "harvest",
     "is_finished",
     "load_experiment",
     "load_frames",

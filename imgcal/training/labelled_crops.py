@@ -53,7 +53,7 @@ LEAST_SNAPSHOTS = 5
 """Smallest number of snapshots that can be split; with fewer, cameras are held out."""
 
 
-def harvest(
+def cut_labelled(
     frames: Callable[[int], Mapping[str, Frame | None]],
     detections: Detections,
     rig: CameraRig,
@@ -65,8 +65,8 @@ def harvest(
     size: int = 96,
     seed: int = 0,
     progress: Progress | None = None,
-) -> tuple[FrameDataset, FrameDataset]:
-    """Cut labelled crops from the frames of a calibrated rig.
+) -> tuple[FrameDataset, PatchDataset]:
+    """Cut labelled crops, and patches of their markers, from the frames of a calibrated rig.
 
     Args:
         frames: maps the index of a snapshot to its frames: camera name -> (H, W).
@@ -81,33 +81,7 @@ def harvest(
         progress: wraps the loops over snapshots.
 
     Returns:
-        Crops for training, and held-out crops: from other snapshots, never neighbours in time; from other cameras if
-        there are fewer than five snapshots.
-
-    Raises:
-        RefusedError: no snapshot is conclusive, no pose fits, or one of the two would be empty.
-    """
-    made = cut_labelled(
-        frames, detections, rig, obj, options, detection=detection, sight=sight, size=size, seed=seed,
-        progress=progress,
-    )  # fmt: skip
-    return split(made[0], len(detections.snapshot_names), rig.num_cameras)
-
-
-def cut_labelled(
-    frames: Callable[[int], Mapping[str, Frame | None]],
-    detections: Detections,
-    rig: CameraRig,
-    obj: CalibrationObject,
-    options: PipelineOptions = PipelineOptions(),
-    *,
-    detection: DetectionOptions = DetectionOptions(),
-    sight: Sight | None = None,
-    size: int = 96,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> tuple[FrameDataset, PatchDataset]:
-    """Cut the crops of all snapshots that can be decided, and patches of their markers; arguments as of `harvest`.
+        Crops and patches of all snapshots that can be decided; `split` holds some of each out.
 
     Raises:
         RefusedError: no snapshot can be decided, or no pose fits.

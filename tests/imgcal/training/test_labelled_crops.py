@@ -7,9 +7,14 @@ import torch
 import imgcal
 from imgcal.errors import RefusedError
 from imgcal.io import data_path, open_capture
-from imgcal.training import harvest
 from imgcal.training.frame_dataset import FrameDataset
 from imgcal.training.labelled_crops import cut_labelled, split
+
+
+def harvest(frames, detections, rig, obj) -> tuple[FrameDataset, FrameDataset]:
+    """Crops to learn from, and held out."""
+    crops, _ = cut_labelled(frames, detections, rig, obj)
+    return split(crops, len(detections.snapshot_names), rig.num_cameras)
 
 
 @pytest.fixture(scope="module")
