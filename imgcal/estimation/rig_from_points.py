@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.estimation.map_estimate import Estimate, EstimationOptions, estimate
-from imgcal.estimation.rig_initialization import FINE, ROUGH, ordinary_lens, require_connected
+from imgcal.estimation.map_estimate import EstimationOptions, estimate
+from imgcal.estimation.rig_initialization import FINE, ROUGH, ordinary_lens, require_connected, robust_std
 from imgcal.geometry import RigidTransform, undistort
 from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 
@@ -249,13 +249,9 @@ def _fit_jointly(
         rig, poses = fit.rig, fit.rig_from_object
     assert fit is not None
     placed, _ = move_to_pair_frame(fit.rig, pair)
-    return PointStart(replace(placed, prior=cameras.prior), pair, _spread(fit))
-
-
-def _spread(fit: Estimate) -> float:
-    """Robust standard deviation of the residuals, per axis, px."""
-    seen = fit.problem.root_weight[0] > 0
-    return float(fit.residual.norm(dim=-1)[seen].median()) / 1.1774
+    return PointStart(
+        replace(placed, prior=cameras.prior), pair, robust_std(fit.residual[fit.problem.root_weight[0] > 0])
+    )
 
 
 def _select_moments(seen: Tensor) -> Tensor:
