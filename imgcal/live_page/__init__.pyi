@@ -2,8 +2,8 @@ from .address import Address, parse_address
 from .commands import Action, Command
 from .demonstration import Demonstration
 from .live_page import LivePage
-from .page import content_policy, to_json
-from .rig_drawing import up_and_forward
+from .page import content_policy, to_json, viewer_script
+from .rig_drawing import frustum_length, frustums, up_and_forward
 from .security import Gate
 
 __all__ = [
@@ -14,7 +14,10 @@ __all__ = [
     "Gate",
     "LivePage",
     "content_policy",
+    "frustum_length",
+    "frustums",
     "parse_address",
     "to_json",
     "up_and_forward",
+    "viewer_script",
 ]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-SCRIPTS = ("words", "scene", "timelines", "cameras", "pictures", "volume", "events", "controls", "main")
+SCRIPTS = ("viewer", "words", "scene", "timelines", "cameras", "pictures", "volume", "events", "controls", "main")
 """Files of the script, in the order in which they stand in the page: later ones use earlier ones."""
 
 
@@ -98,7 +98,12 @@ def _digest(text: str) -> str:
 
 @cache
 def _script() -> str:
-    return '"use strict";\n' + "\n".join(_asset(f"{name}.js") for name in SCRIPTS)
+    return "\n".join(_asset(f"{name}.js") for name in SCRIPTS)
+
+
+def viewer_script() -> str:
+    """The script that defines `Viewer`, a rig in 3D on a canvas; it reads the colours --page, --ink and --muted."""
+    return _asset("viewer.js")
 
 
 @cache
