@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
 import torch
 
-from imgcal.live_page import frustum_length, frustums, up_and_forward, viewer_script
+from imgcal.live_page import frustum_length, frustums, read_asset, up_and_forward, viewer_script
 from imgcal.report.svg import Array
 from imgcal.types import CameraRig
 
@@ -66,10 +64,9 @@ def rig_scene(rigs: Sequence[DrawnRig], points: Array | None = None) -> Scene:
     }
 
 
-@cache
 def rig_view_script() -> str:
     """The script that defines `RigView`."""
-    return viewer_script() + files("imgcal.report").joinpath("templates", "rig_view.js").read_text(encoding="utf-8")
+    return viewer_script() + read_asset("report/templates/rig_view.js")
 
 
 def _round(points: Array) -> list[Any]:
