@@ -145,10 +145,8 @@ def _measure_change(before: RigBelief, after: RigBelief, fiducial: int | None) -
 def _similarities(points: Tensor) -> Tensor:
     """Directions of fiducials (N, 3) in which an object moves, turns or grows without changing its shape: (3 N, 7)."""
     arms = points - points.mean(0)
-    shifts, turns = (
-        torch.eye(3).to(points).expand(len(points), -1, -1),
-        torch.linalg.cross(torch.eye(3).to(points)[None], arms[:, None], dim=-1),
-    )
+    shifts = torch.eye(3).to(points).expand(len(points), -1, -1)
+    turns = torch.linalg.cross(shifts[:1], arms[:, None], dim=-1)
     return torch.cat((shifts, turns, arms[:, None]), 1).movedim(1, -1).flatten(0, 1)
 
 
