@@ -1,6 +1,6 @@
 from . import levenberg_marquardt_cpu
 from .accuracy import MAP_DEPTHS, MAP_SIZE, PredictedError, WorkingVolume, predicted_error
-from .blocks import BlockScatter, block_scatter
+from .block_scatter import BlockScatter, block_scatter
 from .change_points import CLIP, LEAST_SNAPSHOTS
 from .correlation import autocorrelation, correlation_time
 from .covariance import (
