@@ -11,9 +11,9 @@ from torch import Tensor
 
 from imgcal.estimation import Gauge
 from imgcal.monitoring import CHANGES, RigBelief
-from imgcal.online.events import UNITS, ChangeKind, Event
+from imgcal.online.events import ChangeKind, Event
 from imgcal.online.relearning import relative_std
-from imgcal.types import CameraRig
+from imgcal.types import SHOWN_UNITS, CameraRig
 
 EVERY_SECONDS = 10.0
 """Time between two checks."""
@@ -83,8 +83,8 @@ class DriftWatch:
         return None if best is None else best[1:]
 
     def _event(self, camera: int, kind: ChangeKind, size: float, std: Tensor, time: float, number: int) -> Event:
-        unit, name = UNITS[kind], self.names[camera]
-        scale = math.degrees(1.0) if unit == "deg" else 1.0
+        name = self.names[camera]
+        unit, scale = SHOWN_UNITS[kind]
         assert self.std is not None
         part = CHANGES[kind]
         sigma = float((self.std[camera, part].square() + std[part].square()).max().sqrt()) * scale
