@@ -52,6 +52,9 @@ LEAST_LEAD = 0.8
 
 EPISODE, LEAST_EPISODE = 2.0, 3
 """Longest transient error in correlation times, and its smallest length in snapshots where errors are correlated."""
+PERSISTENT = 1e-3
+"""Error probability of the evidence that must remain on either side of a step without its most supportive half, where
+errors are correlated: a camera that has moved stays there, but the error of a second or two ends."""
 LEAST_LABELS = 2
 """Smallest number of labels from which the shift of a camera's image in a snapshot is computed."""
 
@@ -220,6 +223,13 @@ class Change:
         return kind, length, float(direction @ (alone * scale * scale[:, None]) @ direction) ** 0.5
 
 
+def longest_episodes(problem: Problem, state: State) -> list[int]:
+    """Longest transient error of each of C cameras, in successive snapshots; 0 = errors are not correlated."""
+    cameras = problem.uv.shape[2]
+    places = Places(problem, state, tuple(range(cameras)), (0,) * cameras)
+    return [places.episode(camera) for camera in range(cameras)]
+
+
 def find_moves(
     problem: Problem, state: State, camera_names: tuple[str, ...], snapshot_names: tuple[str, ...],
     options: EstimationOptions,
@@ -256,7 +266,7 @@ def find_moves(
                 and divided.shift(step.camera, new) >= LEAST_MOVE * left**0.5
                 and (change := divided.change(step.camera, new, left)).is_physical
                 and change.is_certain
-                and _outlasts_an_episode(places, divided, step.camera, least_significant(candidates, ERROR) * left)
+                and _outlasts_an_episode(places, divided, step.camera, least_significant(candidates, ERROR), left)
             ):
                 doubts[new] = _doubts(places, step)
                 places, noise = divided, left
@@ -286,8 +296,8 @@ def _locate(places: Places, step: Step, options: EstimationOptions) -> Places | 
     return divided
 
 
-def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: float) -> bool:
-    """Check that a step stays significant without its most supportive episode on either side.
+def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: float, noise: float) -> bool:
+    """Check that a step stays significant without its most supportive episode, and evident without half of either side.
 
     A transient error is no motion: a target at the edge of an image, or behind an arm, may seem to be off by pixels for
     some snapshots.
@@ -297,6 +307,7 @@ def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: fl
         divided: afterwards; the new place is the last.
         camera: index of the divided place.
         least: smallest significant statistic.
+        noise: factor by which statistics exceed those of independent noise.
     """
     new = len(divided.camera) - 1
     length, row = divided.episode(divided.camera[new]), divided.first[new]
@@ -307,10 +318,11 @@ def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: fl
     for rows, gain in ((shown[shown < row], -saved), (shown[shown >= row], saved)):
         if len(rows) <= length:
             return False
-        first = int(np.convolve(gain[rows], np.ones(length), "valid").argmax())
-        rest = places.drop_labels(camera, rows[first : first + length])
-        if rest.blocks.statistics([camera], np.array([row]))[0, 0] < least:
-            return False
+        for dropped, enough in ((length, least), (len(rows) // 2, least_significant(1, PERSISTENT))):
+            first = int(np.convolve(gain[rows], np.ones(dropped), "valid").argmax())
+            rest = places.drop_labels(camera, rows[first : first + dropped])
+            if rest.blocks.statistics([camera], np.array([row]))[0, 0] < enough * noise:
+                return False
     return True
 
 
