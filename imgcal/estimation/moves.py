@@ -34,7 +34,7 @@ from imgcal.estimation.map_estimate import equations_at, minimize
 from imgcal.estimation.robust_losses import NamedLoss, huber
 from imgcal.types import PARAMETER_KINDS, Kind, MovedCamera
 
-ERROR = 1e-5
+FALSE_MOVE_PROBABILITY = 1e-5
 """Probability of naming a camera in a capture in which none has moved, if the noise is as stated."""
 LEAST_MOVE = 0.15
 """Pixels, in the image of the camera: smaller moves do no harm, and slow drifts of every rig reach them. Multiplied by
@@ -253,7 +253,7 @@ def find_moves(
     for _ in range(3 * cameras):
         seen = places.seen & ~np.isin(places.camera, list(left_out))
         candidates = int(places.seen.sum())
-        step = likeliest_step(places.blocks, seen, least_significant(candidates, ERROR))
+        step = likeliest_step(places.blocks, seen, least_significant(candidates, FALSE_MOVE_PROBABILITY))
         if step is None:
             break
         divided = _locate(places, step, options)
@@ -262,11 +262,13 @@ def find_moves(
             left = dispersion(divided.blocks, divided.seen)
             new = len(divided.camera) - 1
             if (
-                is_significant(step.statistic / left, candidates, ERROR)
+                is_significant(step.statistic / left, candidates, FALSE_MOVE_PROBABILITY)
                 and divided.shift(step.camera, new) >= LEAST_MOVE * left**0.5
                 and (change := divided.change(step.camera, new, left)).is_physical
                 and change.is_certain
-                and _outlasts_an_episode(places, divided, step.camera, least_significant(candidates, ERROR), left)
+                and _outlasts_an_episode(
+                    places, divided, step.camera, least_significant(candidates, FALSE_MOVE_PROBABILITY), left
+                )
             ):
                 doubts[new] = _doubts(places, step)
                 places, noise = divided, left

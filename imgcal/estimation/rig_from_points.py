@@ -21,7 +21,7 @@ from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.estimation.map_estimate import EstimationOptions, estimate
-from imgcal.estimation.rig_initialization import FINE, ROUGH, ordinary_lens, require_connected, robust_std
+from imgcal.estimation.rig_initialization import FINE_SIGMA, ROUGH_SIGMA, ordinary_lens, require_connected, robust_std
 from imgcal.geometry import RigidTransform, undistort
 from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 
@@ -94,7 +94,7 @@ def cold_start_from_points(
         found = _fit_jointly(observations, move_to_pair_frame(rig, pair), cameras)
         if found is not None and (best is None or found.spread < best.spread):
             best = found
-        if best is not None and best.spread < FINE:
+        if best is not None and best.spread < FINE_SIGMA:
             break
     if best is None:
         common = [int((seen[:, [c]] & np.delete(seen, c, 1)).any(1).sum()) for c in range(cameras.num_cameras)]
@@ -242,7 +242,7 @@ def _fit_jointly(
     lens_fixed = std.clone()
     lens_fixed[:, 8:] = 0.0
     poses = None
-    for noise, spread in ((ROUGH, lens_fixed), (ROUGH, std), (FINE, std)):
+    for noise, spread in ((ROUGH_SIGMA, lens_fixed), (ROUGH_SIGMA, std), (FINE_SIGMA, std)):
         part = replace(some, sigma=torch.full_like(some.sigma, noise))
         options = EstimationOptions(loss="cauchy", max_iterations=60)
         fit = estimate(part, given, light, poses, prior_std=spread, initial_rig=rig, options=options)

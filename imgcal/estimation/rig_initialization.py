@@ -26,11 +26,11 @@ from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 
 LEAST_FIDUCIALS = 4
 """Smallest number in one image for a pose from that image alone."""
-ROUGH = 3.0
+ROUGH_SIGMA = 3.0
 """Pixels: standard deviation of an observation while the lens is wrong."""
-FINE = 0.5
+FINE_SIGMA = 0.5
 """Pixels: standard deviation of an observation in the final fit."""
-OUTLYING = 6.0
+OUTLYING_SPREADS = 6.0
 """Multiple of the residuals' robust spread beyond which labels are excluded."""
 CAPPED = 30.0
 """Pixels at which reprojection errors are clipped when poses are compared."""
@@ -186,7 +186,7 @@ def _fit_jointly(
     lens_fixed = std.clone()
     lens_fixed[:, 8:] = 0.0
     seen, start, fit = observations.seen, rig, None
-    for noise, spread in ((ROUGH, lens_fixed), (ROUGH, std), (FINE, std)):
+    for noise, spread in ((ROUGH_SIGMA, lens_fixed), (ROUGH_SIGMA, std), (FINE_SIGMA, std)):
         poses = best_poses(observations, seen, start, cam_from_object, known, obj, fit)
         part = Observations(observations.uv, torch.full_like(observations.sigma, noise), seen)
         options = EstimationOptions(loss="cauchy", max_iterations=60)

@@ -29,7 +29,7 @@ from imgcal.monitoring.change_test import MODEL_ERROR
 from imgcal.monitoring.shaking import shared_shifts
 from imgcal.types import Observations
 
-MEMORY = 1024
+MEMORY_SNAPSHOTS = 1024
 """Number of latest snapshots used to measure correlation times ..."""
 FIRST_MEASUREMENTS, MEASUREMENT_INTERVAL = (48, 64, 96), 128
 """... counts of snapshots at which they are first measured, and the interval after that."""
@@ -77,7 +77,7 @@ class NoiseCorrelation:
     cameras: int
     time: Tensor = field(init=False)  # (C,) correlation time in snapshots; 1 = independent
     lasting: Tensor = field(init=False)  # (C,) px, one standard deviation of a persistent image shift
-    shifts: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=MEMORY))  # (C, 2) px
+    shifts: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=MEMORY_SNAPSHOTS))  # (C, 2) px
     taken: int = 0  # snapshots
     usual: float = 1.0  # least correlation time until enough snapshots are taken
     interval: float = 0.0  # s between snapshots; 0 = unknown

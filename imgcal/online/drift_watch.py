@@ -17,7 +17,7 @@ from imgcal.types import SHOWN_UNITS, CameraRig
 
 EVERY_SECONDS = 10.0
 """Time between two checks."""
-WORTH = {"rotation": math.radians(0.05), "position": 0.5, "focal_length": 1.0, "principal_point": 1.0}
+LEAST_DRIFT = {"rotation": math.radians(0.05), "position": 0.5, "focal_length": 1.0, "principal_point": 1.0}
 """Drift (rad, mm, pixels) that is reported if significant."""
 DRIFT_SIGMAS = 5.0
 """Significance of the drift, in standard deviations of the values at the start of the measurement."""
@@ -77,7 +77,7 @@ class DriftWatch:
         best: tuple[float, ChangeKind, float] | None = None
         for kind, part in CHANGES.items():
             size = float(change[part].norm())
-            least = max(WORTH[kind], DRIFT_SIGMAS * float(std[part].max()))
+            least = max(LEAST_DRIFT[kind], DRIFT_SIGMAS * float(std[part].max()))
             if size >= least and (best is None or size / least > best[0]):
                 best = size / least, kind, size  # type: ignore[assignment]
         return None if best is None else best[1:]
