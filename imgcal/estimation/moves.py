@@ -34,6 +34,7 @@ from imgcal.estimation.map_estimate import equations_at, minimize
 from imgcal.estimation.robust_losses import NamedLoss, huber
 from imgcal.types import PARAMETER_KINDS, Kind, MovedCamera
 
+# When a camera has moved.
 FALSE_MOVE_PROBABILITY = 1e-5
 """Probability of naming a camera in a capture in which none has moved, if the noise is as stated."""
 LEAST_MOVE = 0.15
@@ -50,6 +51,7 @@ MOST_UNEXPLAINED = 0.5
 LEAST_LEAD = 0.8
 """Relative to the best camera's statistic: another one that reaches this may be the one that moved."""
 
+# Correlated errors.
 EPISODE, LEAST_EPISODE = 2.0, 3
 """Longest transient error in correlation times, and its smallest length in snapshots where errors are correlated."""
 PERSISTENT = 1e-3

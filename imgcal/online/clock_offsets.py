@@ -15,10 +15,13 @@ from imgcal.monitoring import ClockSlip, MeasurementUpdate
 from imgcal.online.events import Event
 from imgcal.online.rig_state import RigState
 
+# Residuals that count.
 MEMORY_SECONDS = 5.0
 """Decay time (s, to 1/e) of a residual's weight."""
 LONGEST_INTERVAL = 0.2
 """Maximum time (s) between snapshots for which the difference of predictions is a velocity."""
+
+# Offsets that are reported and corrected.
 OFFSET_CHI2, LEAST = 40.0, 1e-3
 """Chi-squared (one degree of freedom; chance: once in 10^9 independent tests), and seconds, to report an offset ..."""
 LEAST_KNOWN = 1e-4
@@ -27,6 +30,8 @@ LEAST_CHANGE = 0.05
 """Relative change of an offset at which it is reported again."""
 LEAST_MEMORY = 1.0
 """Seconds of motion required before a report."""
+
+# When motion and shift can be separated.
 LEAST_MOTION, LEAST_SIGMAS = 0.5, 5.0
 """Pixels, and standard deviations, by which blobs (their median) must move between snapshots: less is noise of the
 pose, which correlates with the residuals. Predictions would not do: they also move as the rig is learnt."""

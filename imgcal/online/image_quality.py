@@ -17,6 +17,7 @@ from imgcal.online.rig_state import RigState
 
 Array = NDArray[np.float64]
 
+# Blocks of snapshots, which are averaged.
 BLOCK_SECONDS = 1.0
 """Duration of a block, whose snapshots are averaged."""
 INTERVAL = 0.06
@@ -28,11 +29,15 @@ LONGEST_BLOCK = 60.0
 CORRELATION_SECONDS = 4.0
 """Time constant of what place and distance do not explain: arms in front, motion blur, the object's attitude. On the
 ten-camera stream the autocorrelation at one second is below 0.3 for nine cameras and 0.6 for the tenth."""
+
+# What place and distance explain.
 TERM_CENTRES = (-2 / 3, 0.0, 2 / 3)
 """Centres of the local terms across and down the image, relative to its centre, in half image sizes ..."""
 TERM_WIDTH = 0.5
 """... and the standard deviation of each."""
 FEATURES = 1 + len(TERM_CENTRES) ** 2 + 2 + 3  # constant, local terms, log distance and its square, direction
+
+# What is known beforehand, and how it is learnt.
 LEAST_SPREAD = np.array((0.03, 0.15, 0.1))
 """Minimum standard deviations of a block: size (3 %), sigma (15 %), share missing (0.1, on the real stream)."""
 PRIOR = np.array(((10.0, 0.1, 0.3, 0.1), (10.0, 0.5, 2.0, 0.5), (0.3, 0.2, 0.2, 0.2)))
@@ -46,6 +51,8 @@ LEARNT = 0.1
 tested; nothing is learnt there, so that slow changes are not absorbed."""
 SUSPICION = 0.3
 """Share of the alarm threshold above which nothing is learnt: it may be the fault itself."""
+
+# The test.
 RUN_LENGTH = 1e7
 """Mean number of blocks between false alarms of a camera and measure, if blocks were normal: four months in view."""
 SUBTRACTED = 0.5
