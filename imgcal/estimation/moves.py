@@ -223,11 +223,10 @@ class Change:
         return kind, length, float(direction @ (alone * scale * scale[:, None]) @ direction) ** 0.5
 
 
-def longest_episodes(problem: Problem, state: State) -> list[int]:
-    """Longest transient error of each of C cameras, in successive snapshots; 0 = errors are not correlated."""
+def longest_episode(problem: Problem, state: State, camera: int) -> int:
+    """Longest transient error of a camera, in successive snapshots; 0 = errors are not correlated."""
     cameras = problem.uv.shape[2]
-    places = Places(problem, state, tuple(range(cameras)), (0,) * cameras)
-    return [places.episode(camera) for camera in range(cameras)]
+    return Places(problem, state, tuple(range(cameras)), (0,) * cameras).episode(camera)
 
 
 def find_moves(
