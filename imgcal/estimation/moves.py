@@ -47,6 +47,8 @@ LEAST_SIGMAS = 5.0
 """Smallest size in standard deviations, given the dispersion, of the kind of values that explains a step best."""
 MOST_UNEXPLAINED = 0.5
 """Largest share of a camera's misfit that may remain after it is given several places."""
+MOST_MISFIT = 4.0
+"""Largest cost of a label in the middle snapshot of a new place, in multiples of what noise alone would leave."""
 LEAST_LEAD = 0.8
 """Relative to the best camera's statistic: another one that reaches this may be the one that moved."""
 
@@ -125,6 +127,11 @@ class Places:
         """Cost of each snapshot's labels if their camera were at one of its places: (S,) half chi-squared."""
         loss, _ = huber(self._squared_residuals(place, self.camera_places(self.camera[place])), CLIP)
         return 0.5 * loss.sum(-1).numpy()
+
+    def cost_per_label(self, place: int) -> float:
+        """Median, over a place's snapshots, of the mean cost of a label; noise alone leaves one."""
+        labels = (self.problem.root_weight[0][:, place] > 0).sum(-1).numpy()
+        return float(np.median((self.costs(place) / np.maximum(labels, 1))[labels > 0]))
 
     def misfit(self, camera: int) -> float:
         """Chi-squared of a camera's labels, each clipped, in excess of the noise."""
@@ -265,6 +272,7 @@ def find_moves(
                 and divided.shift(step.camera, new) >= LEAST_MOVE * left**0.5
                 and (change := divided.change(step.camera, new, left)).is_physical
                 and change.is_certain
+                and divided.cost_per_label(new) <= MOST_MISFIT * left
                 and _outlasts_an_episode(places, divided, step.camera, least_significant(candidates, ERROR), left)
             ):
                 doubts[new] = _doubts(places, step)
