@@ -35,7 +35,7 @@ from imgcal.estimation.robust_losses import NamedLoss, huber
 from imgcal.types import PARAMETER_KINDS, Kind, MovedCamera
 
 # When a camera has moved.
-FALSE_MOVE_PROBABILITY = 1e-5
+FALSE_ALARM = 1e-5
 """Probability of naming a camera in a capture in which none has moved, if the noise is as stated."""
 LEAST_MOVE = 0.15
 """Pixels, in the image of the camera: smaller moves do no harm, and slow drifts of every rig reach them. Multiplied by
@@ -48,6 +48,8 @@ LEAST_SIGMAS = 5.0
 """Smallest size in standard deviations, given the dispersion, of the kind of values that explains a step best."""
 MOST_UNEXPLAINED = 0.5
 """Largest share of a camera's misfit that may remain after it is given several places."""
+MOST_MISFIT = 4.0
+"""Largest cost of a label in the middle snapshot of a new place, in multiples of what noise alone would leave."""
 LEAST_LEAD = 0.8
 """Relative to the best camera's statistic: another one that reaches this may be the one that moved."""
 
@@ -127,6 +129,11 @@ class Places:
         """Cost of each snapshot's labels if their camera were at one of its places: (S,) half chi-squared."""
         loss, _ = huber(self._squared_residuals(place, self.camera_places(self.camera[place])), CLIP)
         return 0.5 * loss.sum(-1).numpy()
+
+    def cost_per_label(self, place: int) -> float:
+        """Median, over a place's snapshots, of the mean cost of a label; noise alone leaves one."""
+        labels = (self.problem.root_weight[0][:, place] > 0).sum(-1).numpy()
+        return float(np.median((self.costs(place) / np.maximum(labels, 1))[labels > 0]))
 
     def misfit(self, camera: int) -> float:
         """Chi-squared of a camera's labels, each clipped, in excess of the noise."""
@@ -225,11 +232,10 @@ class Change:
         return kind, length, float(direction @ (alone * scale * scale[:, None]) @ direction) ** 0.5
 
 
-def longest_episodes(problem: Problem, state: State) -> list[int]:
-    """Longest transient error of each of C cameras, in successive snapshots; 0 = errors are not correlated."""
+def longest_episode(problem: Problem, state: State, camera: int) -> int:
+    """Longest transient error of a camera, in successive snapshots; 0 = errors are not correlated."""
     cameras = problem.uv.shape[2]
-    places = Places(problem, state, tuple(range(cameras)), (0,) * cameras)
-    return [places.episode(camera) for camera in range(cameras)]
+    return Places(problem, state, tuple(range(cameras)), (0,) * cameras).episode(camera)
 
 
 def find_moves(
@@ -255,7 +261,7 @@ def find_moves(
     for _ in range(3 * cameras):
         seen = places.seen & ~np.isin(places.camera, list(left_out))
         candidates = int(places.seen.sum())
-        step = likeliest_step(places.blocks, seen, least_significant(candidates, FALSE_MOVE_PROBABILITY))
+        step = likeliest_step(places.blocks, seen, least_significant(candidates, FALSE_ALARM))
         if step is None:
             break
         divided = _locate(places, step, options)
@@ -264,13 +270,12 @@ def find_moves(
             left = dispersion(divided.blocks, divided.seen)
             new = len(divided.camera) - 1
             if (
-                is_significant(step.statistic / left, candidates, FALSE_MOVE_PROBABILITY)
+                is_significant(step.statistic / left, candidates, FALSE_ALARM)
                 and divided.shift(step.camera, new) >= LEAST_MOVE * left**0.5
                 and (change := divided.change(step.camera, new, left)).is_physical
                 and change.is_certain
-                and _outlasts_an_episode(
-                    places, divided, step.camera, least_significant(candidates, FALSE_MOVE_PROBABILITY), left
-                )
+                and divided.cost_per_label(new) <= MOST_MISFIT * left
+                and _outlasts_an_episode(places, divided, step.camera, least_significant(candidates, FALSE_ALARM), left)
             ):
                 doubts[new] = _doubts(places, step)
                 places, noise = divided, left

@@ -181,6 +181,16 @@ def test_an_error_of_the_last_snapshots_is_a_doubt_and_no_motion():
     assert [doubt.camera for doubt in result.doubtful] == ["cam04"]
 
 
+@pytest.mark.parametrize("count", [2, 3])
+@pytest.mark.parametrize("kind", MAKE)
+def test_labels_at_the_end_that_no_place_of_the_camera_explains_are_no_motion(kind, count):
+    rig, obj, truth = MAKE[kind](40, 1)
+    table, draw = damage.blobs(truth, 1, labelled=True), np.random.default_rng(1)
+    wrong = (table.camera == CAMERA) & (table.snapshot >= 40 - count) & (table.fiducial >= 0)
+    table.uv[wrong] -= np.array([1.8, 0.9]) * (1 + 0.5 * draw.standard_normal((wrong.sum(), 1)))  # one way, uneven
+    assert list_moves(associate(table, rig, obj), rig, obj, PipelineOptions()) == ()
+
+
 @pytest.mark.parametrize("seed", [94, 100, 145])  # named with a size, twice, and without one
 def test_markers_that_merge_are_no_motion(seed):
     made, _ = merging_wands.capture(seed)
