@@ -1,6 +1,5 @@
 from . import levenberg_marquardt_cpu
 from .accuracy import MAP_DEPTHS, MAP_SIZE, PredictedError, WorkingVolume, predicted_error
-from .block_scatter import BlockScatter, block_scatter
 from .change_points import CLIP, LEAST_SNAPSHOTS
 from .correlation import autocorrelation, correlation_time
 from .covariance import (
@@ -56,6 +55,7 @@ from .rig_from_points import PointStart, cold_start_from_points, move_to_pair_fr
 from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens, robust_std, single_camera_poses
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion, uncertainty_over
 from .robust_losses import squared
+from .snapshot_scatter import BlockScatter, block_scatter
 from .variance_components import BENT, ObjectQuestion, Start, estimate_variance_components
 
 __all__ = [
