@@ -45,7 +45,7 @@ PARAMETER_KINDS = {
     "principal_point": slice(8, 10),
     "distortion": slice(10, None),
 }
-"""Position of each kind of value, named as in a rig file's `prior`, among the parameters of a camera."""
+"""Where each kind of value, named as in a rig file's `prior`, is among the parameters of a camera."""
 
 
 def parameter_names(lens_models: Sequence[str], width: int | None = None) -> tuple[str, ...]:
@@ -363,7 +363,7 @@ class CameraRig:
 
     @classmethod
     def combine(cls, rigs: Sequence[CameraRig], join: Join) -> CameraRig:
-        """Combine several into one; `join` takes the list of focal lengths, and so on. The rest is the first one's."""
+        """Combine several into one; `join` takes the list of focal lengths, and so on. The rest is from the first."""
         return replace(
             rigs[0],
             focal_length=join([rig.focal_length for rig in rigs]),
