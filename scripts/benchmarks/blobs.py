@@ -1,4 +1,4 @@
-"""Blob centres: imgcal beside other finders, and beside what the noise allows."""
+"""Blob centres: imgcal compared with other finders and with the Cramér-Rao bound."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from scripts.timing import side_by_side
 from tests.imgcal.detection.discs import nearest
 
 OURS = "imgcal"
-GATE = 1.0  # px, a centre that is farther from the truth is false
+GATE = 1.0  # px; a centre farther from the truth is false
 EQUAL = 2.0  # standard errors
 PACKAGES = ("opencv-contrib-python-headless", "scikit-image", "photutils", "trackpy")
 
 
 def measure(effort: Effort) -> dict[str, Any]:
-    """Run every finder over the same frames of every cell, then time them on one frame."""
+    """Run every finder on the same frames of every cell, then time them on one frame."""
     cv2.setNumThreads(1)
     shape, frames = effort.pick((480, 640), (120, 160)), effort.pick(4, 1)
     cells = effort.pick(CELLS, CELLS[:1] + CELLS[-1:])
@@ -44,7 +44,7 @@ def measure(effort: Effort) -> dict[str, Any]:
 
 
 def accuracy(cell: Cell, shape: tuple[int, int], frames: int, seed: int) -> dict[str, Any]:
-    """Recall, false blobs and errors of each finder in one cell, and who is nearest to imgcal."""
+    """Recall, false blobs and errors of each finder in one cell, and the best peer."""
     rng = np.random.default_rng(seed)
     views = [view(cell, shape, rng) for _ in range(frames)]
     errors = {}
@@ -60,7 +60,7 @@ def accuracy(cell: Cell, shape: tuple[int, int], frames: int, seed: int) -> dict
 
 
 def errors_of(found: Iterable[NDArray[np.float64]], views: Sequence[View]) -> tuple[NDArray[np.float64], int]:
-    """Errors (M, 2) px of all true centres, NaN where none was found; and the number of false ones."""
+    """Errors (M, 2) px of all true centres, NaN for missed ones; and the number of false centres."""
     errors, false = [], 0
     for centres, one in zip(found, views, strict=True):
         rows, distance = nearest(centres, one.uv)
@@ -73,7 +73,7 @@ def errors_of(found: Iterable[NDArray[np.float64]], views: Sequence[View]) -> tu
 
 
 def score(errors: NDArray[np.float64], uv: NDArray[np.float64]) -> dict[str, float]:
-    """Recall; RMS of each axis and its standard error; largest mean of an axis; amplitude over the phase in a pixel."""
+    """Recall; RMS per axis and its standard error; largest mean of an axis; amplitude over the subpixel phase."""
     hit = np.isfinite(errors).all(1)
     if hit.sum() < 3:
         return {"recall": float(hit.mean())}
@@ -90,9 +90,9 @@ def score(errors: NDArray[np.float64], uv: NDArray[np.float64]) -> dict[str, flo
 
 
 def best_peer(errors: Mapping[str, NDArray[np.float64]]) -> dict[str, Any]:
-    """The most exact peer of those that find nearly everything, and how imgcal compares on the discs that both found.
+    """Find the most accurate peer that finds nearly everything, and compare it with imgcal on discs that both found.
 
-    `gap` is the difference of the mean squared errors, peer minus imgcal, in its standard errors.
+    `gap` is the difference of the mean squared errors, peer minus imgcal, in units of its standard error.
     """
     ours = errors[OURS]
     rivals = {}
@@ -122,7 +122,7 @@ def times(effort: Effort) -> dict[str, dict[str, float]]:
 
 
 def rig_times(effort: Effort) -> dict[str, Any]:
-    """Time ten frames in memory to blobs with one and two threads; OpenCV's components of the same for reference."""
+    """Time blob detection in ten frames in memory with one and two threads; OpenCV's components for reference."""
     shape, sample = effort.pick((1088, 2048), (240, 320)), open_capture(data_path("samples", "O10"))
     drawn = rig_frames(shape)
     scenes: dict[str, Mapping[str, Frame | None]] = {
@@ -148,7 +148,7 @@ def rig_times(effort: Effort) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, str]:
-    """Errors, findings and biases of every cell, and times."""
+    """Make the tables of errors, recall and bias of every cell, and of times."""
     names = list(FINDERS)
     cells = result["cells"]
     return {
@@ -227,7 +227,7 @@ SHOWN = {
 
 
 def draw(result: Mapping[str, Any], path: Path) -> None:
-    """Draw errors over the limit, a row for each cell."""
+    """Draw errors relative to the bound, one row per cell."""
     cells = result["cells"]
     with figure(path, size=(8.0, 0.6 + 0.28 * max(len(cells), 6))) as (axes,):
         for name, colour in SHOWN.items():
