@@ -83,7 +83,7 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
         parts |= {f"{name}, {kind.replace('_', ' ')}": part for kind, part in group.get("by_kind", {}).items()}
         rows += [[label, *_cells(part)] for label, part in parts.items() if "bumps" in part]
     head = [
-        "bumps", "number", "found within 1 s", "median delay", "others blamed", "right kind", "kind not told",
+        "bumps", "number", "found within 1 s", "median delay", "other cameras blamed", "right kind", "kind undecided",
         "time within 3 snapshots",
     ]  # fmt: skip
     return {

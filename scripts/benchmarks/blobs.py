@@ -158,7 +158,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
             [[cell["cell"], f"{cell['bound']:.4f}", *_row(cell, names, _rms)] for cell in cells],
         ),
         "blobs finding": markdown(
-            ["recall % / false a frame", *names], [[cell["cell"], *_row(cell, names, _found)] for cell in cells]
+            ["recall % / false per frame", *names], [[cell["cell"], *_row(cell, names, _found)] for cell in cells]
         ),
         "blobs bias": markdown(
             ["bias / phase (px)", *names], [[cell["cell"], *_row(cell, names, _bias)] for cell in cells]
@@ -178,7 +178,7 @@ def _best(cells: Sequence[Mapping[str, Any]]) -> str:
             verdict = "equal" if abs(peer["gap"]) < EQUAL else "ahead" if peer["gap"] > 0 else "**behind**"
             row += [peer["name"], f"{peer['ratio']:.2f}", verdict]
         rows.append(row)
-    head = ["", "limit (px)", "imgcal RMS (px)", "over limit", "best peer", "its RMS over imgcal's", "imgcal is"]
+    head = ["", "limit (px)", "imgcal RMS (px)", "RMS / limit", "best peer", "its RMS / imgcal's", "imgcal is"]
     return markdown(head, rows)
 
 
@@ -212,7 +212,7 @@ def _time(taken: Mapping[str, Mapping[str, float]]) -> str:
         one = taken[name]
         ratio = one["p50"] / taken[OURS]["p50"]
         rows.append([name, f"{one['p50']:.2f}", f"{one['p99']:.2f}", f"{ratio:,.1f}", str(one["blobs"])])
-    return markdown(["", "ms p50", "p99", "times imgcal's", "found (of 10)"], rows)
+    return markdown(["", "ms p50", "p99", "relative to imgcal", "found (of 10)"], rows)
 
 
 def _rig(taken: Mapping[str, Any]) -> str:
@@ -242,5 +242,5 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
         axes.set_xscale("log")
         axes.set_yticks(range(len(cells)), [cell["cell"] for cell in cells], fontsize=8)
         axes.invert_yaxis()
-        axes.set_xlabel("RMS error over the Cramer-Rao bound")
+        axes.set_xlabel("RMS error over the Cramér-Rao bound")
         axes.legend(fontsize=8)

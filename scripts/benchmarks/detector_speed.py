@@ -165,7 +165,7 @@ def table(result: Mapping[str, Any]) -> str:
         for level, said in levels.items()
         for name, row in said.items()
     ]
-    return markdown(["ms of CPU / by the clock; threads", *COLUMNS], rows)
+    return markdown(["ms CPU / wall; threads", *COLUMNS], rows)
 
 
 def _cell(taken: Mapping[str, float] | None) -> str:

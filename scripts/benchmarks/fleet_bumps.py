@@ -125,9 +125,9 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
         share = 100 * one["found"] / one["draws"]
         return [first, f"{one['sigmas']:.1f}", f"{share:.1f} %", f"{100 * one['bound']:.1f} %", str(one["wrong"])]
 
-    head = ["standard deviations of what can be seen (median)", "found", "most powerful test, told where to look",
-            "others named"]  # fmt: skip
-    visible = [row(one, f"{one['size']:g} of what can be seen, any kind") for one in result["visible"]]
+    head = ["observable size, sigmas (median)", "found", "most powerful test, camera and direction known",
+            "other cameras named"]  # fmt: skip
+    visible = [row(one, f"{one['size']:g} observable sigmas, any kind") for one in result["visible"]]
     spreads = [row(one, f"{one['size']:g} spreads of rotation") for one in result["spreads"]]
     steady = f"Without a bump: {result['false']} of {result['steady_cameras']:,} cameras named."
     return {"bumps seen": markdown(["bump", *head], [*visible, *spreads]) + f"\n\n{steady}"}

@@ -172,7 +172,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
     return {
         "spreads": markdown(["kind", "true", "learnt", "off by"], spreads),
         "bumps": markdown(["camera turned by", "found"], found),
-        "priors": markdown(["prior", "RMS error, measured, over that with the true prior", "by the bound"], errors),
+        "priors": markdown(["prior", "RMS error / error with the true prior", "predicted by the bound"], errors),
     }
 
 

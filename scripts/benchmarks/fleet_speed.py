@@ -335,7 +335,7 @@ def _plan(result: dict[str, Any]) -> str:
     seconds = {kind: row["work"] * (1 + max(row["percent"], 0.0) / 100) for kind, row in result.items()}
     cores = ", ".join(f"{PLANNED / 86_400 * value / USE:.2g} for {kind}" for kind, value in seconds.items())
     rate = PLANNED / 86_400
-    return f"A million captures a day are {rate:.1f} a second. Cores that they need, {100 * USE:.0f} % busy: {cores}."
+    return f"A million captures per day are {rate:.1f} per second. Cores needed at {100 * USE:.0f} % load: {cores}."
 
 
 def _overhead(result: dict[str, Any]) -> str:
@@ -346,10 +346,10 @@ def _overhead(result: dict[str, Any]) -> str:
     ]  # fmt: skip
     head = [
         "capture", "captures", "plain loop, CPU ms", "work in a worker, CPU ms", "driver, CPU ms",
-        "engine adds to the work", "to the plain loop", "target",
+        "engine overhead on the work", "on the plain loop", "target",
     ]  # fmt: skip
     idle = 1e3 * max(row["idle_per_s"] for row in result.values())
-    return f"{markdown(head, rows)}\n\nWork or no work, Ray takes {idle:.0f} CPU ms of every second on a machine."
+    return f"{markdown(head, rows)}\n\nEven when idle, Ray takes {idle:.0f} CPU ms per second on a machine."
 
 
 def _rates(result: dict[str, Any]) -> str:
@@ -357,7 +357,7 @@ def _rates(result: dict[str, Any]) -> str:
         [who, f"{row['rate']:.2g}", f"{1e3 * row['cpu_seconds']:.3g}", f"{row['load']:.0f}"]
         for who, row in result.items()
     ]
-    return markdown(["who", "captures a second", "CPU ms a capture", "load average"], rows)
+    return markdown(["engine", "captures per second", "CPU ms per capture", "load average"], rows)
 
 
 def _bytes(result: dict[str, Any]) -> str:
@@ -365,21 +365,21 @@ def _bytes(result: dict[str, Any]) -> str:
         [kind, *(f"{row[name] / 1e3:.3g}" for name in ("read", "to_worker", "from_worker", "stored"))]
         for kind, row in result.items()
     ]
-    return markdown(["kB a capture", "read", "to a worker", "back", "kept (Parquet)"], rows)
+    return markdown(["kB per capture", "read", "to a worker", "back", "kept (Parquet)"], rows)
 
 
 def _memory(result: dict[str, Any]) -> str:
     curve = result["curve_mb"]
     shown = [*curve[: -1 : max(1, len(curve) // 6)], curve[-1]]
     cells = ["driver, MB", *(f"{mb:.0f}" for _, mb in shown)]
-    told = f"{result['driver_cpu_us']:.0f} CPU microseconds of the driver a row."
+    told = f"{result['driver_cpu_us']:.0f} CPU microseconds of the driver per row."
     return f"{markdown(['rows done', *(f'{rows:,}' for rows, _ in shown)], [cells])}\n\n{told}"
 
 
 def _death(result: dict[str, Any]) -> str:
     return (
-        f"{result['lost_node_seconds']:.1f} node seconds, with batches of {result['batch_seconds']:g} s; every one of "
-        f"{result['done']} results came, once."
+        f"{result['lost_node_seconds']:.1f} node seconds, with batches of {result['batch_seconds']:g} s; all "
+        f"{result['done']} results arrived exactly once."
     )
 
 

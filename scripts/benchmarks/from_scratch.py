@@ -205,8 +205,8 @@ def tables(result: Mapping[str, Any]) -> str:
         "wrong",
         "refused or gave up",
         "error, mm",
-        "in parts of the factory's",
-        "the same, 95 %",
+        "error / with factory",
+        "the same, 95 % quantile",
         "s",
     ]
     rows = []

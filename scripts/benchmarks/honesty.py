@@ -277,13 +277,13 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
     return {
         "honesty wand": markdown(
             [
-                "one fiducial of the wand off by",
+                "displacement of one fiducial",
                 "captures",
                 "named",
                 "within 3 sigma",
                 "refused",
                 "error / known object",
-                "the same, told which fiducial",
+                "the same, fiducial known",
             ],
             wands,
         ),

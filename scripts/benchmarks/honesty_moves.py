@@ -138,7 +138,7 @@ def _counted(found: list[str]) -> dict[str, int]:
 def steady_table(result: Mapping[str, Any]) -> str:
     """Markdown."""
     return markdown(
-        ["steady captures", "number", "a camera said to have moved"],
+        ["steady captures", "number", "camera reported as moved"],
         [[name, str(row["captures"]), str(row["alarms"])] for name, row in result["steady"].items()],
     )
 
@@ -146,7 +146,7 @@ def steady_table(result: Mapping[str, Any]) -> str:
 def faults_table(result: Mapping[str, Any], part: str) -> str:
     """Markdown."""
     rows = [[name, *(str(row[key]) for key in ("found", "refused", "accepted"))] for name, row in result[part].items()]
-    return markdown(["capture", "named rightly", "refused otherwise", "accepted"], rows)
+    return markdown(["capture", "identified", "refused for another reason", "accepted"], rows)
 
 
 @dataclass(frozen=True)

@@ -175,7 +175,9 @@ def table(result: dict[str, Any]) -> str:
         difference = f"{row['largest_difference']:.1e} {row['unit'] if row['unit'] != '1' else ''}".strip()
         rows.append([row["work"], f"`{row['kornia']}`", difference, *times, hard])
     head = ("ours, ms", "kornia, ms", "ours with gradient, ms", "kornia with gradient, ms")
-    return markdown(("work", "kornia", "largest difference", *head, "gradient where it is hard: ours, kornia"), rows)
+    return markdown(
+        ("work", "kornia", "largest difference", *head, "gradient at the singular input: ours, kornia"), rows
+    )
 
 
 def _finite(run: Run, inputs: tuple[Tensor, ...]) -> bool:

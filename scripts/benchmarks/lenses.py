@@ -117,7 +117,7 @@ def table(result: dict[str, Any]) -> str:
         ]
         for row in result["rows"]
     ]
-    return markdown(("lens", "parameters", "converged", "joint NEES", "of the lens's coefficients alone"), rows)
+    return markdown(("lens", "parameters", "converged", "joint NEES", "NEES of the lens coefficients"), rows)
 
 
 @dataclass(frozen=True)

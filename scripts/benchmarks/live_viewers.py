@@ -106,7 +106,7 @@ def measure(options: Options) -> dict[str, Any]:
 def table(result: Mapping[str, Any]) -> str:
     """Make the table, as Markdown."""
     keys = ("p50_ms", "p95_ms", "p99_ms", "cpu_p50_ms", "cpu_p99_ms")
-    names = {"nobody": "nobody looks", "viewers": f"{result['viewers']} viewers, and one that never reads"}
+    names = {"nobody": "no viewers", "viewers": f"{result['viewers']} viewers, and one that never reads"}
     rows = [[names[name], *(f"{row[key]:.2f}" for key in keys)] for name, row in result["rows"].items()]
     return markdown(["update and publication, ms", "p50", "p95", "p99", "CPU p50", "CPU p99"], rows)
 

@@ -68,7 +68,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
     trained = [(name, str(row["batch_size"]), f"{row['rigs_per_s']:.0f}") for name, row in result["training"].items()]
     return {
         LATENCY: markdown(head, rows),
-        TRAINING: markdown(("shipped encoder", "rigs a step", "rigs/s of training"), trained),
+        TRAINING: markdown(("shipped encoder", "rigs per step", "rigs/s of training"), trained),
     }
 
 

@@ -150,7 +150,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
     for kind, marker, unit in (("camera", "projection camera", "points"), ("rigs", "projection rigs", "rigs")):
         shapes = [shape for shape in result["shapes"] if shape["kind"] == kind]
         rows = [[name, *(_cell(shape, name) for shape in shapes), _worst(shapes, name)] for name in names]
-        head = ("ns a point, p50", *(f"{shape['count']:,} {unit}" for shape in shapes), "largest difference, px")
+        head = ("ns per point, p50", *(f"{shape['count']:,} {unit}" for shape in shapes), "largest difference, px")
         made[marker] = markdown(head, rows)
     shapes = result["derivatives"]
     labels = [f"{s['count']:,} points" if s["kind"] == "camera" else f"{s['count']:,} rigs" for s in shapes]
@@ -158,7 +158,9 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
         [name, what, *(_cell(shape, name) for shape in shapes), _worst(shapes, name, "{:.0e}")]
         for name, what in COMPUTES.items()
     ]
-    made["projection derivatives"] = markdown(("ns a point, p50", "what", *labels, "largest relative difference"), rows)
+    made["projection derivatives"] = markdown(
+        ("ns per point, p50", "result", *labels, "largest relative difference"), rows
+    )
     rows = [
         [row["name"], *(f"{1e3 * row['rigs'] / row['times'][n]['p50']:,.0f}" for n in row["times"])]
         for row in result["synthesis"]["rows"]

@@ -252,8 +252,16 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
         for row in result["bumps"]
     ]  # fmt: skip
     head = ["every", "false events", "which", "losses (reported twice)", "final px", "to calibration", "worst to start",
-            "ms a frame"]  # fmt: skip
-    turn = ["every", "degrees", "in time", "and right", "others blamed", "seen for, s (median)", "false before"]
+            "ms per frame"]  # fmt: skip
+    turn = [
+        "every",
+        "degrees",
+        "in time",
+        "right kind",
+        "other cameras blamed",
+        "time in view, s (median)",
+        "false events before",
+    ]
     return {"real stream untouched": markdown(head, quiet), "real stream bumps": markdown(turn, turns)}
 
 

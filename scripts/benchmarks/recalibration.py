@@ -147,7 +147,7 @@ def _rows(size: Mapping[str, Any]) -> list[list[str]]:
         rows.append([*cells, str(row["failures"]), str(row["solved"])])
     start, limit = size["start"], size["bound"]
     rows.append(["the start pose that all but OpenCV get", f"{start['p50']:.3g}", f"{start['p99']:.3g}"])
-    rows.append(["Cramer-Rao bound", "", "", *(f"{limit[kind]:.3g}" for kind in KINDS), "", "1"])
+    rows.append(["Cramér-Rao bound", "", "", *(f"{limit[kind]:.3g}" for kind in KINDS), "", "1"])
     return rows
 
 

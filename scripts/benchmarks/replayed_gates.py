@@ -178,7 +178,7 @@ def compared() -> list[dict[str, Any]]:
 def tables(result: dict[str, Any]) -> dict[str, str]:
     """Make the tables, by name."""
     head = ["place", "snapshots", "false events", "in 8 hours", "NEES (median)", "beyond 3 sigma", "bumps in time",
-            "and right", "others blamed"]  # fmt: skip
+            "right kind", "other cameras blamed"]  # fmt: skip
     rows = [
         [
             place, f"{part['snapshots']:,}", str(part["false"]), _figure(part["false_in_8_hours"], ".0f"),

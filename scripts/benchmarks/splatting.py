@@ -125,7 +125,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
     frames = [[row["name"], f"{row['p50']:.3g}", f"{row['p99']:.3g}"] for row in result["infrared"]]
     return {
         "splatting": markdown((*head, "memory, MB", "largest difference"), rows),
-        "splatting rigs": markdown(("O10, 8 fiducials, 224 x 224", "ms a rig, p50", "best", "rigs/s"), rigs),
+        "splatting rigs": markdown(("O10, 8 fiducials, 224 x 224", "ms per rig, p50", "best", "rigs/s"), rigs),
         "infrared": markdown(("ten frames of 2048 x 1088, 8 markers", "ms p50", "p99"), frames),
     }
 

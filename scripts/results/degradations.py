@@ -115,8 +115,8 @@ def crowded(frame: Frame, times: float, look: Look, draw: np.random.Generator) -
 DEGRADATIONS = {
     "clean": Degradation(lambda frame, level, look, draw: frame.astype(np.float64), (0.0,), "as captured"),
     "blur": Degradation(blurred, (1.0, 2.0), "sigma of a Gaussian, in radii of a dot"),
-    "motion": Degradation(moved, (3.0, 6.0), "length of the path, in radii of a dot; a direction a frame"),
-    "dark": Degradation(darkened, (0.1, 0.04), f"share of the light; {ELECTRONS:g} electrons a grey level, "
+    "motion": Degradation(moved, (3.0, 6.0), "length of the path, in radii of a dot; a direction per frame"),
+    "dark": Degradation(darkened, (0.1, 0.04), f"share of the light; {ELECTRONS:g} electrons per grey level, "
                         f"read noise of {READ_NOISE:g}"),
     "noise": Degradation(noisy, (15.0, 40.0), "standard deviation, grey levels"),
     "drapes": Degradation(draped, (0.25, 0.5), "share of the image that dark and bright oblongs hide"),

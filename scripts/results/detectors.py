@@ -166,7 +166,7 @@ def write_page(results: Path) -> None:
     known = read_json(place)
     outcomes = sorted((Outcome(**row) for row in known["outcomes"]), key=_order)
     text = (
-        f"Rig {known['rig']}, object {known['object']}, {known['captures']} captures a difficulty of "
+        f"Rig {known['rig']}, object {known['object']}, {known['captures']} captures per difficulty with "
         f"{known['snapshots']} snapshots, drift of all 15 values of each camera."
     )
     texts = [text, *(f"{table.markdown()}".strip() for table in detector_tables(outcomes))]

@@ -277,8 +277,8 @@ def facts(model: Checkpoint) -> dict[str, Any]:
 def table(result: dict[str, Any]) -> str:
     """Make a table with one line per level and family: mean over seeds, and their range."""
     head = (
-        "level", "what", "seeds", "position, px", f"within {NEAR:g} px", "one pass", "last pass",
-        "refined on positions", "success", "rendered and compared", "success", "encoder shuffled",
+        "level", "method", "seeds", "position, px", f"within {NEAR:g} px", "one pass", "last pass",
+        "refined on positions", "success", "render and compare", "success", "encoder shuffled",
     )  # fmt: skip
     families: dict[str, list[str]] = {}
     for name, one in result["models"].items():
@@ -299,7 +299,7 @@ def _sizes(result: dict[str, Any], families: dict[str, list[str]]) -> str:
     for family, names in families.items():
         first = result["models"][names[0]]
         rows.append([family, f"{first['parameters'] / 1e6:.2f} M", f"{first['flops'] / 1e9:.2f}", str(len(names))])
-    return markdown(("encoder and heads", "parameters", "GFLOP an image", "seeds"), rows)
+    return markdown(("encoder and heads", "parameters", "GFLOP per image", "seeds"), rows)
 
 
 def _cells(seeds: Sequence[dict[str, float]]) -> list[str]:

@@ -122,7 +122,7 @@ def _summed_up(tried: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> str:
     """Make the table, as Markdown."""
-    head = ("drift", "labels exchanged", "snapshots", "calibrated / refused / wrong: none", "first guess", "guess used",
+    head = ("drift", "labels swapped", "snapshots", "calibrated / refused / wrong: none", "first guess", "guess used",
             "same rig (1 %)", "RE over the volume, px: none", "first guess", "ms: none", "first guess")  # fmt: skip
     rows = []
     for row in result["rows"]:

@@ -135,13 +135,13 @@ def table(result: dict[str, Any]) -> str:
     rows = []
     for name, row in result["formats"].items():
         read, write = row["read"], row["write"]
-        seen = f"{read['cameras']} in {read['files']}: {read['worst_px']:.1e}" if read["files"] else "no file at hand"
+        seen = f"{read['cameras']} in {read['files']}: {read['worst_px']:.1e}" if read["files"] else "no file available"
         if name == "caliscope-config":
             seen = "as `caliscope`"
         if write is None:
             rows.append((row["title"], f"`{name}`", seen, "only read", "–"))
             continue
-        tool = write["reader"] or ("not at hand" if name in READERS else "none on PyPI or Debian")
+        tool = write["reader"] or ("not available" if name in READERS else "none on PyPI or Debian")
         worst = f"{write['worst_px']:.1e}" if write["worst_px"] is not None else "–"
         rows.append((row["title"], f"`{name}`", seen, f"{write['own_reader_px']:.1e}", f"{tool}: {worst}"))
     head = (

@@ -72,7 +72,7 @@ def headline_tables(result: Mapping[str, Any]) -> str:
     head = ("RE mean (px)", *(place.name for place in PLACES), "ms, p50")
     paper = ["paper's network", *("" if place.paper is None else f"{place.paper:g}" for place in PLACES), ""]
     rows = [paper, *([_shown(name), *(_px(one[name]["mean"]) for one in places), _time(name, took)] for name in names)]
-    texts = [f"`{result['model']}`, one seed, exact points, {result['rigs']:,} rigs a column.", markdown(head, rows)]
+    texts = [f"`{result['model']}`, one seed, exact points, {result['rigs']:,} rigs per column.", markdown(head, rows)]
     for title, cell in (
         ("RE < 1 px / < 0.5 px, % of rigs", _success),
         ("RE on held-out points, median (px)", lambda one: _px(one["held_out"]["median"])),

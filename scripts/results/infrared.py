@@ -255,7 +255,7 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
             [name, *(f"{said[name]['1']['rms_px']:.2f} / {said[name]['1']['nees']:.2f}" for said in levels.values())]
             for name in names
         ]
-        return markdown(["RMS px of the right ones / NEES", *levels], rows)
+        return markdown(["RMS px of right positions / NEES", *levels], rows)
 
     harder = result["harder"]
     beyond = next(iter(harder.values()))
@@ -272,7 +272,7 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
             [[level, *(cell(row) for said in by.values() for row in said.values())] for level, by in harder.items()],
         ),
         "infrared lost": markdown(
-            ["snapshots", "refused", "accepted", "labels more than 20 px off in these"],
+            ["snapshots", "refused", "accepted", "labels more than 20 px off in accepted snapshots"],
             [
                 [name, str(said["refused"]), str(said["accepted"]), str(said["wrong labels"])]
                 for name, said in result["lost"].items()

@@ -187,7 +187,7 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
         ]
         frames.append([level, *cells])
     names = list(next(iter(result["frames"].values())))
-    head = ["encoder", "weights", "operations a crop", "seeds", "right, % of visible", "wrong, % of claimed", "NEES"]
+    head = ["encoder", "weights", "operations per crop", "seeds", "right, % of visible", "wrong, % of claimed", "NEES"]
     return {
         "infrared families": markdown(head, crops),
         "infrared families frames": markdown(["right % of visible / wrong % of claimed", *names], frames),
@@ -215,7 +215,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
                           textcoords="offset points")  # fmt: skip
         learning.set(xlabel="crops seen in training", ylabel="missed + wrong (%)")
         learning.legend(fontsize=7)
-        cost.set(xlabel="operations a crop (M)", ylabel="missed + wrong (%)", xlim=(0, 420))
+        cost.set(xlabel="operations per crop (M)", ylabel="missed + wrong (%)", xlim=(0, 420))
         hard.set(ylabel="right (%), whole frames")
         short = [level if level in DIFFICULTIES else f"{level.partition(',')[0]} +" for level in frames]
         hard.set_xticks(range(len(frames)), short, rotation=60, ha="right", fontsize=6)

@@ -48,7 +48,7 @@ class Seen:
     row: NDArray[np.int64]  # (K,) index among the blobs
     uv: NDArray[np.float64]  # (K, 2) true centre
     share: NDArray[np.float64]  # (K,) visible share of the marker
-    bound: NDArray[np.float64]  # (K,) px, Cramer-Rao, one axis; nan where it is not defined
+    bound: NDArray[np.float64]  # (K,) px, Cramér-Rao, one axis; nan where it is not defined
     markers: int  # number of markers that could be found
 
 
@@ -252,18 +252,18 @@ def tables(result: dict[str, Any]) -> str:
     ]
     return "\n\n".join(
         (
-            f"RMS error of one axis in pixels, of usable blobs that show a marker; {result['snapshots']} snapshots of"
-            " O10 a level, markers of some 11 px radius. *Bound*: Cramer-Rao, who knows all but centre, brightness and"
-            " ground; whole markers only. *Alone*: the network's centre for every blob; *shuffled*: the same with the"
-            " encoder's features exchanged between blobs. Mean over training seeds"
+            f"RMS error per axis in pixels, of usable blobs that show a marker; {result['snapshots']} snapshots of O10"
+            " per level, markers of about 11 px radius. *Bound*: Cramér-Rao, with only centre, brightness and"
+            " background unknown; whole markers only. *Alone*: the network's centre for every blob; *shuffled*: the"
+            " same with the encoder's features swapped between blobs. Mean over training seeds"
             f" ({', '.join(f'{family}: {len(names)}' for family, names in families.items())}), lowest to highest.",
             markdown(head, errors),
-            "Median distance in pixels:",
+            "Median error in pixels:",
             markdown(("level", "ellipse", *families), medians),
-            f"What {networks[0]} says of itself: NEES (1 = sigmas are right; median and, alone, mean), shares of"
-            " markers and of other blobs that end up flagged, and what it took the markers for.",
+            f"Self-assessment of {networks[0]}: NEES (1 = correct sigmas; median and, alone, mean), shares of markers"
+            " and of other blobs that are flagged, and its classification of the markers.",
             markdown(("level", "NEES, median", "NEES, alone", "flagged markers", "flagged others", "kinds"), kinds),
-            markdown(("family", "weights", "operations a patch"), sizes_of),
+            markdown(("family", "weights", "operations per patch"), sizes_of),
         )
     )
 

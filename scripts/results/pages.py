@@ -33,7 +33,7 @@ def accuracy_table(experiments: Sequence[RigExperiment], results: Results) -> st
     """Table 1, our networks: the columns comparable with the paper first, then steps from the factory."""
     stages = {ONE_PASS: "one pass", NETWORK: "all passes", REFINED: "refined", FACTORY: FACTORY}
     stages |= {name: name.replace(" from the factory", "") for name in STEPS}
-    head = ("row", "what", "paper's RE", *stages.values(), "RE < 1 px, one pass / all", "encoder", "seeds")
+    head = ("row", "experiment", "paper's RE", *stages.values(), "RE < 1 px, one pass / all", "encoder", "seeds")
 
     def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
         row = [str(row_of(experiment)), _what(experiment, runs), _paper(experiment)]
@@ -46,7 +46,7 @@ def accuracy_table(experiments: Sequence[RigExperiment], results: Results) -> st
 def parameters_table(experiments: Sequence[RigExperiment], results: Results) -> str:
     """Table 1, quantities that RE does not show: factory / one pass / all passes / MAP."""
     stages = (FACTORY, ONE_PASS, NETWORK, WITHOUT)
-    head = ("row", "what", *PARAMETERS.values(), "RE on held-out points, median (px)")
+    head = ("row", "experiment", *PARAMETERS.values(), "RE on held-out points, median (px)")
 
     def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
         row = [str(row_of(experiment)), _what(experiment, runs)]
@@ -59,7 +59,7 @@ def parameters_table(experiments: Sequence[RigExperiment], results: Results) -> 
 
 def background_table(experiments: Sequence[RigExperiment], results: Results) -> str:
     """Table 1, last part: noise, and the length of each training."""
-    head = ("row", "what", "0.1 px noise: alone", "refined", "refined / Cramer-Rao bound", "rigs", *TRAINING)
+    head = ("row", "experiment", "0.1 px noise: alone", "refined", "refined / Cramér-Rao bound", "rigs", *TRAINING)
 
     def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
         row = [str(row_of(experiment)), _what(experiment, runs)]
@@ -74,7 +74,7 @@ def paper_table(experiments: Sequence[RigExperiment], results: Results) -> str:
     """Trained networks of the paper's own design."""
     head = (
         "row",
-        "what",
+        "experiment",
         "paper's RE",
         "network alone",
         REFINED,
@@ -97,7 +97,7 @@ def paper_table(experiments: Sequence[RigExperiment], results: Results) -> str:
 
 def comparison_table(experiments: Sequence[RigExperiment], results: Results) -> str:
     """Effect of single design decisions, in equal training time from scratch."""
-    head = ("what", "network alone", "median", "seeds", "rigs", "parameters", *TRAINING)
+    head = ("experiment", "network alone", "median", "seeds", "rigs", "parameters", *TRAINING)
 
     def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
         row = [experiment.description.partition(":")[0], mean(runs, NETWORK), _px(_mean(runs, NETWORK, "median"))]

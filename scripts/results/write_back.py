@@ -356,8 +356,8 @@ def table(result: dict[str, Any]) -> str:
             markdown(head, rows),
             "",
             f"Damaged originals: {damaged['tried']} tried, {damaged['refused']} refused with one line and exit code 2, "
-            f"{damaged['sound_and_right']} still sound and written right, {damaged['lens_refused']} refused for the "
-            f"lens (exit code 3), {len(damaged['faults'])} faults. Nothing was written where one was refused.",
+            f"{damaged['sound_and_right']} still valid and written correctly, {damaged['lens_refused']} refused for "
+            f"the lens (exit code 3), {len(damaged['faults'])} faults. Nothing was written for refused ones.",
         )
     )
 
