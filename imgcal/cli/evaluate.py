@@ -74,16 +74,16 @@ class Compare(arguments.Compare):
         """
         unread: list[tuple[Setting | Compare | arguments.Captures, str]]
         if self.captured.captures:
-            how, meant = "with", "networks are compared on points"
+            how, meant = "with", "comparing networks on points"
             unread = [(self.setting, name) for name in vars(self.setting) if name not in OF_BOTH]
             unread.append((self, "baselines"))
         else:
-            how, meant = "without", "detectors are compared on captured frames"
+            how, meant = "without", "comparing detectors on captured frames"
             unread = [(self.captured, name) for name in vars(self.captured)]
         for options, name in unread:
             if getattr(options, name) != getattr(type(options), name):
                 option = name.replace("_", "-")
-                raise InputError(f"--{option}: found it {how} --captures, expected it where {meant}")
+                raise InputError(f"--{option}: cannot be used {how} --captures; it is for {meant}")
 
 
 def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path | None) -> None:
@@ -118,7 +118,7 @@ def _select_suited(methods: Mapping[str, Method], rig: CameraRig) -> dict[str, M
     suited = {name: method for name, method in methods.items() if method.knows(rig)}
     if left := [name for name in methods if name not in suited]:
         lenses = ", ".join(dict.fromkeys(rig.lens_models))
-        print(f"note: without {' and '.join(left)}: found {lenses} lenses, which they do not know", file=sys.stderr)
+        print(f"note: left out {' and '.join(left)}: no support for {lenses} lenses", file=sys.stderr)
     return suited
 
 
@@ -184,7 +184,7 @@ def _conditions(models: list[Model], setting: Setting) -> Conditions:
     if not 0 <= setting.level < len(LEVELS):
         raise InputError(f"--level: found {setting.level}, expected 0 to {len(LEVELS) - 1}")
     if not corruption.nothing:
-        raise InputError("--level: found --noise, --missing, --swapped or --false beside it, expected one of the two")
+        raise InputError("--level: cannot be used with --noise, --missing, --swapped or --false")
     return known.at_level(setting.level)
 
 
