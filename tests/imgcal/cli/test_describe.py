@@ -1,4 +1,4 @@
-"""What the report is told of a run that was refused."""
+"""Data for the report of a refused run."""
 
 import pytest
 import torch
