@@ -178,7 +178,7 @@ class CalibrationObject:
         lights = [replace(obj, unknown_markers=True) for obj in objects if obj.pose_rank == 3]
         objects = [obj for obj in objects if obj.pose_rank > 3] + lights
         if len(lights) > 1:
-            raise InputError("objects: found single or unknown markers twice, expected once: there may be any number")
+            raise InputError("objects: found single or unknown markers twice, expected once, for any number of them")
         names: list[str] = []
         for obj in objects:
             number = sum(other.name == obj.name for other in objects[: len(names)]) + 1
@@ -234,7 +234,7 @@ class CalibrationObject:
         if self.parts:
             raise InputError(f"objects: found {len(self.parts)}, expected a single one {use}")
         if self.unknown_markers:
-            found = "found markers of which nothing is known, expected the file of an object"
+            found = "found unknown markers, expected the file of an object"
             raise InputError(f"object {self.name}: {found} {use}")
         if self.pose_rank < 6:
             found = "one fiducial" if len(self.points) == 1 else f"{len(self.points)} fiducials on one line"
