@@ -220,9 +220,7 @@ def tables(result: Mapping[str, Any]) -> str:
     for name, row in result.get("captures", {}).items():
         said = row.get("reason") or row.get("held_out_rms_px") or f"{row['rms_px']:.2f} px"
         if isinstance(said, Mapping):
-            said = (
-                ", ".join(f"{method} {rms:.3f} px" for method, rms in said.items()) + " (RMS, held-out views)"
-            )
+            said = ", ".join(f"{method} {rms:.3f} px" for method, rms in said.items()) + " (RMS, held-out views)"
         lines.append(f"\n{name}: {row['outcome']}: {said}.")
     return "\n".join(lines)
 
