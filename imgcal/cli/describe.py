@@ -134,7 +134,7 @@ def _about_object(calibration: Calibration) -> str:
     if calibration.lost:
         which = ", ".join(map(str, calibration.lost))
         words.append(
-            f"Fiducial {which} was rarely found where the others were: missing, hidden, or not where the object file "
+            f"Fiducial {which} was hardly found where the others were: missing, hidden, or not where the object file "
             "has it."
         )
     return " ".join(words)

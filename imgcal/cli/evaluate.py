@@ -74,16 +74,16 @@ class Compare(arguments.Compare):
         """
         unread: list[tuple[Setting | Compare | arguments.Captures, str]]
         if self.captured.captures:
-            how, meant = "with", "comparing networks on points"
+            how, meant = "with", "networks are compared on points"
             unread = [(self.setting, name) for name in vars(self.setting) if name not in OF_BOTH]
             unread.append((self, "baselines"))
         else:
-            how, meant = "without", "comparing detectors on captured frames"
+            how, meant = "without", "detectors are compared on captured frames"
             unread = [(self.captured, name) for name in vars(self.captured)]
         for options, name in unread:
             if getattr(options, name) != getattr(type(options), name):
                 option = name.replace("_", "-")
-                raise InputError(f"--{option}: cannot be used {how} --captures; it is for {meant}")
+                raise InputError(f"--{option}: found it {how} --captures, expected it where {meant}")
 
 
 def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path | None) -> None:

@@ -45,7 +45,7 @@ PARAMETER_KINDS = {
     "principal_point": slice(8, 10),
     "distortion": slice(10, None),
 }
-"""Where each kind of value, named as in a rig file's `prior`, is among the parameters of a camera."""
+"""Position of each kind of value, named as in a rig file's `prior`, among the parameters of a camera."""
 
 
 def parameter_names(lens_models: Sequence[str], width: int | None = None) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Data for the report of a refused run."""
+"""What the report is told of a run that was refused."""
 
 import pytest
 import torch
