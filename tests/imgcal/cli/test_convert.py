@@ -98,7 +98,7 @@ def test_the_source_survives(camchain: Path, tmp_path: Path, capsys: pytest.Capt
     before = camchain.read_bytes()
     code, _, error = run(capsys, camchain, "--to", "kalibr", "--out", camchain)
     assert code == 2
-    assert "is what SOURCE holds" in error
+    assert "would overwrite SOURCE" in error
     assert camchain.read_bytes() == before
     code, _, error = run(capsys, camchain, "--to", "mrcal", "--out", camchain)
     assert code == 2

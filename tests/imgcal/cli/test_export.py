@@ -20,7 +20,7 @@ def test_a_shipped_network_is_written_and_described(export, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("more", "out", "said"),
     [
-        ((), "x.pt2", "expected a file .onnx"),
+        ((), "x.pt2", "expected a name that ends in .onnx"),
         (("--count", "0"), "x.onnx", "--count: found 0"),
         (("--fiducials", "5000"), "x.onnx", "--fiducials: found 5000"),
     ],
