@@ -22,7 +22,6 @@ from imgcal.association.assignment import spacing
 from imgcal.association.blobs import PatternPrior, gather, pattern_prior
 from imgcal.association.hypotheses import (
     Poses,
-    fiducial_triples,
     has_many_triples,
     likely_blobs,
 )
@@ -157,13 +156,17 @@ def relocalize(
     compared = compare_labellings(scene, options) if has_minimal_blobs(scene) else None
     if compared is not None and compared.accepted:
         return compared
-    likely = {camera: likely_blobs(scene.blobs, camera, has_many_triples(obj)) for camera in cameras.tolist()}
-    hopeful = {camera: rows for camera, rows in likely.items() if len(rows) <= MOST_FALSE * obj.num_fiducials}
+    most, outer = MOST_FALSE * obj.num_fiducials, has_many_triples(obj)
+    hopeful = [
+        camera
+        for camera in cameras.tolist()
+        if scene.blobs.count[camera] <= most or len(likely_blobs(scene.blobs, camera, outer)) <= most
+    ]
     if not hopeful or scene.blobs.uv[..., 0].size * obj.num_fiducials > MOST_PAIRS:
         return _refuse(scene, _too_many(scene))
     bounds = _bounds(scene, rig.working_distance or _guess_distance(scene), pose_known=False)
     generator = np.random.default_rng(options.seed)
-    search = Search(scene, hopeful, fiducial_triples(obj, generator), bounds)
+    search = Search(scene, hopeful, bounds, alone=not options.others_in_view)
     fits: Fits | None = None
     result = _refuse(scene, "no pose of the object explains the blobs")
     undecided = 0
