@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import permutations
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,13 +84,14 @@ def edge_triples(obj: CalibrationObject, generator: np.random.Generator) -> Fidu
     if obj.planar or _orders(len(points)) <= FEW_TRIPLES:
         return None
     symmetries = tuple(motion.permutation.astype(np.int64).tobytes() for motion in obj.symmetries)
-    *found, outer = _edge_triples(points.tobytes(), symmetries)
+    found, outer = _edge_triples(points.tobytes(), symmetries)
     inner = np.setdiff1d(np.arange(len(points)), outer)
-    return FiducialTriples(*found, points, np.concatenate((generator.permutation(outer), generator.permutation(inner))))
+    order = np.concatenate((generator.permutation(outer), generator.permutation(inner)))
+    return FiducialTriples(*found, points, order)
 
 
 @lru_cache(maxsize=4)
-def _edge_triples(coordinates: bytes, symmetries: tuple[bytes, ...]) -> tuple[NDArray[Any], ...]:
+def _edge_triples(coordinates: bytes, symmetries: tuple[bytes, ...]) -> tuple[Triples, NDArray[np.int64]]:
     """Triples, sides and frames of `edge_triples`, and the outer fiducials, once per object."""
     points = np.frombuffer(coordinates).reshape(-1, 3)
     hull = ConvexHull(points)
@@ -99,7 +99,7 @@ def _edge_triples(coordinates: bytes, symmetries: tuple[bytes, ...]) -> tuple[ND
     count = len(hull.vertices)
     triples = np.column_stack((edges.repeat(count, axis=0), np.tile(hull.vertices, len(edges))))
     triples = triples[(triples[:, :2] != triples[:, 2:]).all(1)]
-    return *_drop_symmetric(points, triples, symmetries), hull.vertices
+    return _drop_symmetric(points, triples, symmetries), hull.vertices
 
 
 Triples = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]

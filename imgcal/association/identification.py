@@ -35,6 +35,7 @@ from imgcal.association.verification import (
     Scene,
     certain,
     evidence,
+    fit_and_label,
     join,
     predictions,
     refine,
@@ -91,13 +92,13 @@ def identify(
     Raises:
         InputError: blobs of several snapshots, or cameras that are not the rig's.
     """
-    partial: Identity | None = None
+    scene, partial = Scene(gather(detections, rig), obj, rig, std), None
     for pose, known in [*((pose, True) for pose in candidates), *((pose, False) for pose in guesses)]:
-        found = track(detections, rig, obj, std, pose, options, pose_known=known)
+        found = _track(scene, pose, options, known)
         if found.accepted and found.explained >= CONVINCING:
             return found
         partial = found if partial is None and found.accepted else partial
-    anew = relocalize(detections, rig, obj, std, options)
+    anew = _relocalize(scene, options)
     return partial if partial is not None and anew.explained <= partial.explained else anew
 
 
@@ -112,13 +113,17 @@ def track(
     pose_known: bool = True,
 ) -> Identity:
     """Label the blobs of one snapshot near a pose; arguments as in `identify`; `pose_known`: it is not a mere guess."""
+    return _track(Scene(gather(detections, rig), obj, rig, std), rig_from_object, options, pose_known)
+
+
+def _track(scene: Scene, rig_from_object: RigidTransform, options: IdentityOptions, pose_known: bool) -> Identity:
+    rig, obj = scene.rig, scene.obj
     if obj.pose_rank < 6:  # its last pose says little: without a pattern it easily fits something else
-        return relocalize(detections, rig, obj, std, options)
-    scene = Scene(gather(detections, rig), obj, rig, std)
+        return _relocalize(scene, options)
     if scene.blobs.uv[..., 0].size * obj.num_fiducials > MOST_PAIRS:
         return _refuse(scene, _too_many(scene))
-    poses = Poses(rig_from_object.rotation.numpy()[None], rig_from_object.translation.numpy()[None])
-    predicted = predict_ideal(rig, scene.obj.points.numpy(), poses)
+    poses = _one_snapshot(rig_from_object)
+    predicted = predict_ideal(rig, obj.points.numpy(), poses)
     distance = float(np.median(_distances(rig, poses, obj)))
     tolerance, gate = _bounds(scene, distance, pose_known=True)
     # If the fiducials are dense, a wide tolerance pairs them with anything: also try a narrow one.
@@ -128,8 +133,14 @@ def track(
         match(scene.blobs, predicted, vote(scene.blobs, predicted, reach, gate).shift, 1.25 * reach)
         for reach in tolerances
     ]
-    fits = refine(scene, start(scene, poses.select(np.zeros(len(attempts), dtype=int)), np.concatenate(attempts)))
-    return _decide(scene, fits, options, pose_known)
+    fits = start(scene, poses.select(np.zeros(len(attempts), dtype=int)), np.concatenate(attempts))
+    fits = fit_and_label(scene, fits, STAGES[0])
+    share = max(_share(scene, fits.select(np.array([k])), options) for k in range(len(attempts)))
+    if share < options.least_share:  # the object is elsewhere: further fits would not find it
+        return _refuse(scene, _too_little(obj.name, share, share, options.least_share))
+    if len(attempts) > 1 and np.array_equal(*fits.labels):
+        fits = fits.select(np.array([0]))
+    return _decide(scene, refine(scene, fits, STAGES[1:]), options, pose_known)
 
 
 def relocalize(
@@ -140,7 +151,11 @@ def relocalize(
     options: IdentityOptions = IdentityOptions(),
 ) -> Identity:
     """Label the blobs of one snapshot without a known pose; arguments as in `identify`."""
-    scene = Scene(gather(detections, rig), obj, rig, std)
+    return _relocalize(Scene(gather(detections, rig), obj, rig, std), options)
+
+
+def _relocalize(scene: Scene, options: IdentityOptions) -> Identity:
+    obj = scene.obj
     if obj.pose_rank == 3:
         return _refuse(scene, "a single marker has no pattern: beside snapshots with labels, others say nothing")
     if obj.pose_rank == 5:
@@ -164,7 +179,7 @@ def relocalize(
     ]
     if not hopeful or scene.blobs.uv[..., 0].size * obj.num_fiducials > MOST_PAIRS:
         return _refuse(scene, _too_many(scene))
-    bounds = _bounds(scene, rig.working_distance or _guess_distance(scene), pose_known=False)
+    bounds = _bounds(scene, scene.rig.working_distance or _guess_distance(scene), pose_known=False)
     generator = np.random.default_rng(options.seed)
     search = Search(scene, hopeful, bounds, alone=not options.others_in_view)
     fits: Fits | None = None

@@ -115,9 +115,14 @@ def start(scene: Scene, poses: Poses, labels: NDArray[np.int64]) -> Fits:
 def refine(scene: Scene, fits: Fits, stages: tuple[float, ...] = STAGES) -> Fits:
     """Alternate fitting and labelling through all stages; the last labels are fitted, too."""
     for sigma in stages:
-        fits = fit(scene, replace(fits, sigma=np.full(len(fits.labels), sigma)))
-        fits = replace(fits, sigma=_residual_sigma(scene, fits), labels=_assign(fits))
+        fits = fit_and_label(scene, fits, sigma)
     return settle_labels(scene, fit(scene, fits), rounds=1)
+
+
+def fit_and_label(scene: Scene, fits: Fits, sigma: float) -> Fits:
+    """Fit with an error of `sigma` px beyond the blobs' own, and label anew."""
+    fits = fit(scene, replace(fits, sigma=np.full(len(fits.labels), sigma)))
+    return replace(fits, sigma=_residual_sigma(scene, fits), labels=_assign(fits))
 
 
 def settle_labels(scene: Scene, fits: Fits, rounds: int = 4) -> Fits:
