@@ -37,6 +37,7 @@ from imgcal.association.verification import (
     evidence,
     fit_and_label,
     join,
+    most_evidence,
     predictions,
     refine,
     rig_and_pose,
@@ -55,7 +56,7 @@ MOST_PAIRS = 30_000_000  # of fiducials and blobs: limit of memory
 PATIENCE = 3  # number of rounds with two good labellings before giving up
 MOST_STEPS = 6  # number of moves to a better labelling of the shifted or turned object
 APPROXIMATE = 0.02  # rad, error of poses from three points, even for a perfect camera
-EXCLUDED = 60.0  # margin of a labelling in one camera that makes a test with the rig unnecessary
+EXCLUDED = 60.0  # margin that makes a closer comparison unnecessary
 LEAST_ALONE = 6  # minimum number of labels for a fit of one camera alone
 STICK_SHARE = 0.5  # factor on the required share: a marker with a hidden neighbour has no label at first
 MOST_SHARED = 0.2  # maximum share of common blobs for two labellings to be two objects in view
@@ -301,6 +302,11 @@ def _margin(scene: Scene, best: Fits, others: Fits) -> float:
     return float(evidence(scene, best)[0] - max([0.0, *rivals]))
 
 
+def _least_margin(scene: Scene, best: Fits, labels: NDArray[np.int64]) -> float:
+    """Estimate the least log odds of a labelling against another one (C, N) in its place, without fitting that."""
+    return float(evidence(scene, best)[0]) - most_evidence(scene, best, labels)
+
+
 def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, float]:
     """Compare a labelling with those of an object shifted or turned onto itself, and change to a better one.
 
@@ -327,11 +333,13 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
                 best = settle_labels(scene, fit)
                 continue
         rivals = [relabel(pose, labels, [motion]) for motion in shifts + turns]
+        least = [_least_margin(scene, best, changed[0]) for _, changed in rivals]
+        excluded = [margin for margin in (*least, *(margin for margin, _, _ in alone)) if margin >= EXCLUDED]
+        rivals = [rival for margin, rival in zip(least, rivals, strict=True) if margin < EXCLUDED]
         rivals += [(_one_snapshot(pose), rival[None]) for margin, _, rival in alone if margin < EXCLUDED]
         fits = [refine(scene, start(scene, *rival), stages=STAGES[:1]) for rival in rivals]
         margins = [_margin(scene, best, rival) for rival in fits]
         if not margins or min(margins) >= 0:
-            excluded = [margin for margin, _, _ in alone if margin >= EXCLUDED]
             return best, min([np.inf, *margins, *excluded])
         best = settle_labels(scene, fits[int(np.argmin(margins))])
     return best, 0.0
@@ -368,8 +376,8 @@ def _compare_with_shifts(
         )
         for motion in near:
             where, shifted = relabel(pose, labels, [motion])
-            margin = 0.0
-            if mine is not None:
+            margin = 0.0 if mine is None else _least_margin(part, mine, shifted[0, [camera]])
+            if mine is not None and margin < EXCLUDED:
                 rival = refine(part, start(part, where, shifted[:, [camera]]), STAGES[:1])
                 margin = _margin(part, mine, rival)
             alone = labels.copy()
