@@ -127,8 +127,9 @@ class Search:
 
     def _fit_decisive(self, ballot: _Ballot) -> Fits | None:
         """Fit the pose with the most votes if it explains nearly all blobs; None = it does not, before or after."""
-        scene, best = self.scene, ballot.votes.count.sum(1).argmax()[None]
-        labels = self._match(ballot, best)
+        scene, votes = self.scene, ballot.votes.count.sum(1)
+        best = np.flatnonzero(votes == votes.max())[: 4 * VERIFIED]
+        best, labels = distinct(scene.obj, best, self._match(ballot, best), most=1)
         if not self._is_decisive(labels):
             return None
         fits = refine(scene, start(scene, ballot.poses.select(best), labels))
