@@ -322,10 +322,11 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
     turns = [] if known_pose else near_symmetries(scene.obj, 2 * pattern.shape * scene.obj.size)
     if not shifts and not turns:
         return best, np.inf
+    compared: dict[tuple[int, bytes], list[tuple[float, NDArray[np.int64]]]] = {}
     for _ in range(MOST_STEPS):
         pose = select_pose(scene, best, 0)
         labels = best.labels[0]
-        alone = _compare_with_shifts(scene, best, shifts, 6 * pattern.shift)
+        alone = _compare_with_shifts(scene, best, shifts, 6 * pattern.shift, compared)
         together = _prefer_shifts(labels, alone)
         if together is not None:
             fit = refine(scene, start(scene, _one_snapshot(pose), together[None]), stages=STAGES[:1])
@@ -346,7 +347,11 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
 
 
 def _compare_with_shifts(
-    scene: Scene, best: Fits, shifts: list[Ambiguity], reach: NDArray[np.float64]
+    scene: Scene,
+    best: Fits,
+    shifts: list[Ambiguity],
+    reach: NDArray[np.float64],
+    compared: dict[tuple[int, bytes], list[tuple[float, NDArray[np.int64]]]],
 ) -> list[tuple[float, int, NDArray[np.int64]]]:
     """Compare a labelling with those in which a single camera sees the object shifted, by that camera's own fit.
 
@@ -358,31 +363,39 @@ def _compare_with_shifts(
         best: a labelling, fitted.
         shifts: steps of a lattice.
         reach: (C,) pixels; larger shifts are beyond the prior.
+        compared: earlier comparisons by camera and its labels (N,): margins and shifted labels; new ones are added.
 
     Returns:
         Margin of the labelling over the shifted one in that camera, camera, labels (C, N) of all cameras; 0 =
         undecided.
     """
-    pose = select_pose(scene, best, 0)
-    labels, uv, found = best.labels[0], predictions(best), []
+    labels, found = best.labels[0], []
     for camera in range(scene.rig.num_cameras):
-        near = [motion for motion in shifts if displacement(uv, motion)[camera] < reach[camera]]
-        seen = (labels[camera] >= 0).sum() >= LEAST_ALONE
-        part = scene.select_camera(camera)
-        mine = (
-            refine(part, start(part, _one_snapshot(pose), labels[None, [camera]]), STAGES[:1])
-            if near and seen
-            else None
-        )
-        for motion in near:
-            where, shifted = relabel(pose, labels, [motion])
-            margin = 0.0 if mine is None else _least_margin(part, mine, shifted[0, [camera]])
-            if mine is not None and margin < EXCLUDED:
-                rival = refine(part, start(part, where, shifted[:, [camera]]), STAGES[:1])
-                margin = _margin(part, mine, rival)
+        key = camera, labels[camera].tobytes()
+        if key not in compared:
+            near = [motion for motion in shifts if displacement(predictions(best)[[camera]], motion)[0] < reach[camera]]
+            compared[key] = _margins_over_shifts(scene, best, camera, near)
+        for margin, shifted in compared[key]:
             alone = labels.copy()
-            alone[camera] = shifted[0, camera]
+            alone[camera] = shifted
             found.append((margin, camera, alone))
+    return found
+
+
+def _margins_over_shifts(
+    scene: Scene, best: Fits, camera: int, shifts: list[Ambiguity]
+) -> list[tuple[float, NDArray[np.int64]]]:
+    """Margins of a labelling over the shifted ones in one camera, and the shifted labels (N,); 0 = undecided."""
+    pose, labels = select_pose(scene, best, 0), best.labels[0, [camera]]
+    part, mine, found = scene.select_camera(camera), None, []
+    if shifts and (labels >= 0).sum() >= LEAST_ALONE:
+        mine = refine(part, start(part, _one_snapshot(pose), labels[None]), STAGES[:1])
+    for motion in shifts:
+        where, shifted = relabel(pose, labels, [motion])
+        margin = 0.0 if mine is None else _least_margin(part, mine, shifted[0])
+        if mine is not None and margin < EXCLUDED:
+            margin = _margin(part, mine, refine(part, start(part, where, shifted), STAGES[:1]))
+        found.append((margin, shifted[0, 0]))
     return found
 
 
