@@ -136,9 +136,11 @@ class Search:
         return fits if self._is_decisive(fits.labels) else None
 
     def _is_decisive(self, labels: NDArray[np.int64]) -> bool:
-        """Tell whether a labelling (1, C, N) explains so much, in so many cameras, that no other can."""
+        """Tell whether a labelling (1, C, N) explains so much, in every camera with enough blobs, that no other can."""
+        labelled = (labels[0] >= 0).sum(-1)
         most = np.minimum(self.scene.blobs.count, self.scene.obj.num_fiducials).sum()
-        return (labels >= 0).any(-1).sum() >= DECISIVE_CAMERAS and (labels >= 0).sum() >= DECISIVE * most
+        everywhere = bool(labelled[list(self.cameras)].all())
+        return everywhere and (labelled > 0).sum() >= DECISIVE_CAMERAS and labelled.sum() >= DECISIVE * most
 
     def _match(self, ballot: _Ballot, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         return match(self.scene.blobs, ballot.predicted[rows], ballot.votes.shift[rows], 1.25 * self.bounds[0])
