@@ -96,13 +96,13 @@ class Search:
                 self.hypotheses += PLANAR_EFFORT
                 yield self._planar_poses(camera)
             return
-        cameras = generator.permutation(self.cameras)
+        edges = edge_triples(obj, generator) if self.triples is None else None
+        if edges is not None:
+            for camera in generator.permutation(self.cameras)[:EDGES_TRIED]:
+                yield self._single_camera_poses(camera[None], 1, edges, generator)
         if self.triples is None:
-            edges = edge_triples(obj, generator)
-            if edges is not None:
-                for camera in cameras[:EDGES_TRIED]:
-                    yield self._single_camera_poses(cameras[cameras == camera], 1, edges, generator)
             self.triples = fiducial_triples(obj, generator)
+        cameras = generator.permutation(self.cameras)
         number = int(np.clip(hypotheses // len(self.triples.triples), 1, TRIPLES))
         cameras = cameras[:number]
         each = -(-number // len(cameras))
