@@ -113,7 +113,7 @@ class Search:
     def _single_camera_poses(
         self, cameras: NDArray[np.int64], each: int, triples: FiducialTriples, generator: np.random.Generator
     ) -> Poses:
-        """Make poses from `each` triples of blobs in each camera; the first two are neighbours on the hull for edges."""
+        """Make poses from `each` triples of blobs in each camera; edges need neighbours on the hull of the image."""
         scene, edges = self.scene, triples is not self.triples
         drawn = [
             blob_triples(scene.blobs.ideal[c], self._likely_blobs(c, edges), each, generator, neighbours=edges)
@@ -121,9 +121,7 @@ class Search:
         ]
         camera = np.repeat(cameras, each)
         self.hypotheses += len(camera) * len(triples.triples)
-        return single_camera_poses(
-            scene.blobs, scene.rig, camera, np.concatenate(drawn), triples, self.bounds[0], KEPT
-        )
+        return single_camera_poses(scene.blobs, scene.rig, camera, np.concatenate(drawn), triples, self.bounds[0], KEPT)
 
     def _fit_decisive(self, ballot: _Ballot) -> Fits | None:
         """Fit the pose with the most votes if it explains nearly all blobs; None = it does not, before or after."""
