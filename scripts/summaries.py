@@ -250,9 +250,9 @@ def _identity_row() -> list[str]:
     wrong = _sum(ours, "wrong_labels")
     return [
         "labelling blobs, six markers and four false blobs per camera",
-        f"{wrong or 'no'} wrong labels in {_sum(ours, 'snapshots')} snapshots, {_span(ours, 'ms_p50')} ms",
+        f"{wrong or 'no'} wrong labels in {_sum(ours, 'snapshots')} snapshots, {_span(ours, 'ms_p50')} ms of CPU",
         f"P3P, assignment and a vote among the cameras: wrong labels in {_span(peers, 'wrong_percent')} % of the "
-        f"snapshots, {_span(peers, 'ms_p50')} ms",
+        f"snapshots, {_span(peers, 'ms_p50')} ms of CPU",
     ]
 
 
@@ -305,8 +305,8 @@ def _sum(rows: Iterable[Mapping[str, Any]], key: str) -> int:
 
 
 def _span(rows: Sequence[Mapping[str, Any]], key: str) -> str:
-    least, most = sorted(row[key] for row in rows)
-    return f"{least:.0f} to {most:.0f}"
+    least, most = (f"{value:.0f}" for value in sorted(row[key] for row in rows))
+    return least if least == most else f"{least} to {most}"
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from imgcal.types import CalibrationObject, CameraRig
 from renderers.compiling import njit
 
 MOST_TRIPLES = 40_000  # maximum number of fiducial triples to try them all
+FEW_TRIPLES = 1_000  # maximum number of fiducial triples to try without trying the edges of the hull first
 MOST_FIDUCIAL_TRIPLES = 300_000  # of the outer fiducials; beyond that, a random subset is used
 DRAWS = 3  # blob triples drawn, to use the widest
 PROBES = 8  # fiducials for the first test of a hypothesis; only promising ones are tested on all
@@ -72,6 +73,33 @@ def fiducial_triples(obj: CalibrationObject, generator: np.random.Generator) -> 
         triples = among[generator.integers(0, len(among), (MOST_FIDUCIAL_TRIPLES, 3))]
         found = _drop_symmetric(points, triples[(triples != np.roll(triples, 1, axis=1)).all(1)], symmetries)
     return FiducialTriples(*found, points, generator.permutation(count))
+
+
+def edge_triples(obj: CalibrationObject, generator: np.random.Generator) -> FiducialTriples | None:
+    """List edges of the object's convex hull, each with every third outer fiducial; None = all triples are few.
+
+    Neighbours on the hull of an image are an edge of the hull in space. They are the quickest try if little is hidden.
+    """
+    points = obj.points.double().cpu().numpy()
+    if obj.planar or _orders(len(points)) <= FEW_TRIPLES:
+        return None
+    symmetries = tuple(motion.permutation.astype(np.int64).tobytes() for motion in obj.symmetries)
+    found, outer = _edge_triples(points.tobytes(), symmetries)
+    inner = np.setdiff1d(np.arange(len(points)), outer)
+    order = np.concatenate((generator.permutation(outer), generator.permutation(inner)))
+    return FiducialTriples(*found, points, order)
+
+
+@lru_cache(maxsize=4)
+def _edge_triples(coordinates: bytes, symmetries: tuple[bytes, ...]) -> tuple[Triples, NDArray[np.int64]]:
+    """Triples, sides and frames of `edge_triples`, and the outer fiducials, once per object."""
+    points = np.frombuffer(coordinates).reshape(-1, 3)
+    hull = ConvexHull(points)
+    edges = np.unique(np.concatenate([hull.simplices[:, pair] for pair in permutations(range(3), 2)]), axis=0)
+    count = len(hull.vertices)
+    triples = np.column_stack((edges.repeat(count, axis=0), np.tile(hull.vertices, len(edges))))
+    triples = triples[(triples[:, :2] != triples[:, 2:]).all(1)]
+    return _drop_symmetric(points, triples, symmetries), hull.vertices
 
 
 Triples = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
@@ -129,7 +157,7 @@ def likely_blobs(blobs: PaddedBlobs, camera: int, outer: bool) -> NDArray[np.int
     Args:
         blobs: the snapshot.
         camera: index of the camera, which has at least four blobs.
-        outer: take the outermost blobs only, see `has_many_triples`.
+        outer: take the outermost blobs only, in their order around the image; see `has_many_triples`.
     """
     uv = blobs.ideal[camera, : blobs.count[camera]].astype(np.float64)
     gaps = cKDTree(uv).query(uv, k=4)[0][:, -1]
@@ -140,7 +168,11 @@ def likely_blobs(blobs: PaddedBlobs, camera: int, outer: bool) -> NDArray[np.int
 
 
 def blob_triples(
-    uv: NDArray[np.floating], likely: NDArray[np.int64], count: int, generator: np.random.Generator
+    uv: NDArray[np.floating],
+    likely: NDArray[np.int64],
+    count: int,
+    generator: np.random.Generator,
+    neighbours: bool = False,
 ) -> NDArray[np.int64]:
     """Draw triples of blobs (count, 3) that are wide enough.
 
@@ -149,10 +181,14 @@ def blob_triples(
         likely: (L >= 3,) blobs to draw from.
         count: number of triples.
         generator: source of randomness.
+        neighbours: the first two of each triple follow each other in `likely`, or are its last and first.
     """
     # Draw three different numbers: each counts among the remaining ones and is moved past those already drawn.
     drawn = generator.integers(0, len(likely) - np.arange(3), (DRAWS * count, 3))
-    drawn[:, 1] += drawn[:, 1] >= drawn[:, 0]
+    if neighbours:
+        drawn[:, 1] = (drawn[:, 0] + 1) % len(likely)
+    else:
+        drawn[:, 1] += drawn[:, 1] >= drawn[:, 0]
     taken = np.sort(drawn[:, :2], axis=1)
     drawn[:, 2] += drawn[:, 2] >= taken[:, 0]
     drawn[:, 2] += drawn[:, 2] >= taken[:, 1]
@@ -188,7 +224,9 @@ def single_camera_poses(
     seen = blobs.ideal[blobs.row >= 0]
     cell = max(tolerance / CELLS, float(np.ptp(seen, axis=0).max()) / MOST_CELLS)
     origin = np.zeros((len(blobs.count), 2))
-    raster = _rasterize(blobs.ideal, blobs.count, cell, origin)
+    count = np.zeros_like(blobs.count)
+    count[cameras] = blobs.count[cameras]
+    raster = _rasterize(blobs.ideal, count, cell, origin)
     score = np.zeros((len(triples), keep))
     rotation, translation = np.zeros((len(triples), keep, 3, 3)), np.zeros((len(triples), keep, 3))
     _search(

@@ -22,7 +22,6 @@ from imgcal.association.assignment import spacing
 from imgcal.association.blobs import PatternPrior, gather, pattern_prior
 from imgcal.association.hypotheses import (
     Poses,
-    fiducial_triples,
     has_many_triples,
     likely_blobs,
 )
@@ -36,7 +35,9 @@ from imgcal.association.verification import (
     Scene,
     certain,
     evidence,
+    fit_and_label,
     join,
+    most_evidence,
     predictions,
     refine,
     rig_and_pose,
@@ -55,7 +56,7 @@ MOST_PAIRS = 30_000_000  # of fiducials and blobs: limit of memory
 PATIENCE = 3  # number of rounds with two good labellings before giving up
 MOST_STEPS = 6  # number of moves to a better labelling of the shifted or turned object
 APPROXIMATE = 0.02  # rad, error of poses from three points, even for a perfect camera
-EXCLUDED = 60.0  # margin of a labelling in one camera that makes a test with the rig unnecessary
+EXCLUDED = 60.0  # margin that makes a closer comparison unnecessary
 LEAST_ALONE = 6  # minimum number of labels for a fit of one camera alone
 STICK_SHARE = 0.5  # factor on the required share: a marker with a hidden neighbour has no label at first
 MOST_SHARED = 0.2  # maximum share of common blobs for two labellings to be two objects in view
@@ -92,13 +93,13 @@ def identify(
     Raises:
         InputError: blobs of several snapshots, or cameras that are not the rig's.
     """
-    partial: Identity | None = None
+    scene, partial = Scene(gather(detections, rig), obj, rig, std), None
     for pose, known in [*((pose, True) for pose in candidates), *((pose, False) for pose in guesses)]:
-        found = track(detections, rig, obj, std, pose, options, pose_known=known)
+        found = _track(scene, pose, options, known)
         if found.accepted and found.explained >= CONVINCING:
             return found
         partial = found if partial is None and found.accepted else partial
-    anew = relocalize(detections, rig, obj, std, options)
+    anew = _relocalize(scene, options)
     return partial if partial is not None and anew.explained <= partial.explained else anew
 
 
@@ -113,13 +114,17 @@ def track(
     pose_known: bool = True,
 ) -> Identity:
     """Label the blobs of one snapshot near a pose; arguments as in `identify`; `pose_known`: it is not a mere guess."""
+    return _track(Scene(gather(detections, rig), obj, rig, std), rig_from_object, options, pose_known)
+
+
+def _track(scene: Scene, rig_from_object: RigidTransform, options: IdentityOptions, pose_known: bool) -> Identity:
+    rig, obj = scene.rig, scene.obj
     if obj.pose_rank < 6:  # its last pose says little: without a pattern it easily fits something else
-        return relocalize(detections, rig, obj, std, options)
-    scene = Scene(gather(detections, rig), obj, rig, std)
+        return _relocalize(scene, options)
     if scene.blobs.uv[..., 0].size * obj.num_fiducials > MOST_PAIRS:
         return _refuse(scene, _too_many(scene))
-    poses = Poses(rig_from_object.rotation.numpy()[None], rig_from_object.translation.numpy()[None])
-    predicted = predict_ideal(rig, scene.obj.points.numpy(), poses)
+    poses = _one_snapshot(rig_from_object)
+    predicted = predict_ideal(rig, obj.points.numpy(), poses)
     distance = float(np.median(_distances(rig, poses, obj)))
     tolerance, gate = _bounds(scene, distance, pose_known=True)
     # If the fiducials are dense, a wide tolerance pairs them with anything: also try a narrow one.
@@ -129,8 +134,14 @@ def track(
         match(scene.blobs, predicted, vote(scene.blobs, predicted, reach, gate).shift, 1.25 * reach)
         for reach in tolerances
     ]
-    fits = refine(scene, start(scene, poses.select(np.zeros(len(attempts), dtype=int)), np.concatenate(attempts)))
-    return _decide(scene, fits, options, pose_known)
+    fits = start(scene, poses.select(np.zeros(len(attempts), dtype=int)), np.concatenate(attempts))
+    fits = fit_and_label(scene, fits, STAGES[0])
+    share = max(_share(scene, fits.select(np.array([k])), options) for k in range(len(attempts)))
+    if share < options.least_share:  # the object is elsewhere: further fits would not find it
+        return _refuse(scene, _too_little(obj.name, share, share, options.least_share))
+    if len(attempts) > 1 and np.array_equal(*fits.labels):
+        fits = fits.select(np.array([0]))
+    return _decide(scene, refine(scene, fits, STAGES[1:]), options, pose_known)
 
 
 def relocalize(
@@ -141,7 +152,11 @@ def relocalize(
     options: IdentityOptions = IdentityOptions(),
 ) -> Identity:
     """Label the blobs of one snapshot without a known pose; arguments as in `identify`."""
-    scene = Scene(gather(detections, rig), obj, rig, std)
+    return _relocalize(Scene(gather(detections, rig), obj, rig, std), options)
+
+
+def _relocalize(scene: Scene, options: IdentityOptions) -> Identity:
+    obj = scene.obj
     if obj.pose_rank == 3:
         return _refuse(scene, "a single marker has no pattern: beside snapshots with labels, others say nothing")
     if obj.pose_rank == 5:
@@ -157,13 +172,17 @@ def relocalize(
     compared = compare_labellings(scene, options) if has_minimal_blobs(scene) else None
     if compared is not None and compared.accepted:
         return compared
-    likely = {camera: likely_blobs(scene.blobs, camera, has_many_triples(obj)) for camera in cameras.tolist()}
-    hopeful = {camera: rows for camera, rows in likely.items() if len(rows) <= MOST_FALSE * obj.num_fiducials}
+    most, outer = MOST_FALSE * obj.num_fiducials, has_many_triples(obj)
+    hopeful = [
+        camera
+        for camera in cameras.tolist()
+        if scene.blobs.count[camera] <= most or len(likely_blobs(scene.blobs, camera, outer)) <= most
+    ]
     if not hopeful or scene.blobs.uv[..., 0].size * obj.num_fiducials > MOST_PAIRS:
         return _refuse(scene, _too_many(scene))
-    bounds = _bounds(scene, rig.working_distance or _guess_distance(scene), pose_known=False)
+    bounds = _bounds(scene, scene.rig.working_distance or _guess_distance(scene), pose_known=False)
     generator = np.random.default_rng(options.seed)
-    search = Search(scene, hopeful, fiducial_triples(obj, generator), bounds)
+    search = Search(scene, hopeful, bounds, alone=not options.others_in_view)
     fits: Fits | None = None
     result = _refuse(scene, "no pose of the object explains the blobs")
     undecided = 0
@@ -283,6 +302,11 @@ def _margin(scene: Scene, best: Fits, others: Fits) -> float:
     return float(evidence(scene, best)[0] - max([0.0, *rivals]))
 
 
+def _least_margin(scene: Scene, best: Fits, labels: NDArray[np.int64]) -> float:
+    """Estimate the least log odds of a labelling against another one (C, N) in its place, without fitting that."""
+    return float(evidence(scene, best)[0]) - most_evidence(scene, best, labels)
+
+
 def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, float]:
     """Compare a labelling with those of an object shifted or turned onto itself, and change to a better one.
 
@@ -298,10 +322,11 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
     turns = [] if known_pose else near_symmetries(scene.obj, 2 * pattern.shape * scene.obj.size)
     if not shifts and not turns:
         return best, np.inf
+    compared: dict[tuple[int, bytes], list[tuple[float, NDArray[np.int64]]]] = {}
     for _ in range(MOST_STEPS):
         pose = select_pose(scene, best, 0)
         labels = best.labels[0]
-        alone = _compare_with_shifts(scene, best, shifts, 6 * pattern.shift)
+        alone = _compare_with_shifts(scene, best, shifts, 6 * pattern.shift, compared)
         together = _prefer_shifts(labels, alone)
         if together is not None:
             fit = refine(scene, start(scene, _one_snapshot(pose), together[None]), stages=STAGES[:1])
@@ -309,18 +334,24 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
                 best = settle_labels(scene, fit)
                 continue
         rivals = [relabel(pose, labels, [motion]) for motion in shifts + turns]
+        least = [_least_margin(scene, best, changed[0]) for _, changed in rivals]
+        excluded = [margin for margin in (*least, *(margin for margin, _, _ in alone)) if margin >= EXCLUDED]
+        rivals = [rival for margin, rival in zip(least, rivals, strict=True) if margin < EXCLUDED]
         rivals += [(_one_snapshot(pose), rival[None]) for margin, _, rival in alone if margin < EXCLUDED]
         fits = [refine(scene, start(scene, *rival), stages=STAGES[:1]) for rival in rivals]
         margins = [_margin(scene, best, rival) for rival in fits]
         if not margins or min(margins) >= 0:
-            excluded = [margin for margin, _, _ in alone if margin >= EXCLUDED]
             return best, min([np.inf, *margins, *excluded])
         best = settle_labels(scene, fits[int(np.argmin(margins))])
     return best, 0.0
 
 
 def _compare_with_shifts(
-    scene: Scene, best: Fits, shifts: list[Ambiguity], reach: NDArray[np.float64]
+    scene: Scene,
+    best: Fits,
+    shifts: list[Ambiguity],
+    reach: NDArray[np.float64],
+    compared: dict[tuple[int, bytes], list[tuple[float, NDArray[np.int64]]]],
 ) -> list[tuple[float, int, NDArray[np.int64]]]:
     """Compare a labelling with those in which a single camera sees the object shifted, by that camera's own fit.
 
@@ -332,31 +363,39 @@ def _compare_with_shifts(
         best: a labelling, fitted.
         shifts: steps of a lattice.
         reach: (C,) pixels; larger shifts are beyond the prior.
+        compared: earlier comparisons by camera and its labels (N,): margins and shifted labels; new ones are added.
 
     Returns:
         Margin of the labelling over the shifted one in that camera, camera, labels (C, N) of all cameras; 0 =
         undecided.
     """
-    pose = select_pose(scene, best, 0)
-    labels, uv, found = best.labels[0], predictions(best), []
+    labels, found = best.labels[0], []
     for camera in range(scene.rig.num_cameras):
-        near = [motion for motion in shifts if displacement(uv, motion)[camera] < reach[camera]]
-        seen = (labels[camera] >= 0).sum() >= LEAST_ALONE
-        part = scene.select_camera(camera)
-        mine = (
-            refine(part, start(part, _one_snapshot(pose), labels[None, [camera]]), STAGES[:1])
-            if near and seen
-            else None
-        )
-        for motion in near:
-            where, shifted = relabel(pose, labels, [motion])
-            margin = 0.0
-            if mine is not None:
-                rival = refine(part, start(part, where, shifted[:, [camera]]), STAGES[:1])
-                margin = _margin(part, mine, rival)
+        key = camera, labels[camera].tobytes()
+        if key not in compared:
+            near = [motion for motion in shifts if displacement(predictions(best)[[camera]], motion)[0] < reach[camera]]
+            compared[key] = _margins_over_shifts(scene, best, camera, near)
+        for margin, shifted in compared[key]:
             alone = labels.copy()
-            alone[camera] = shifted[0, camera]
+            alone[camera] = shifted
             found.append((margin, camera, alone))
+    return found
+
+
+def _margins_over_shifts(
+    scene: Scene, best: Fits, camera: int, shifts: list[Ambiguity]
+) -> list[tuple[float, NDArray[np.int64]]]:
+    """Margins of a labelling over the shifted ones in one camera, and the shifted labels (N,); 0 = undecided."""
+    pose, labels = select_pose(scene, best, 0), best.labels[0, [camera]]
+    part, mine, found = scene.select_camera(camera), None, []
+    if shifts and (labels >= 0).sum() >= LEAST_ALONE:
+        mine = refine(part, start(part, _one_snapshot(pose), labels[None]), STAGES[:1])
+    for motion in shifts:
+        where, shifted = relabel(pose, labels, [motion])
+        margin = 0.0 if mine is None else _least_margin(part, mine, shifted[0])
+        if mine is not None and margin < EXCLUDED:
+            margin = _margin(part, mine, refine(part, start(part, where, shifted), STAGES[:1]))
+        found.append((margin, shifted[0, 0]))
     return found
 
 

@@ -32,6 +32,7 @@ REACH = 0.25  # steps that a blob may be off where its neighbours expect it
 LEAST_AROUND = 5  # of the eight cells around a blob, for a lattice to be grown from there
 LEAST_SHARE = 0.15  # of the fiducials, that a lattice must show
 SEEDS = 12  # blobs that lattices are grown from
+AROUND = np.array([cell for cell in product((-1, 0, 1), repeat=2) if cell != (0, 0)])
 STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 TURNS = [
     np.array(entries).reshape(2, 2)
@@ -208,27 +209,25 @@ def _lattice_homographies(flat: Floats, steps: Floats | None, seen: Floats) -> l
 
 def _seeds(seen: Floats, tree: cKDTree) -> list[tuple[int, Floats]]:
     """Blobs with their two steps (2, 2), those with the fullest neighbourhood first."""
-    near = tree.query(seen, k=NEIGHBOURS + 1)[1]
-    ranked = []
-    for blob, others in enumerate(near):
-        steps = seen[others[1:]] - seen[blob]
-        length = np.linalg.norm(steps, axis=1)
-        best: tuple[int, float, Floats] | None = None
-        for i, j in zip(*np.triu_indices(len(steps), 1), strict=True):
-            across = abs(steps[i, 0] * steps[j, 1] - steps[i, 1] * steps[j, 0])
-            if across < LEAST_ANGLE * length[i] * length[j]:
-                continue
-            frame = np.stack((steps[i], steps[j]))
-            around = np.array([c for c in product((-1, 0, 1), repeat=2) if c != (0, 0)]) @ frame + seen[blob]
-            there = int((tree.query(around)[0] < REACH * min(length[i], length[j])).sum())
-            rank = (there, -float(length[i] + length[j]))
-            if there >= LEAST_AROUND and (best is None or rank > best[:2]):
-                best = (*rank, frame)
-        if best is not None:
-            ranked.append((-best[0], blob, best[2]))
-    ranked.sort(key=lambda each: each[:2])
+    near = tree.query(seen, k=NEIGHBOURS + 1)[1][:, 1:]
+    steps = seen[near] - seen[:, None]  # (M, 8, 2)
+    length = np.linalg.norm(steps, axis=2)
+    i, j = np.triu_indices(NEIGHBOURS, 1)
+    across = np.abs(steps[:, i, 0] * steps[:, j, 1] - steps[:, i, 1] * steps[:, j, 0])
+    blob, pair = np.nonzero(across >= LEAST_ANGLE * length[:, i] * length[:, j])
+    i, j = i[pair], j[pair]
+    frames = np.stack((steps[blob, i], steps[blob, j]), axis=1)  # (P, 2, 2)
+    around = AROUND @ frames + seen[blob, None]
+    reach = REACH * np.minimum(length[blob, i], length[blob, j])
+    there = (tree.query(around)[0] < reach[:, None]).sum(1)
+    # The fullest neighbourhood of each blob, the shortest steps of equals.
+    order = np.lexsort((length[blob, i] + length[blob, j], -there, blob))
+    order = order[there[order] >= LEAST_AROUND]
+    order = order[np.unique(blob[order], return_index=True)[1]]
+    order = order[np.argsort(-there[order], kind="stable")]
+    ranked = [(int(blob[k]), frames[k]) for k in order]
     # Spread over the image, so that clutter around one of them does not decide.
-    return [(blob, frame) for _, blob, frame in ranked[:: max(len(ranked) // SEEDS, 1)]]
+    return ranked[:: max(len(ranked) // SEEDS, 1)]
 
 
 def _follow(seen: Floats, tree: cKDTree, blob: int, frame: Floats) -> Cells:
@@ -282,21 +281,24 @@ def _place(cells: Cells, numbers: NDArray[np.int64]) -> list[tuple[NDArray[np.in
     """Lay the object's lattice on the grown one every way that shows most fiducials: fiducials and their blobs."""
     seen, blobs = np.array(list(cells)), np.array(list(cells.values()))
     index = {(int(i), int(j)): fiducial for fiducial, (i, j) in enumerate(numbers)}
-    placements: list[tuple[int, NDArray[np.int64], bytes]] = []
+    placements: list[tuple[int, NDArray[np.int64], NDArray[np.int64]]] = []
     for turn in TURNS:
-        turned, back = seen @ turn, np.rint(np.linalg.inv(turn)).astype(np.int64)
+        turned = seen @ turn
         shifts = (numbers[:, None] - turned).reshape(-1, 2)
         low, wide = shifts.min(0), int(np.ptp(shifts[:, 1])) + 1
         counts = np.bincount((shifts[:, 0] - low[0]) * wide + shifts[:, 1] - low[1])
         for code in np.flatnonzero(counts >= CLOSE * counts.max()).tolist():
-            shift = low + np.array(divmod(code, wide))
-            covered = np.unique((numbers - shift) @ back, axis=0).tobytes()
-            placements.append((int(counts[code]), turned + shift, covered))
+            placements.append((int(counts[code]), turn, low + np.array(divmod(code, wide))))
     most, covers, result = max(count for count, _, _ in placements), set(), []
-    for count, where, covered in placements:
-        if count < CLOSE * most or covered in covers:
+    for count, turn, shift in placements:
+        if count < CLOSE * most:
+            continue
+        cells_covered = (numbers - shift) @ np.rint(np.linalg.inv(turn)).astype(np.int64)
+        covered = cells_covered[np.lexsort(cells_covered.T)].tobytes()
+        if covered in covers:
             continue  # turns of a symmetric object onto itself are one
         covers.add(covered)
+        where = seen @ turn + shift
         fiducial = np.array([index.get((int(i), int(j)), -1) for i, j in where])
         result.append((fiducial[fiducial >= 0], blobs[fiducial >= 0]))
     return result

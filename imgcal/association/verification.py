@@ -115,9 +115,14 @@ def start(scene: Scene, poses: Poses, labels: NDArray[np.int64]) -> Fits:
 def refine(scene: Scene, fits: Fits, stages: tuple[float, ...] = STAGES) -> Fits:
     """Alternate fitting and labelling through all stages; the last labels are fitted, too."""
     for sigma in stages:
-        fits = fit(scene, replace(fits, sigma=np.full(len(fits.labels), sigma)))
-        fits = replace(fits, sigma=_residual_sigma(scene, fits), labels=_assign(fits))
+        fits = fit_and_label(scene, fits, sigma)
     return settle_labels(scene, fit(scene, fits), rounds=1)
+
+
+def fit_and_label(scene: Scene, fits: Fits, sigma: float) -> Fits:
+    """Fit with an error of `sigma` px beyond the blobs' own, and label anew."""
+    fits = fit(scene, replace(fits, sigma=np.full(len(fits.labels), sigma)))
+    return replace(fits, sigma=_residual_sigma(scene, fits), labels=_assign(fits))
 
 
 def settle_labels(scene: Scene, fits: Fits, rounds: int = 4) -> Fits:
@@ -140,7 +145,7 @@ def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
         least_odds: the same if false blobs are so dense that hardly any label reaches `odds`.
     """
     # Estimate the density of false blobs once: a dropped label must not count as a false blob against the others.
-    surroundings = _detection_odds(scene, fits) - np.log(_clutter(scene, fits))
+    surroundings = _label_gain(scene, fits, (fits.labels >= 0).sum((1, 2)))[:, None, None]
     log_odds = _log_density(_require_innovations(fits)) + surroundings
     usual = np.median(log_odds[np.isfinite(log_odds)]) if np.isfinite(log_odds).any() else 0.0
     demanded = np.clip(usual - np.log(100), np.log(least_odds), np.log(odds))
@@ -167,9 +172,21 @@ def evidence(scene: Scene, fits: Fits) -> NDArray[np.float64]:
     labelled = fits.labels >= 0
     noise = _blob_noise(scene, fits) + fits.sigma[:, None, None] ** 2
     found = _require_innovations(fits)
-    gain = -np.log(2 * np.pi * noise) - np.log(_clutter(scene, fits)) + _detection_odds(scene, fits)
+    gain = _label_gain(scene, fits, labelled.sum((1, 2)))[:, None, None] - np.log(2 * np.pi * noise)
     sizes = _size_misfit(scene, fits)
     return np.where(labelled, gain, 0).sum((1, 2)) - fits.cost - 0.5 * (found.complexity + sizes)
+
+
+def most_evidence(scene: Scene, fits: Fits, labels: NDArray[np.int64]) -> float:
+    """Estimate the evidence that another labelling (C, N) in the place of a fitted one has at most.
+
+    All its labels fit exactly then, and so do all blobs that the fitted one leaves unlabelled.
+    """
+    unlabelled = scene.blobs.count - (fits.labels[0] >= 0).sum(1)
+    count = np.minimum((labels >= 0).sum(1) + unlabelled, scene.obj.num_fiducials).sum()
+    precision = -np.log(2 * np.pi * scene.blobs.sigma[scene.blobs.row >= 0] ** 2).mean()
+    gain = _label_gain(scene, fits, count[None])[0] + precision
+    return float(count * gain - 0.5 * _require_innovations(fits).complexity[0])
 
 
 def predictions(fits: Fits) -> NDArray[np.float64]:
@@ -276,24 +293,22 @@ def _size_misfit(scene: Scene, fits: Fits) -> NDArray[np.float64]:
     return np.nansum(np.minimum((misfit / usual) ** 2, MOST_SIZE_MISFIT), axis=(1, 2))
 
 
-def _clutter(scene: Scene, fits: Fits) -> NDArray[np.float64]:
-    """False blobs per square pixel, near the object's image or overall, whichever is larger: (K, 1, 1)."""
-    uv = _require_innovations(fits).uv
+def _label_gain(scene: Scene, fits: Fits, labelled: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Log odds (K,) that a label adds to the evidence, without its blob's density, if there are `labelled` (K,)."""
+    uv, size = _require_innovations(fits).uv, scene.rig.image_size.numpy()[:, None]
+    in_view = ((uv > 0) & (uv < size)).all(-1).sum((1, 2))
+    detected = np.clip((labelled + 1) / (in_view + 2), 0.05, 0.95)  # share of the visible fiducials
+    return np.log(detected / (1 - detected)) - np.log(_clutter(scene, uv, labelled))
+
+
+def _clutter(scene: Scene, uv: NDArray[np.float64], labelled: NDArray[np.int64]) -> NDArray[np.float64]:
+    """False blobs per square pixel, near the object's image (K, C, N, 2) or overall, whichever is larger: (K,)."""
     low, high = uv.min(2), uv.max(2)
     middle, half = (low + high) / 2, 0.75 * (high - low) + 10
     inside = (np.abs(scene.blobs.uv[None] - middle[:, :, None]) < half[:, :, None]).all(-1).sum((1, 2))
-    labelled = (fits.labels >= 0).sum((1, 2))
     local = (np.maximum(inside - labelled, 0) + 1) / (4 * half.prod(-1)).sum(1)
     overall = (scene.blobs.count.sum() - labelled + 1) / scene.rig.image_size.prod(1).sum().item()
-    return np.maximum(local, overall)[:, None, None]
-
-
-def _detection_odds(scene: Scene, fits: Fits) -> NDArray[np.float64]:
-    """Log odds that a visible fiducial is detected: (K, 1, 1)."""
-    uv = _require_innovations(fits).uv
-    in_view = ((uv > 0) & (uv < scene.rig.image_size.numpy()[:, None])).all(-1).sum((1, 2))
-    share = np.clip(((fits.labels >= 0).sum((1, 2)) + 1) / (in_view + 2), 0.05, 0.95)
-    return np.log(share / (1 - share))[:, None, None]
+    return np.maximum(local, overall)
 
 
 def _log_density(found: Innovations) -> NDArray[np.float64]:

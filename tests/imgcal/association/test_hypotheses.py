@@ -14,6 +14,7 @@ from imgcal.association.hypotheses import (
     Poses,
     _rasterize,
     blob_triples,
+    edge_triples,
     fiducial_triples,
     has_many_triples,
     likely_blobs,
@@ -62,6 +63,31 @@ def test_triples_that_are_kept_are_those_of_the_same_object_and_draw_no_numbers(
     drawn = rng()
     np.testing.assert_array_equal(first.order, drawn.permutation(8))
     np.testing.assert_array_equal(again.order, drawn.permutation(8))
+
+
+def test_neighbours_on_an_images_hull_are_an_edge_of_the_object() -> None:
+    obj = make_object(rng(2).normal(size=(40, 3)) * 50)
+    points = obj.points.numpy()
+    found = edge_triples(obj, rng())
+    assert edge_triples(load_object("asymmetric8"), rng()) is None
+    assert edge_triples(make_object(points * [1, 1, 0]), rng()) is None
+    edges = set(map(tuple, found.triples[:, :2]))
+    outer = ConvexHull(points).vertices
+    assert len(edges) == 2 * (3 * len(outer) - 6) and len(found.triples) == len(edges) * (len(outer) - 2)
+    assert set(found.order[: len(outer)]) == set(outer) and sorted(found.order) == list(range(40))
+    for seed in range(20):
+        turned = points @ np.linalg.qr(rng(seed).normal(size=(3, 3)))[0].T + [0, 0, 900]
+        uv = 1000 * turned[:, :2] / turned[:, 2:]
+        hull = ConvexHull(uv).vertices
+        assert {*zip(hull, np.roll(hull, 1), strict=True), *zip(hull, np.roll(hull, -1), strict=True)} <= edges
+
+
+def test_blobs_are_drawn_as_neighbours_in_their_order() -> None:
+    uv, likely = rng(3).uniform(0, 100, (9, 2)), np.array([7, 2, 5, 0, 8])
+    drawn = blob_triples(uv, likely, 60, rng(4), neighbours=True)
+    ring = {(7, 2), (2, 5), (5, 0), (0, 8), (8, 7)}
+    assert set(map(tuple, drawn[:, :2])) == ring and set(drawn[:, 2]) == set(likely)
+    assert all(len(set(triple)) == 3 for triple in drawn.tolist())
 
 
 def test_triples_in_line_are_left_out() -> None:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association import IdentityOptions, identify, relocalize, track
+from imgcal.association import IdentityOptions, identification, identify, relocalize, track
 from imgcal.errors import InputError
+from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.geometry.transforms import RigidTransform
 from imgcal.io import load_object, read_rig
 from imgcal.io.names import data_path
@@ -183,6 +184,18 @@ def test_three_blobs_in_every_camera_near_a_guessed_pose(o10: CameraRig) -> None
     found = track(blobs, rig, obj, DRIFT.std(o10), made.rig_from_object[0], pose_known=False)
     assert found.accepted, found.reason
     assert agreements(found.labels, truth, obj)[1] == 0
+
+
+def test_tracking_from_a_wrong_pose_gives_up_after_one_fit(
+    o10: CameraRig, asymmetric: CalibrationObject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, [(detections, _)] = snapshots(o10, asymmetric, 1, visible=8, false=0)
+    std, pose = DRIFT.std(o10), made.rig_from_object[0]
+    assert track(detections, o10, asymmetric, std, pose).accepted
+    turn = rotation_from_vector(torch.tensor([2.0, 0.5, 0.0], dtype=torch.float64))
+    monkeypatch.setattr(identification, "refine", None)  # it makes all further fits
+    found = track(detections, o10, asymmetric, std, RigidTransform(pose.rotation @ turn, pose.translation))
+    assert not found.accepted and "does not look like asymmetric8" in found.reason
 
 
 def test_a_shifted_lattice_ends_in_the_right_answer_or_none(o10: CameraRig) -> None:

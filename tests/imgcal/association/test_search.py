@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 
 from imgcal.association.ambiguities import conflicts
-from imgcal.association.hypotheses import fiducial_triples
 from imgcal.association.search import PLANAR_EFFORT, VERIFIED, Search, distinct
 from imgcal.association.verification import evidence
 from imgcal.io import load_object
 from tests.imgcal.association.scenes import make_object, scene_of, take
 
 
-def search_of(scene, cameras, bounds=(8.0, 150.0)) -> Search:
-    likely = {camera: np.arange(scene.blobs.count[camera]) for camera in cameras}
-    return Search(scene, likely, fiducial_triples(scene.obj, np.random.default_rng(0)), bounds)
+def search_of(scene, cameras, alone=True) -> Search:
+    return Search(scene, cameras, (8.0, 150.0), alone)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -23,12 +21,55 @@ def test_a_round_finds_the_labels(seed, o10, asymmetric8) -> None:
     rig = o10.select([0, 3, 6])
     snapshot = take(rig, asymmetric8, seed, false=1, missing=1)
     scene = scene_of(snapshot, rig, asymmetric8)
-    search = search_of(scene, [0, 1, 2])
+    search = search_of(scene, [0, 1, 2], alone=False)
     fits = search.run_round(5000, np.random.default_rng(seed))
     assert fits is not None and len(fits.labels) <= VERIFIED
     best = fits.labels[evidence(scene, fits).argmax()]
     assert conflicts(asymmetric8, snapshot.labels(scene.blobs, 8), best) < 0.1
     assert search.hypotheses >= 12 * 8 * 7 * 6  # ten blob triples, as many in each camera
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_first_camera_ends_a_round_where_its_pose_labels_nearly_all_blobs(seed, o10, asymmetric8) -> None:
+    rig = o10.select([0, 3, 6])
+    snapshot = take(rig, asymmetric8, seed)
+    scene = scene_of(snapshot, rig, asymmetric8)
+    search = search_of(scene, [0, 1, 2])
+    fits = search.run_round(5000, np.random.default_rng(seed))
+    assert fits is not None and len(fits.labels) == 1
+    np.testing.assert_array_equal(fits.labels[0], snapshot.labels(scene.blobs, 8))
+    assert search.hypotheses < 1.5 * 4 * 8 * 7 * 6
+    # Two cameras do not suffice.
+    pair = scene_of(take(rig.select([0, 1]), asymmetric8, seed), rig.select([0, 1]), asymmetric8)
+    search = search_of(pair, [0, 1])
+    search.run_round(5000, np.random.default_rng(seed))
+    assert search.hypotheses >= 10 * 8 * 7 * 6
+
+
+@pytest.mark.parametrize("fiducials", [20, 90])
+def test_edges_of_the_hull_find_an_object_with_little_hidden(fiducials, o10) -> None:
+    obj = make_object(np.random.default_rng(fiducials).uniform(-90, 90, (fiducials, 3)))
+    rig = o10.select([0, 3, 6])
+    for seed in range(3):
+        snapshot = take(rig, obj, seed)
+        scene = scene_of(snapshot, rig, obj)
+        search = search_of(scene, [0, 1, 2])
+        fits = search.run_round(8000, np.random.default_rng(seed))
+        assert fits is not None and conflicts(obj, snapshot.labels(scene.blobs, fiducials), fits.labels[0]) < 0.05
+        assert search.triples is None  # no other hypotheses were made
+
+
+def test_where_edges_mislead_all_triples_are_tried(o10) -> None:
+    obj = make_object(np.random.default_rng(1).uniform(-90, 90, (20, 3)))
+    rig = o10.select([0, 3, 6])
+    snapshot = take(rig, obj, 2, missing=6, false=4)
+    scene = scene_of(snapshot, rig, obj)
+    search = search_of(scene, [0, 1, 2])
+    random = np.random.default_rng(0)
+    rounds = [search.run_round(16_000, random) for _ in range(3)]
+    assert search.triples is not None
+    found = [labels for fits in rounds if fits is not None for labels in fits.labels]
+    assert min(conflicts(obj, snapshot.labels(scene.blobs, 20), labels) for labels in found) < 0.1
 
 
 def test_the_same_seed_finds_the_same_and_effort_is_counted(o10, asymmetric8) -> None:

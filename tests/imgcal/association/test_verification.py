@@ -6,24 +6,28 @@ import numpy as np
 import pytest
 import torch
 
+from imgcal.association.ambiguities import differ, lattice_shifts, relabel
 from imgcal.association.blobs import PaddedBlobs
 from imgcal.association.hypotheses import Poses
 from imgcal.association.verification import (
+    STAGES,
     Scene,
     certain,
     evidence,
     fit,
     join,
     make_problem,
+    most_evidence,
     predictions,
     refine,
     rig_and_pose,
+    select_pose,
     settle_labels,
     start,
 )
 from imgcal.geometry.rotations import rotation_from_vector
 from imgcal.io import load_object
-from tests.imgcal.association.scenes import DRIFT, degrees_between, scene_of, take
+from tests.imgcal.association.scenes import DRIFT, degrees_between, make_object, scene_of, take
 
 ODDS = (1e5, 1e2)
 
@@ -146,6 +150,24 @@ def test_the_true_labelling_has_the_most_evidence(scene, snapshot) -> None:
     weights = evidence(scene, replace(fits, sigma=np.zeros(4)))
     assert weights.argmax() == 0 and weights[0] > 20
     assert weights[2] < weights[0] - 5  # a good label that is left out
+
+
+@pytest.mark.parametrize("missing", [0, 3])
+def test_no_shifted_lattice_has_more_evidence_than_estimated(missing, rig) -> None:
+    lattice = np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0), [0.0]), axis=-1).reshape(-1, 3)
+    obj = make_object(30 * (lattice - lattice.mean(0)))
+    snapshot = take(rig, obj, 3, missing=missing)
+    scene = scene_of(snapshot, rig, obj)
+    labels = snapshot.labels(scene.blobs, 20)
+    best = refine(scene, started(scene, snapshot, labels))
+    assert most_evidence(scene, best, labels) >= evidence(scene, best)[0]
+    for motion in lattice_shifts(obj):
+        poses, shifted = relabel(select_pose(scene, best, 0), best.labels[0], [motion])
+        rival = refine(scene, start(scene, poses, shifted), STAGES[:1])
+        if differ(obj, best.labels[0], rival.labels[0]):
+            assert most_evidence(scene, best, shifted[0]) >= evidence(scene, rival)[0]
+        # What a row of blobs adds is not given away: hidden blobs are, since the shifted lattice may lack the same.
+        assert missing or most_evidence(scene, best, shifted[0]) < evidence(scene, best)[0] - 60
 
 
 def test_evidence_does_not_care_about_the_order_of_cameras_and_fiducials(scene, snapshot, rig, asymmetric8) -> None:
