@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from imgcal.errors import InputError
 from imgcal.io import read_tensors, shipped_names, write_tensors
@@ -58,6 +59,19 @@ class FrameDataset:
     def __len__(self) -> int:
         return len(self.crops)
 
+    @classmethod
+    def cat(cls, parts: Sequence[FrameDataset]) -> FrameDataset:
+        """Concatenate crops, padded to the largest number of fiducials."""
+        most = max((part.place.shape[1] for part in parts), default=0)
+
+        def pad(values: Tensor) -> Tensor:
+            if values.ndim < 2 or values.dtype == torch.float16:
+                return values
+            rest = [0, 0] * (values.ndim - 2)
+            return functional.pad(values, [*rest, 0, most - values.shape[1]])
+
+        return cls(*(torch.cat([pad(getattr(part, field.name)) for part in parts]) for field in fields(cls)))
+
     def select(self, rows: Tensor) -> FrameDataset:
         """Select crops by row."""
         return FrameDataset(*(getattr(self, field.name)[rows] for field in fields(self)))
@@ -87,6 +101,11 @@ class PatchDataset:
 
     def __len__(self) -> int:
         return len(self.light)
+
+    @classmethod
+    def cat(cls, parts: Sequence[PatchDataset]) -> PatchDataset:
+        """Concatenate patches."""
+        return cls(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
     def select(self, rows: Tensor) -> PatchDataset:
         """Keep the patches of these rows."""
