@@ -10,6 +10,7 @@ import queue
 import shutil
 import signal
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,7 +47,6 @@ from imgcal.watch import (
     send,
 )
 
-LOWEST = 19  # how much rather anything else runs than this
 GRACE = 6.0  # s that a training has to stop in, once nobody feeds the process
 NEAR = 5.0  # px within which a claim is right
 TURNED_DEG, ASIDE = 1.0, 0.01  # errors of the pose that networks are given: degrees, and parts of the distance
@@ -112,7 +112,7 @@ class Learner:
     """Keeps crops of snapshots, and adapts networks when there are enough."""
 
     def __init__(self, task: LearningTask, tell: Callable[[Any], None], ended: threading.Event) -> None:
-        """Start with nothing.
+        """Start with nothing kept.
 
         Args:
             task: what to learn.
@@ -127,6 +127,7 @@ class Learner:
         self._held_out: dict[int, Moment] = {}  # with packed frames
         self._latest: Moment | None = None
         self._unwritten = False
+        self.writing = threading.Lock()  # held while files are written that the user may look at
         self._next = 0  # snapshots to train on, from which the next training begins
 
     @property
@@ -174,7 +175,8 @@ class Learner:
         patches = [PatchDataset.cat([self._patches[number] for number in part]) for part in numbers]
         source = Source("imgcal watch --learn", "a running rig", len(self._crops), 0)
         known = patches if all(len(part) for part in patches) else []
-        write_dataset(self.folder / DATASET, splits, known, self._latest.rig, self.task.obj, source)
+        with self.writing:
+            write_dataset(self.folder / DATASET, splits, known, self._latest.rig, self.task.obj, source)
         self._unwritten = False
 
     def _adapt(self) -> None:
@@ -237,7 +239,7 @@ class Learner:
         """Put the adapted networks and their card where the user finds them, in one step."""
         folder, train = self.folder / ADAPTED, self._train
         assert self._latest is not None
-        with publishing(folder, (*SUBJECTS, ADAPTED_CARD), mark=ADAPTED_CARD) as out:
+        with self.writing, publishing(folder, (*SUBJECTS, ADAPTED_CARD), mark=ADAPTED_CARD) as out:
             for name in SUBJECTS:
                 if (self.folder / CANDIDATE / name).is_dir():
                     shutil.move(self.folder / CANDIDATE / name, out / name)
@@ -306,8 +308,6 @@ def _unpack(frames: Any) -> dict[str, Any]:
 
 def main() -> None:
     """Learn from the snapshots on standard input until it ends."""
-    if hasattr(os, "nice"):
-        os.nice(LOWEST)
     for number in (signal.SIGINT, signal.SIGTERM):  # it ends with its pipe, and leaves nothing behind
         signal.signal(number, signal.SIG_IGN)
     torch.set_num_threads(1)
@@ -334,8 +334,8 @@ def main() -> None:
 
     shutil.rmtree(unfinished, ignore_errors=True)  # of a run that was killed
     threading.Thread(target=listen, daemon=True).start()
-    threading.Thread(target=_leave, args=(ended, unfinished), daemon=True).start()
     learner = Learner(task, tell, ended)
+    threading.Thread(target=_leave, args=(ended, learner.writing, unfinished), daemon=True).start()
     try:
         tell(None)
         while (moment := moments.get()) is not None:
@@ -348,9 +348,10 @@ def main() -> None:
         tell(Outcome(f"learning has ended: {error}", failed=True))
 
 
-def _leave(ended: threading.Event, unfinished: Path) -> None:
-    """End the process a while after nobody feeds it, whatever it is doing."""
+def _leave(ended: threading.Event, writing: threading.Lock, unfinished: Path) -> None:
+    """End the process a while after nobody feeds it, whatever it is doing, but between two files."""
     ended.wait()
-    threading.Event().wait(GRACE)
-    shutil.rmtree(unfinished, ignore_errors=True)
-    os._exit(1)
+    time.sleep(GRACE)
+    with writing:
+        shutil.rmtree(unfinished, ignore_errors=True)
+        os._exit(1)

@@ -44,8 +44,10 @@ LARGEST_LAG = 0.5
 """Pixels: a camera that exposes so late shows the object elsewhere than its projection."""
 CLEAR_HEALTH = frozenset({"ok", "dirty", "defocused"})
 """Health of cameras whose projections hold, however bad the images are."""
-LONGEST_END = 10.0
-"""Seconds that the process has to end in."""
+LOWEST = 19
+"""Priority of the process: how much rather anything else runs."""
+LONGEST_END = 30.0
+"""Seconds that the process has to write the dataset and end in."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +172,7 @@ class Learning:
         self._number = 0
         self._last: float | None = None  # s, time of the last snapshot that was sent
         self._waiting: Moment | None = None
-        self._busy = True
+        self._busy, self._started = True, False
         self._outcomes: list[Outcome] = []
         self._changed = threading.Condition()
         self._closing = False
@@ -182,6 +184,12 @@ class Learning:
         """What was learnt, in a few words."""
         return f"learning: {self.kept} snapshots, {self.trainings} trainings, {self.adopted} adopted"
 
+    @property
+    def process_id(self) -> int:
+        """Number of the process."""
+        assert self._process is not None
+        return self._process.pid
+
     def __enter__(self) -> Learning:
         """Start the process."""
         # Not from the current folder, which anybody may have filled.
@@ -190,9 +198,12 @@ class Learning:
             [sys.executable, "-P", "-c", self._code],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, bufsize=0,
             env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
-            start_new_session=True,  # an interruption of the loop is not its own
+            # An interruption of the loop is not its own. In a session of its own, Linux would not compare priorities.
+            process_group=None if sys.platform == "win32" else 0,
             creationflags=getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0),
         )  # fmt: skip
+        if hasattr(os, "setpriority"):
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, LOWEST)
         self._thread = threading.Thread(target=self._work, name="learning", daemon=True)
         self._thread.start()
         return self
@@ -210,6 +221,8 @@ class Learning:
             self._writing.release()
         with contextlib.suppress(OSError):
             process.stdin.close()  # the process ends with it
+        if not self._started:  # it still imports libraries: nothing to wait for
+            process.kill()
         try:
             process.wait(LONGEST_END)
         except subprocess.TimeoutExpired:
@@ -263,7 +276,7 @@ class Learning:
             while True:
                 self._answer(process.stdout)
                 with self._changed:
-                    self._busy = False
+                    self._busy, self._started = False, True
                     self._changed.wait_for(lambda: self._waiting is not None or self._closing)
                     moment, self._waiting = self._waiting, None
                 if self._closing or moment is None:

@@ -121,10 +121,13 @@ def test_snapshots_are_chosen_by_time_pose_and_health_of_cameras(state, tmp_path
     assert not list(tmp_path.iterdir())
 
 
-def test_nothing_is_offered_while_the_process_works(state, tmp_path):
+def test_nothing_is_offered_while_a_process_of_low_priority_works(state, tmp_path):
     with Learning(task(tmp_path), "import time; time.sleep(60)") as learning:
         learning.offer(state, FRAMES)
         assert len(learning._train) == 0
+        # Priorities are compared within a session only.
+        process = learning.process_id
+        assert (os.getpriority(os.PRIO_PROCESS, process), os.getsid(process)) == (19, os.getsid(0))
         learning._process.kill()
 
 
