@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 import imgcal
 from imgcal.association import Proposer
 from imgcal.detection import DetectionOptions, Frame
+from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform
 from imgcal.matching import MatchedFilter
 from imgcal.online import RigState
@@ -282,7 +283,9 @@ class Learning:
                 if self._closing or moment is None:
                     return
                 self._send(process.stdin, moment)
-        except (OSError, EOFError, ValueError):  # it has ended, or was ended
+        except InputError as error:  # the adapted networks cannot be read
+            self._tell(Outcome(f"learning has ended: {error}", failed=True))
+        except (OSError, EOFError, ValueError):  # the process has ended, or is being ended
             if not self._closing:
                 self._tell(Outcome("learning has ended: its process ended unexpectedly", failed=True))
 

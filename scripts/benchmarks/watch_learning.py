@@ -2,11 +2,13 @@
 
 Run as `python -m scripts.benchmarks.watch_learning`. Rig T4 at half its size, asymmetric8 with rings as markers, among
 discs that are no markers (`scripts.results.unlike_markers`). Blocks of updates take turns: in every second one the
-process of `imgcal watch --learn` is stopped by a signal. The loop then goes on until a training has been judged.
+process of `imgcal watch --learn` is stopped by a signal. Between the measured blocks the process gets the usual
+priority, if that is permitted, so that a busy machine comes to an end.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import tempfile
@@ -28,7 +30,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.networks import Expectation
 from imgcal.synthesis import SimulatedRig
 from imgcal.types import CalibrationObject, CameraRig
-from imgcal.watch import CANDIDATE, LEARNING, SUBJECTS, Learning, LearningPlan, LearningTask
+from imgcal.watch import CANDIDATE, LEARNING, LOWEST, SUBJECTS, Learning, LearningPlan, LearningTask
 from scripts.output import ROOT, command, markdown, read_json, surroundings, write_json
 from scripts.results.unlike_markers import CLUTTER, GROUND, LIGHT, NOISE, draw
 
@@ -102,12 +104,21 @@ def measure(options: Options) -> dict[str, Any]:
                     os.kill(learning.process_id, number)
                     rows[f"{phase}, {kind}"] += list(block())
 
+            def hurry(priority: int) -> None:
+                with contextlib.suppress(PermissionError):  # only an administrator may raise it again
+                    os.setpriority(os.PRIO_PROCESS, learning.process_id, priority)
+
             list(block())  # the first ones learn the rig, and wait for the compiler
-            while not candidate.exists() and time.monotonic() < ends:
+            for _ in range(options.blocks):
                 turn("harvest")
+            hurry(0)
+            while not candidate.exists() and time.monotonic() < ends:
+                list(block())
+            hurry(LOWEST)
             for _ in range(options.blocks):
                 if candidate.exists():
                     turn("training")
+            hurry(0)
             while not (found := learning.outcomes()) and time.monotonic() < ends:
                 time.sleep(1.0)
             card = Path(folder) / LEARNING / "adapted" / "README.md"
