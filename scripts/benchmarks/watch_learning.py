@@ -31,10 +31,11 @@ from imgcal.networks import Expectation
 from imgcal.synthesis import SimulatedRig
 from imgcal.types import CalibrationObject, CameraRig
 from imgcal.watch import CANDIDATE, LEARNING, LOWEST, SUBJECTS, Learning, LearningPlan, LearningTask
-from scripts.output import ROOT, command, markdown, read_json, surroundings, write_json
+from scripts.output import ROOT, command, fill, markdown, read_json, surroundings, write_json
 from scripts.results.unlike_markers import CLUTTER, GROUND, LIGHT, NOISE, draw
 
 RESULT = ROOT / "docs" / "benchmarks" / "watch_learning.json"
+PAGE = ROOT / "docs" / "watch.md"
 LOW, HIGH = torch.tensor([[-250.0, -150.0, 750.0], [250.0, 150.0, 950.0]], dtype=torch.float64)
 SIZE = (1024, 544)
 RATE = 5.0  # snapshots a second of the simulated clock
@@ -150,12 +151,14 @@ def table(result: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Measure, write, print."""
+    """Measure, write, print; put the committed result on its page."""
     options = tyro.cli(Options, description=__doc__)
     before = surroundings()
     write_json(options.out, before | measure(options))
     found = read_json(options.out)
     print(table(found), *found["outcomes"], sep="\n")
+    if options.out == RESULT:
+        fill(PAGE, {"watch learning": table(found)})
 
 
 if __name__ == "__main__":
