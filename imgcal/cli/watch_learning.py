@@ -51,7 +51,7 @@ GRACE = 6.0  # s that a training has to stop in, once nobody feeds the process
 NEAR = 5.0  # px within which a claim is right
 TURNED_DEG, ASIDE = 1.0, 0.01  # errors of the pose that networks are given: degrees, and parts of the distance
 SIGMAS = 2.0  # by which an adapted network must be better
-GROWTH = 1.5  # times the snapshots of the last training, until the next
+GROWTH = 1.5  # times the snapshots that had been taken at the last training, until the next
 
 CARD = """# Networks adapted to a rig
 
@@ -128,11 +128,16 @@ class Learner:
         self._latest: Moment | None = None
         self._unwritten = False
         self.writing = threading.Lock()  # held while files are written that the user may look at
-        self._next = 0  # snapshots to train on, from which the next training begins
+        self._taken = self._next = 0  # snapshots to train on that were taken; how many for the next training
 
     @property
     def _train(self) -> list[int]:
         return [number for number in self._crops if number not in self._held_out]
+
+    @property
+    def _frames(self) -> int:
+        """Number of frames to train on."""
+        return sum(len(self._crops[number].camera.unique()) for number in self._train)
 
     def take(self, moment: Moment) -> None:
         """Cut crops out of a snapshot; train if there are enough."""
@@ -153,16 +158,16 @@ class Learner:
         self._latest, self._unwritten = moment, True
         if moment.held_out:
             self._held_out[moment.number] = replace(moment, frames=_pack(moment.frames))
+        self._taken += not moment.held_out
         self._tell(1)
         if self._has_enough():
-            self._next = int(np.ceil(GROWTH * len(self._train)))
+            self._next = int(np.ceil(GROWTH * self._taken))
             self._adapt()
 
     def _has_enough(self) -> bool:
-        plan, train = self.task.plan, self._train
-        frames = sum(len(self._crops[number].camera.unique()) for number in train)
-        enough = frames >= plan.least_frames and len(self._held_out) >= plan.least_held_out
-        return enough and len(train) >= min(self._next, plan.most)
+        plan = self.task.plan
+        enough = self._frames >= plan.least_frames and len(self._held_out) >= plan.least_held_out
+        return enough and self._taken >= self._next
 
     def write(self) -> None:
         """Write the dataset, if it has both parts and has changed."""
@@ -181,8 +186,8 @@ class Learner:
 
     def _adapt(self) -> None:
         """Train, compare, and keep what is better."""
-        self.write()
         try:
+            self.write()
             self._tell(self._compare(self._train_networks()))
         except (InputError, RefusedError) as error:
             self._tell(Outcome(f"the network was not adapted: {error}", failed=True))
@@ -212,7 +217,7 @@ class Learner:
     def _compare(self, candidate: tuple[str, str]) -> Outcome:
         """Compare the adapted networks with the running ones, and publish them if they are better."""
         before, after = (self._scores(load_proposer(*each)) for each in (self._running, candidate))
-        frames = sum(len(self._crops[number].camera.unique()) for number in self._train)
+        frames = self._frames
         (right, wrong), (right_before, wrong_before) = after.shares(), before.shares()
         decided = f"{int(after.decided.sum())} of {len(after.decided)} held-out snapshots decided"
         figures = (

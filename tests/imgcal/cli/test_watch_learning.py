@@ -99,6 +99,17 @@ def test_a_worse_network_is_dropped(moments, ruined, tmp_path, monkeypatch):
     assert [path.name for path in (tmp_path / "learning").iterdir()] == ["dataset"]
 
 
+def test_the_next_training_waits_for_half_as_many_snapshots_more(moments, tmp_path, monkeypatch):
+    found, _, _ = learner(tmp_path, monkeypatch, running=SUBJECTS, trained={})
+    begun = []
+    monkeypatch.setattr(found, "_adapt", lambda: begun.append(found._taken))
+    for moment in (*moments[2:], *moments[:2]):
+        found.take(moment)
+    for number in range(5, 12):  # each in the place of the one before: as where as many are kept as may be
+        found.take(replace(moments[0], number=number, displaced=1 if number == 5 else number - 1))
+    assert begun == [2, 3, 5, 8] and len(found._crops) == 5
+
+
 def test_the_dataset_is_that_of_harvest_and_keeps_the_parts_apart(moments, tmp_path, monkeypatch):
     found, _, _ = learner(tmp_path, monkeypatch, running=SUBJECTS, trained={name: name for name in SUBJECTS})
     monkeypatch.setattr(found, "_has_enough", lambda: False)
