@@ -13,7 +13,7 @@ from imgcal.estimation import (
     relative_difference,
 )
 from imgcal.estimation.implicit import map_cost
-from imgcal.estimation.map_estimate import PATIENCE, initial_state
+from imgcal.estimation.map_estimate import RESTART_AFTER, initial_state
 from imgcal.estimation.robust_losses import LOSSES
 from imgcal.synthesis.rigs import Drift, PhysicalDrift, RelativeDrift
 
@@ -86,7 +86,7 @@ def test_beginning_again_leaves_the_others_alone(simulate) -> None:
     problem, start = case.problem(), initial_state(case.problem(), together.rig_from_object, None)
     assert (
         0
-        < int((~levenberg_marquardt_cpu.minimize(problem, start, "squared", 3.0, PATIENCE, 1e-4).converged).sum())
+        < int((~levenberg_marquardt_cpu.minimize(problem, start, "squared", 3.0, RESTART_AFTER, 1e-4).converged).sum())
         < 40
     )
     for row in range(0, 40, 5):

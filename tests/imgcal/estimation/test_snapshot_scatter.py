@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from imgcal.estimation import camera_covariance, camera_std, estimate
-from imgcal.estimation.blocks import BlockScatter, block_scatter
 from imgcal.estimation.robust_losses import NamedLoss
+from imgcal.estimation.snapshot_scatter import BlockScatter, block_scatter
 from imgcal.geometry.transforms import RigidTransform
 
 LOSS = NamedLoss("huber", 3.0)
