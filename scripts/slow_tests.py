@@ -1,9 +1,9 @@
-"""Choose the tests that a newcomer's run leaves out, from what a whole run has measured.
+"""Choose the slow tests, which a default run skips, from the durations of a full run.
 
     python -m pytest --slow --numprocesses auto --dist loadfile --durations=0 > durations.log
     python -m scripts.slow_tests durations.log          # rewrites tests/slow_tests.txt
 
-The slowest tests are named until the rest fits into the budget.
+Tests are added to the list, slowest first, until the rest fits into the budget.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from scripts.output import ROOT
 
 LIST = ROOT / "tests" / "slow_tests.txt"
 LINE = re.compile(r"^\s*([\d.]+)s (?:call|setup|teardown)\s+(\S+?)(?:\[.*\])?\s*$")
-HEAD = """# Tests that take long, by the beginning of their node ids. CI=true or `scripts/test --slow` runs them.
-# Rewritten from measured durations by: python -m scripts.slow_tests DURATIONS.log
+HEAD = """# Slow tests, by the start of their node ids. CI=true or `scripts/test --slow` runs them.
+# Generated from measured durations by: python -m scripts.slow_tests DURATIONS.log
 """
 
 
@@ -30,12 +30,12 @@ class Options:
     """Rewrite the list of slow tests."""
 
     log: Annotated[Path, tyro.conf.Positional]  #: output of pytest with --durations=0
-    seconds: float = 400.0  #: what the rest may take, of one core
+    seconds: float = 400.0  #: time budget for the rest, on one core
     out: Path = LIST
 
 
 def slowest(log: str, seconds: float) -> list[str]:
-    """Name tests, the slowest first, until the others take at most so many seconds; cases of a test count together."""
+    """List the slowest tests, until the others fit into `seconds`; parametrized cases of a test count together."""
     spent: dict[str, float] = {}
     for line in log.splitlines():
         if found := LINE.match(line):
@@ -50,7 +50,7 @@ def slowest(log: str, seconds: float) -> list[str]:
 
 
 def main() -> None:
-    """Read, choose, write."""
+    """Read the durations, choose the slow tests, and write the list."""
     options = tyro.cli(Options, description=__doc__)
     named = slowest(options.log.read_text(), options.seconds)
     write_text(options.out, HEAD + "".join(f"{name}\n" for name in sorted(named)))

@@ -1,4 +1,4 @@
-"""Results of benchmarks as they are committed: whole, within what they promise, and on their pages."""
+"""Committed benchmark results are complete, within their targets, and shown on their pages."""
 
 from scripts.benchmarks import honesty_moves, honesty_prediction, image_quality, open_igt_link, qualisys_stream
 from scripts.output import read_json

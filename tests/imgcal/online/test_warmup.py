@@ -1,4 +1,4 @@
-"""What is compiled ahead of time: all of it in one process, then nothing in another."""
+"""One process compiles everything ahead of time, and another then compiles nothing."""
 
 import json
 import os
