@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 from imgcal.cli import arguments
 from imgcal.cli.common import check_folder, open_rig, parse_range, progress, read_detections
@@ -25,7 +27,7 @@ from imgcal.types import CalibrationObject, CameraRig
 
 CARD_TEXT = """# Crops of real frames
 
-Made by `imgcal harvest` from {capture} ({snapshots} snapshots, {cameras} cameras of rig {rig}, object {object}).
+Made by `{command}` from {capture} ({snapshots} snapshots, {cameras} cameras of rig {rig}, object {object}).
 
 | file | crops | markers to be seen | snapshots |
 |---|---|---|---|
@@ -75,16 +77,11 @@ class Harvest(arguments.Harvest):
             lambda snapshot: capture.frames_of(first + snapshot), detections, rig, obj,
             detection=self.detection, sight=sight, size=self.size, seed=self.seed, progress=bar,
         )  # fmt: skip
-        count = len(detections.snapshot_names), rig.num_cameras
-        splits, parts = split(crops, *count), self._split_patches(patches, *count)
-        about = {"capture": str(self.capture), "rig": rig.name, "object": obj.name, "seed": self.seed}
-        with publishing(self.out, (CARD, TRAIN, HELD_OUT, TRAIN_PATCHES, HELD_OUT_PATCHES), mark=CARD) as out:
-            for name, part in zip((TRAIN, HELD_OUT), splits, strict=True):
-                part.save(out / name, about)
-            for name, some in zip((TRAIN_PATCHES, HELD_OUT_PATCHES), parts, strict=False):
-                some.save(out / name, about)
-            card = self._card(rig, obj, len(detections.snapshot_names), *splits)
-            write_text(out / CARD, card.replace("{patches}", self._say_patches(parts)))
+        count = len(detections.snapshot_names)
+        splits = split(crops, count, rig.num_cameras)
+        parts = self._split_patches(patches, count, rig.num_cameras)
+        source = Source("imgcal harvest", str(self.capture), count, self.seed)
+        write_dataset(self.out, splits, parts, rig, obj, source)
         said = [f"{len(part)} crops with {_count_markers(part)} markers" for part in splits]
         print(f"{self.out}: {said[0]} for training, {said[1]} held out", file=sys.stderr)
 
@@ -95,22 +92,55 @@ class Harvest(arguments.Harvest):
         except RefusedError:
             return ()
 
-    def _say_patches(self, parts: Sequence[PatchDataset]) -> str:
-        if not parts:
-            return NO_PATCHES
-        return PATCHES_TEXT.format(train=len(parts[0]), held_out=len(parts[1]), folder=self.out)
 
-    def _card(
-        self, rig: CameraRig, obj: CalibrationObject, snapshots: int, train: FrameDataset, held_out: FrameDataset
-    ) -> str:
-        """Say what is in the dataset."""
-        return CARD_TEXT.format(
-            capture=self.capture, snapshots=snapshots, cameras=rig.num_cameras, rig=rig.name, object=obj.name,
-            train=len(train), train_seen=_count_markers(train), train_snapshots=len(train.snapshot.unique()),
-            held_out=len(held_out), held_out_seen=_count_markers(held_out),
-            held_out_snapshots=len(held_out.snapshot.unique()),
-            folder=self.out, patches="{patches}",
-        )  # fmt: skip
+@dataclass(frozen=True)
+class Source:
+    """Where the snapshots of a dataset come from."""
+
+    command: str  # that made the dataset
+    capture: str
+    snapshots: int
+    seed: int  # of the crops' places
+
+
+def write_dataset(
+    folder: Path,
+    splits: Sequence[FrameDataset],
+    patches: Sequence[PatchDataset],
+    rig: CameraRig,
+    obj: CalibrationObject,
+    source: Source,
+) -> None:
+    """Write crops and patches, each to train on and held out, and a card, in one step; patches may be missing."""
+    about = {"capture": source.capture, "rig": rig.name, "object": obj.name, "seed": source.seed}
+    with publishing(folder, (CARD, TRAIN, HELD_OUT, TRAIN_PATCHES, HELD_OUT_PATCHES), mark=CARD) as out:
+        for name, part in zip((TRAIN, HELD_OUT), splits, strict=True):
+            part.save(out / name, about)
+        for name, some in zip((TRAIN_PATCHES, HELD_OUT_PATCHES), patches, strict=False):
+            some.save(out / name, about)
+        write_text(out / CARD, _card(folder, splits, patches, rig, obj, source))
+
+
+def _card(
+    folder: Path,
+    splits: Sequence[FrameDataset],
+    patches: Sequence[PatchDataset],
+    rig: CameraRig,
+    obj: CalibrationObject,
+    source: Source,
+) -> str:
+    """Say what is in the dataset."""
+    train, held_out = splits
+    of_patches = NO_PATCHES
+    if patches:
+        of_patches = PATCHES_TEXT.format(train=len(patches[0]), held_out=len(patches[1]), folder=folder)
+    return CARD_TEXT.format(
+        command=source.command, capture=source.capture, snapshots=source.snapshots, cameras=rig.num_cameras,
+        rig=rig.name, object=obj.name, folder=folder, patches=of_patches,
+        train=len(train), train_seen=_count_markers(train), train_snapshots=len(train.snapshot.unique()),
+        held_out=len(held_out), held_out_seen=_count_markers(held_out),
+        held_out_snapshots=len(held_out.snapshot.unique()),
+    )  # fmt: skip
 
 
 def _count_markers(part: FrameDataset) -> int:

@@ -29,7 +29,9 @@ from imgcal.types import CalibrationObject, CameraRig, Detections, object_differ
 from imgcal.watch import (
     CURRENT,
     EVENTS,
+    LEARNING,
     STATE,
+    SUBJECTS,
     Bag,
     BlobTable,
     Folder,
@@ -37,6 +39,9 @@ from imgcal.watch import (
     JsonLines,
     Known,
     LabStreaming,
+    Learning,
+    LearningPlan,
+    LearningTask,
     MarkerFile,
     Metrics,
     OpenIGTLink,
@@ -52,15 +57,19 @@ from imgcal.watch import (
     Timing,
     Videos,
     ZeroMQ,
+    adapted_networks,
     forget_after,
     holds_videos,
     listening_address,
     put_aside,
+    run_networks,
 )
 from imgcal.watch import Watch as Loop
 
 MARKER_SUFFIXES, TABLE_SUFFIXES = (".c3d", ".trc"), (".csv", ".jsonl")
 POSE_OUTPUTS = "FILE.csv, FILE.jsonl, FILE.c3d, FILE.trc, tcp://HOST:PORT or igtl://[HOST:]PORT"
+BLOBS_ONLY = (BlobTable, JsonLines, LabStreaming, Qualisys)
+LEARNING_CODE = "from imgcal.cli.watch_learning import main; main()"
 USUAL_RATE = 30.0  # snapshots a second of a table of blobs
 
 # What kind of input an option is for.
@@ -81,6 +90,8 @@ class Watch(arguments.Watch):
         rig, given = open_rig(self.rig), load_objects(self.object)
         check_folder(self.out)
         _check_poses(self.poses, given.as_unknown(), self.out)
+        if self.learn:
+            self._check_learning(given)
         with holding(self.out) as folder:
             self._watch(rig, given, folder)
 
@@ -89,6 +100,8 @@ class Watch(arguments.Watch):
         with _going_on():
             progress = None if self.fresh else Progress.load(folder)
         source, origin = self._source(rig, given.rows, progress), self._origin()
+        if self.learn and isinstance(source, BLOBS_ONLY):
+            raise InputError(f"--learn: found blobs without frames ({shorten(self.input)}), expected frames of cameras")
         rate = source.rate if isinstance(source, BlobTable) else None
         goes_on = source.live and not self.keep_all  # what came since the last state is gone
         knows = goes_on or isinstance(source, Folder)  # a folder knows which files have been read
@@ -107,6 +120,14 @@ class Watch(arguments.Watch):
                 stack.enter_context(Poses(name, _pose_sink(name, rig, obj)))
                 for name in sorted(self.poses, key=_is_table)
             ]
+            learning = None
+            if self.learn:
+                running = (None if self.fresh else adapted_networks(folder)) or SUBJECTS
+                task = LearningTask(folder, obj, self.detection, LearningPlan(), running)
+                learning = stack.enter_context(Learning(task, LEARNING_CODE))
+                if running != SUBJECTS:
+                    keeper.use_proposer(run_networks(running))
+                print(f"learning from the frames of this rig: {folder / LEARNING}")
             page = None
             if self.serve is not None:
                 from imgcal.live_page import LivePage, parse_address  # brings a server along, which is not in the core
@@ -116,7 +137,7 @@ class Watch(arguments.Watch):
             loop = Loop(
                 keeper, folder, hook, page, display.show_event, display.warn, _removing(source), source=origin,
                 rate=rate,
-                poses=poses,
+                poses=poses, learning=learning,
             )  # fmt: skip
             if self.metrics is not None:
                 stack.enter_context(Metrics(loop.tally, intake, hook, metrics_address(self.metrics)))
@@ -137,6 +158,8 @@ class Watch(arguments.Watch):
         said = display.result(self.out / CURRENT)
         if lost := [f"{output.name}: {output.lost:,} poses" for output in poses if output.lost]:
             said = f"{said} | not written: {'; '.join(lost)}"
+        if learning is not None:
+            said = f"{said} | {learning.summary}"
         if loop.unwritten:
             said = f"{said} | not written: {'; '.join(loop.unwritten.values())}"
         if stopped.interrupted:
@@ -216,6 +239,19 @@ class Watch(arguments.Watch):
             given = getattr(self, option.replace("-", "_"))
             if meant != kind and not (given is None or given is False or given == ()):
                 raise InputError(f"--{option}: needs {meant}, found {kind} ({shorten(self.input)})")
+
+    def _check_learning(self, obj: CalibrationObject) -> None:
+        """Refuse to learn where no network runs, or none can learn.
+
+        Raises:
+            InputError: says what `--learn` needs.
+        """
+        if self.detector != "learned":
+            found = f"found --detector {shorten(self.detector)}"
+            raise InputError(f"--learn: {found}, expected --detector learned: it adapts the network that this runs")
+        if obj.board is not None or obj.as_unknown().unknown_markers or obj.parts:
+            found = f"found {shorten(obj.name)}"
+            raise InputError(f"--learn: {found}, expected one object whose markers keep their distances")
 
     def _keeper(self, folder: Path, rig: CameraRig, obj: CalibrationObject) -> tuple[RigKeeper, bool]:
         """Begin, or go on with what an earlier run knew; says whether it did."""

@@ -22,6 +22,7 @@ EventKind = Literal[
     "clock_slip",
     "restart",
     "factory",
+    "network",
 ]
 ChangeKind = Literal["rotation", "position", "focal_length", "principal_point", "unknown"]
 Unit = Literal["deg", "mm", "px", "frames"]

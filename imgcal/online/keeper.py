@@ -297,6 +297,10 @@ class RigKeeper:
         lights = None if labelled is None else labelled.checked.lights
         return replace(state, cameras=health, events=tuple(events), sentence=sentence, lights=lights)
 
+    def use_proposer(self, proposer: Proposer) -> None:
+        """Find fiducials in frames with this proposer from now on; saved states do not contain it."""
+        self._labelling.use_proposer(proposer)
+
     def accept_as_factory(self) -> Event:
         """Make the current rig the factory calibration, relative to which motion is reported; the belief is unchanged.
 

@@ -73,6 +73,10 @@ class Labelling:
             self._proposer, self._where_blobs_fail = choose_proposer(detector)
         self._pool = ThreadPoolExecutor(min(rig.num_cameras, os.cpu_count() or 1))
 
+    def use_proposer(self, proposer: Proposer) -> None:
+        """Find fiducials in frames with this proposer from now on."""
+        self._proposer, self._where_blobs_fail = proposer, False
+
     def close(self) -> None:
         """Stop the threads."""
         self._pool.shutdown()

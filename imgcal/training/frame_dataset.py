@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from imgcal.errors import InputError
 from imgcal.io import read_tensors, shipped_names, write_tensors
@@ -60,6 +61,19 @@ class Samples:
     def select(self, rows: Tensor) -> Self:
         """Select samples by row."""
         return type(self)(*(tensor[rows] for tensor in self.tensors().values()))
+
+    @classmethod
+    def cat(cls, parts: Sequence[Self]) -> Self:
+        """Concatenate samples; the second axis, such as the fiducials, is padded to the longest."""
+
+        def join(tensors: list[Tensor]) -> Tensor:
+            if tensors[0].ndim == 1:
+                return torch.cat(tensors)
+            most = max(tensor.shape[1] for tensor in tensors)
+            padding = [0, 0] * (tensors[0].ndim - 2)
+            return torch.cat([functional.pad(each, [*padding, 0, most - each.shape[1]]) for each in tensors])
+
+        return cls(*(join([getattr(part, name) for part in parts]) for name in cls.names()))
 
     def save(self, path: str | Path, about: Mapping[str, Any]) -> None:
         """Write a file in one step; `about` has plain values that describe the origin of the samples."""

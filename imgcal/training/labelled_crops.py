@@ -7,7 +7,7 @@ learns your own markers, lamps, lenses and walls.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -105,8 +105,7 @@ def cut_labelled(
             patches.append(replace(own, snapshot=torch.full_like(own.snapshot, snapshot)))
             part = _cut(shown, rig, obj, pose, seen, sigma, detection, size, generator)
             parts.append(replace(part, snapshot=torch.full_like(part.snapshot, snapshot)))
-    columns = (torch.cat([getattr(part, field.name) for part in patches]) for field in fields(PatchDataset))
-    return _join(parts), PatchDataset(*columns)
+    return FrameDataset.cat(parts), PatchDataset.cat(patches)
 
 
 def fit_poses(
@@ -336,17 +335,3 @@ def _normalize_light(light: Tensor, place: Tensor, shown: Tensor) -> tuple[Tenso
     usable = (shown.sum(1) >= LEAST_SEEN) & (level > 0)
     scale = torch.where(usable, level, 1.0)
     return ((light - ground[:, None, None]) / scale[:, None, None]).clamp(-100, 100), usable
-
-
-def _join(parts: list[FrameDataset]) -> FrameDataset:
-    """Concatenate crops, padded to the largest number of fiducials."""
-    most = max((part.place.shape[1] for part in parts), default=0)
-
-    def pad(values: Tensor) -> Tensor:
-        if values.ndim < 2 or values.dtype == torch.float16:
-            return values
-        rest = [0, 0] * (values.ndim - 2)
-        return functional.pad(values, [*rest, 0, most - values.shape[1]])
-
-    names = [field.name for field in fields(FrameDataset)]
-    return FrameDataset(*(torch.cat([pad(getattr(part, name)) for part in parts]) for name in names))

@@ -5,6 +5,24 @@ from .folder import Folder
 from .hook import Hook
 from .json_lines import JsonLines
 from .lab_streaming import LabStreaming
+from .learning import (
+    ADAPTED,
+    ADAPTED_CARD,
+    CANDIDATE,
+    DATASET,
+    LEARNING,
+    LOWEST,
+    SUBJECTS,
+    Learning,
+    LearningPlan,
+    LearningTask,
+    Moment,
+    Outcome,
+    adapted_networks,
+    receive,
+    run_networks,
+    send,
+)
 from .loop import EVENTS, STATE, Keeper, Page, Progress, Watch
 from .marker_files import MarkerFile
 from .metrics import Metrics, Tally
@@ -21,10 +39,17 @@ from .timing import Timing
 from .zeromq import ZeroMQ
 
 __all__ = [
+    "ADAPTED",
+    "ADAPTED_CARD",
+    "CANDIDATE",
     "COUNTS",
     "CURRENT",
+    "DATASET",
     "EVENTS",
+    "LEARNING",
+    "LOWEST",
     "STATE",
+    "SUBJECTS",
     "Bag",
     "BlobTable",
     "CameraBlobs",
@@ -37,9 +62,14 @@ __all__ = [
     "Keeper",
     "Known",
     "LabStreaming",
+    "Learning",
+    "LearningPlan",
+    "LearningTask",
     "MarkerFile",
     "Metrics",
+    "Moment",
     "OpenIGTLink",
+    "Outcome",
     "Page",
     "PoseFile",
     "PosePublisher",
@@ -59,9 +89,13 @@ __all__ = [
     "Videos",
     "Watch",
     "ZeroMQ",
+    "adapted_networks",
     "check_exposure",
     "forget_after",
     "holds_videos",
     "listening_address",
     "put_aside",
+    "receive",
+    "run_networks",
+    "send",
 ]

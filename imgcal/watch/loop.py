@@ -10,12 +10,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
 
+from imgcal.association import Proposer
 from imgcal.errors import InputError, RefusedError
 from imgcal.io import Frame, read_json
 from imgcal.online import Event, RigState
 from imgcal.types import CameraRig, Detections
 from imgcal.watch.event_log import EventLog
 from imgcal.watch.hook import Hook
+from imgcal.watch.learning import Learning
 from imgcal.watch.metrics import Tally
 from imgcal.watch.poses import Poses
 from imgcal.watch.rig_files import FRAMES, STATE, RigFiles
@@ -58,6 +60,9 @@ class Keeper(Protocol):
         Raises:
             RefusedError: no snapshot has come yet.
         """
+
+    def use_proposer(self, proposer: Proposer) -> None:
+        """Find fiducials in frames with this proposer from now on."""
 
 
 class Page(Protocol):
@@ -126,6 +131,7 @@ class Watch:
         source: str | None = None,
         rate: float | None = None,
         poses: Collection[Poses] = (),
+        learning: Learning | None = None,
     ) -> None:
         """Prepare; nothing is written before it is entered.
 
@@ -140,11 +146,12 @@ class Watch:
             source: identity of the source.
             rate: snapshots per second of a source without times.
             poses: get the state after each snapshot; not closed here.
+            learning: adapts the network that finds fiducials; not closed here.
         """
         self.keeper, self.folder, self.tally = keeper, folder, Tally()
         self.paused = False
         self._hook, self._page, self._told, self._problem = hook, page, told, problem
-        self._poses = poses
+        self._poses, self._learning = poses, learning
         self._when_saved, self._source, self._rate = saved, source, rate
         self._saved = time.monotonic()
         self._progress: Progress | None = None
@@ -196,6 +203,7 @@ class Watch:
             self._apply_commands()
             self._report_hook()
             self._report_poses()
+            self._apply_learning()
             if snapshot is not None:
                 self.process(snapshot)
             if time.monotonic() - self._saved >= SAVED_EVERY:
@@ -230,6 +238,8 @@ class Watch:
             output.publish(state)
         if self._page is not None:
             self._page.publish(state, snapshot.frames(names))
+        if self._learning is not None:
+            self._learning.offer(state, snapshot.frames(names))
         return state
 
     def publish_event(self, event: Event) -> None:
@@ -289,6 +299,15 @@ class Watch:
         self.tally.problems[output] += 1
         if self.tally.problems[output] == 1:
             self._problem(message)
+
+    def _apply_learning(self) -> None:
+        """Switch to an adapted network, and report what came of trainings."""
+        for outcome in () if self._learning is None else self._learning.outcomes():
+            if outcome.proposer is not None:
+                self.keeper.use_proposer(outcome.proposer)
+            state = self.tally.latest
+            when = (time.time(), 0) if state is None else (state.time, state.snapshot)
+            self.publish_event(Event(*when, "network", message=outcome.message))
 
     def _apply_commands(self) -> None:
         """Execute users' commands."""

@@ -11,6 +11,7 @@ from imgcal.online import RigKeeper
 from imgcal.watch import loop as module
 from imgcal.watch.exposures import CameraBlobs, Exposure
 from imgcal.watch.hook import Hook
+from imgcal.watch.learning import Outcome
 from imgcal.watch.loop import Progress, Watch
 from imgcal.watch.poses import Poses
 from imgcal.watch.source_reader import SourceReader
@@ -218,3 +219,29 @@ def test_poses_go_out_and_an_output_that_fails_is_told_once(tmp_path):
                 time.sleep(0.01)
     assert good.records == [(number, "ok") for number in range(3)]
     assert told == ["broken: cannot be written: no space for 0"] and broken.lost == 3
+
+
+class LearningOfLists:
+    def __init__(self, *outcomes):
+        self.offered, self._outcomes = [], list(outcomes)
+
+    def offer(self, state, frames):
+        self.offered.append((state.snapshot, set(frames)))
+
+    def outcomes(self):
+        found, self._outcomes = self._outcomes, []
+        return found
+
+
+def test_an_adapted_network_is_switched_in_and_what_came_of_a_training_is_an_event(tmp_path):
+    keeper, page, told, used = KeeperOfStates(), PageOfLists(), [], []
+    keeper.use_proposer = used.append
+    learning = LearningOfLists(Outcome("no better and is dropped"), Outcome("runs", adopted=True, proposer="new"))
+    with (
+        Watch(keeper, tmp_path, page=page, told=told.append, learning=learning) as loop,
+        SourceReader(Snapshots(1.0, 2.0), RIG) as intake,
+    ):
+        loop.run(intake, threading.Event())
+    assert used == ["new"] and [offered[0] for offered in learning.offered] == [0, 1]
+    assert [(e.kind, e.message) for e in told] == [("network", "no better and is dropped"), ("network", "runs")]
+    assert page.told == told and events_of(tmp_path) == ["network", "network"]

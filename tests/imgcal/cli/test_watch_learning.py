@@ -1,0 +1,268 @@
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from imgcal.cli import watch_learning as module
+from imgcal.cli.main import main
+from imgcal.cli.watch_learning import Learner, Scores, ask
+from imgcal.detection import DetectionOptions
+from imgcal.io import data_path, load_object, model_file, read_rig, save_detections
+from imgcal.networks import load_infrared
+from imgcal.pipeline import load_proposer
+from imgcal.synthesis import FrameModel, PhysicalDrift, simulate_frames, simulate_truth, true_detections
+from imgcal.training import load_patches, load_splits
+from imgcal.watch import SUBJECTS, LearningPlan, LearningTask, Moment, Outcome, adapted_networks
+
+OBJECT = load_object("asymmetric8")
+PLAN = LearningPlan(least_frames=8, least_held_out=3)
+
+
+@pytest.fixture(scope="module")
+def moments():
+    """Two snapshots to train on, and three that are held out."""
+    rig, generator = read_rig("T4").resized(torch.tensor([512, 272])), torch.Generator().manual_seed(4)
+    truth = simulate_truth(rig, OBJECT, 5, generator, PhysicalDrift())
+    blobs, frames = true_detections(truth), simulate_frames(truth, OBJECT, FrameModel(), generator)
+    return [
+        Moment(number, number > 1, shown, blobs.of_snapshots(number, number + 1), truth.rig, pose, None)
+        for number, (shown, pose) in enumerate(zip(frames, truth.rig_from_object, strict=True))
+    ]
+
+
+@pytest.fixture(scope="module")
+def ruined(tmp_path_factory):
+    """A network that finds nothing."""
+    network = load_infrared(model_file("ir-cnn"))
+    with torch.no_grad():
+        for weights in network.network.parameters():
+            weights.zero_()
+    path = tmp_path_factory.mktemp("ruined") / "model.safetensors"
+    network.save(path)
+    return str(path)
+
+
+def learner(folder, monkeypatch, *, running, trained, ended=None):
+    """Learns from moments; a training gives these networks."""
+    said, asked = [], []
+
+    def train_in(out, experiment, should_stop):
+        asked.append((Path(out).name, experiment.frames, experiment.training.threads, experiment.training.device))
+        Path(out).mkdir(parents=True)
+        shutil.copy(model_file(trained[asked[-1][0]]), Path(out) / "model.safetensors")
+        return SimpleNamespace(seconds=1.0)
+
+    monkeypatch.setattr(module, "train_in", train_in)
+    monkeypatch.setattr(module, "is_finished", lambda run, seconds: True)
+    task = LearningTask(folder, OBJECT, DetectionOptions(), PLAN, running)
+    return Learner(task, said.append, ended or threading.Event()), said, asked
+
+
+def test_a_better_network_is_published_with_its_card(moments, ruined, tmp_path, monkeypatch):
+    running = (ruined, "measurer-cnn")
+    found, said, asked = learner(tmp_path, monkeypatch, running=running, trained={name: name for name in SUBJECTS})
+    for moment in moments:
+        found.take(moment)
+    *taken, outcome = said
+    assert taken == [1] * 5 and outcome.adopted and "runs from now on: right 100.0 %" in outcome.message
+    dataset = tmp_path / "learning" / "dataset"
+    assert asked == [(name, str(dataset), 1, "cpu") for name in SUBJECTS]
+    networks = adapted_networks(tmp_path)
+    assert networks == tuple(str(tmp_path / "learning" / "adapted" / name) for name in SUBJECTS)
+    assert load_proposer(*networks).network.config == load_proposer().network.config
+    card = (tmp_path / "learning" / "adapted" / "README.md").read_text()
+    assert "| before | 0.0 | 0.0 | 0 of 3 |" in card and "| adapted | 100.0 | 0.0 | 3 of 3 |" in card
+    assert sorted(path.name for path in (tmp_path / "learning").iterdir()) == ["adapted", "dataset"]
+    # It is what the next candidate is compared with.
+    found._adapt()
+    assert not said[-1].adopted and "no better and is dropped" in said[-1].message
+
+
+def test_a_worse_network_is_dropped(moments, ruined, tmp_path, monkeypatch):
+    trained = {"ir-cnn": ruined, "measurer-cnn": "measurer-cnn"}
+    found, said, _ = learner(tmp_path, monkeypatch, running=SUBJECTS, trained=trained)
+    for moment in moments:
+        found.take(moment)
+    assert not said[-1].adopted and "no better and is dropped: right 0.0 %" in said[-1].message
+    assert adapted_networks(tmp_path) is None
+    assert [path.name for path in (tmp_path / "learning").iterdir()] == ["dataset"]
+
+
+def test_the_next_training_waits_for_half_as_many_snapshots_more(moments, tmp_path, monkeypatch):
+    found, _, _ = learner(tmp_path, monkeypatch, running=SUBJECTS, trained={})
+    begun = []
+    monkeypatch.setattr(found, "_adapt", lambda: begun.append(found._taken))
+    for moment in (*moments[2:], *moments[:2]):
+        found.take(moment)
+    for number in range(5, 12):  # each in the place of the one before: as where as many are kept as may be
+        found.take(replace(moments[0], number=number, displaced=1 if number == 5 else number - 1))
+    assert begun == [2, 3, 5, 8] and len(found._crops) == 5
+
+
+def test_the_dataset_is_that_of_harvest_and_keeps_the_parts_apart(moments, tmp_path, monkeypatch):
+    found, _, _ = learner(tmp_path, monkeypatch, running=SUBJECTS, trained={name: name for name in SUBJECTS})
+    monkeypatch.setattr(found, "_has_enough", lambda: False)
+    found.write()
+    assert not list(tmp_path.iterdir())  # nothing yet
+    for moment in moments[:4]:
+        found.take(moment)
+    found.take(replace(moments[4], displaced=3))
+    found.write()
+    folder = tmp_path / "learning" / "dataset"
+    for train, held_out in (load_splits(folder), load_patches(folder)):
+        assert (set(train.snapshot.tolist()), set(held_out.snapshot.tolist())) == ({0, 1}, {2, 4})
+    assert "Made by `imgcal watch --learn`" in (folder / "README.md").read_text()
+
+
+def test_a_training_that_nobody_waits_for_leaves_nothing(moments, tmp_path, monkeypatch):
+    ended = threading.Event()
+    found, said, _ = learner(tmp_path, monkeypatch, running=SUBJECTS, trained=dict.fromkeys(SUBJECTS), ended=ended)
+
+    def train_in(out, experiment, should_stop):
+        Path(out).mkdir(parents=True)
+        ended.set()
+        return SimpleNamespace(seconds=1.0) if should_stop() else None
+
+    monkeypatch.setattr(module, "train_in", train_in)
+    monkeypatch.setattr(module, "is_finished", lambda run, seconds: False)
+    with pytest.raises(module._EndedError):
+        for moment in moments:
+            found.take(moment)
+    assert not any(isinstance(each, Outcome) for each in said)
+    assert [path.name for path in (tmp_path / "learning").iterdir()] == ["dataset"]
+
+
+def test_a_training_that_fails_is_reported(moments, tmp_path, monkeypatch):
+    found, said, _ = learner(tmp_path, monkeypatch, running=SUBJECTS, trained={name: name for name in SUBJECTS})
+    (tmp_path / "learning").mkdir()
+    (tmp_path / "learning" / "candidate").mkdir()
+    monkeypatch.setattr(module, "adaptation", lambda name, folder: ["training.steps=-1"])
+    for moment in moments:
+        found.take(moment)
+    assert said[-1].failed and said[-1].message.startswith("the network was not adapted: ")
+    assert not (tmp_path / "learning" / "candidate").exists()
+
+
+def test_a_gain_must_be_larger_than_its_uncertainty():
+    def scores(*right, claimed=8, decided=True):
+        return Scores(*(np.array(n) for n in ([8] * len(right), right, [claimed] * len(right), [decided] * len(right))))
+
+    assert scores(8, 8, 8, 8).is_better(scores(7, 6, 7, 7))
+    assert not scores(8, 5, 8, 6).is_better(scores(7, 6, 7, 6))  # better on average
+    assert not scores(8, 8, 8, 8).is_better(scores(8, 8, 8, 8))
+    assert not scores(8, 8, 8, 8, decided=False).is_better(scores(7, 6, 7, 7))
+    assert scores(6, 6, claimed=6).is_better(scores(6, 6, claimed=8))  # fewer wrong claims
+
+
+def test_networks_are_asked_from_the_same_pose_nearby(moments, ruined):
+    task = LearningTask(Path("out"), OBJECT, DetectionOptions(), PLAN, SUBJECTS)
+    first, again = (module._believe(moments[2].rig_from_object, moments[2], task) for _ in range(2))
+    assert torch.equal(first.rotation, again.rotation) and torch.equal(first.translation, again.translation)
+    middle = OBJECT.points.mean(0, keepdim=True).double()
+    off = (first.apply(middle) - moments[2].rig_from_object.apply(middle)).norm()
+    far = (moments[2].rig.positions - moments[2].rig_from_object.apply(middle)).norm(dim=-1).mean()
+    assert float(off / far) == pytest.approx(0.01, abs=1e-6)
+    assert ask(load_proposer(), moments[2], task) == (32, 32, 32, True)
+    assert ask(load_proposer(ruined), moments[2], task) == (32, 0, 0, False)
+
+
+DYING = """
+import os, pickle, signal, sys, time
+from imgcal.watch import Learning, learning
+learning.LOWEST = 0  # a busy machine would not let it begin
+moments, task = pickle.loads(sys.stdin.buffer.read())
+with Learning(task, "from imgcal.cli.watch_learning import main; main()") as process:
+    for moment in moments:
+        while process._busy:
+            time.sleep(0.05)
+        process._waiting, process._busy = moment, True
+        with process._changed:
+            process._changed.notify()
+    folder = task.folder / "learning" / "candidate" / "ir-cnn" / "resolved.yaml"
+    while not folder.exists():
+        time.sleep(0.05)
+    print(process.process_id, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_killed_watch_leaves_no_process_and_no_half_file(moments, tmp_path):
+    plan = replace(PLAN, changes=("training.steps=100000",))
+    task = LearningTask(tmp_path, OBJECT, DetectionOptions(), plan, SUBJECTS)
+    done = subprocess.run(
+        [sys.executable, "-c", DYING], input=pickle.dumps((moments, task)), capture_output=True, timeout=500,
+        env=os.environ | {"PYTHONPATH": str(Path.cwd())},
+    )  # fmt: skip
+    assert done.returncode == -signal.SIGKILL, done.stderr.decode()
+    process, until = int(done.stdout), time.monotonic() + 120
+    while _runs(process) and time.monotonic() < until:
+        time.sleep(0.1)
+    assert not _runs(process)
+    assert [path.name for path in (tmp_path / "learning").iterdir()] == ["dataset"]
+    assert not list(tmp_path.rglob(".*"))
+    load_splits(tmp_path / "learning" / "dataset")
+
+
+def _runs(process):
+    """Whether a process does: one that has ended and waits to be collected does not."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def watch(workplace, out, *more):
+    given = ["watch", str(workplace.capture), "--rig", str(workplace.capture / "truth" / "rig.yaml")]
+    given += ["--object", str(workplace.object), "--out", str(out), "--until-idle", "0.5"]
+    return main([*given, *more])
+
+
+def test_frames_are_learnt_from_only_when_asked(workplace, tmp_path, capsys):
+    for path in (workplace.capture / "frames").glob("*/*"):
+        os.utime(path, (1e9 + 2 * int(path.stem),) * 2)  # 1e9 is at the beginning of a stretch to train on
+    assert watch(workplace, tmp_path / "plain", "--detector", "learned") == 0
+    assert "learning" not in capsys.readouterr().out
+    assert not (tmp_path / "plain" / "learning").exists()
+    assert watch(workplace, tmp_path / "out", "--detector", "learned", "--learn") == 0
+    said = capsys.readouterr().out
+    assert f"learning from the frames of this rig: {tmp_path}/out/learning" in said
+    assert "| learning: " in said and " 0 trainings, 0 adopted" in said
+
+
+def test_adapted_networks_run_again_after_a_restart(workplace, tmp_path, monkeypatch, capsys):
+    made = tmp_path / "out" / "learning" / "adapted"
+    for name in SUBJECTS:
+        (made / name).mkdir(parents=True)
+        shutil.copy(data_path("models", f"{name}.safetensors"), made / name / "model.safetensors")
+    (made / "README.md").write_text("card")
+    used = []
+    monkeypatch.setattr("imgcal.online.RigKeeper.use_proposer", lambda self, proposer: used.append(proposer.name))
+    assert watch(workplace, tmp_path / "out", "--detector", "learned", "--learn") == 0
+    assert used == ["learned"]
+    assert watch(workplace, tmp_path / "out", "--detector", "learned", "--learn", "--fresh") == 0
+    assert used == ["learned"] and (made / "README.md").is_file()
+
+
+def test_what_cannot_learn_is_one_line(workplace, moments, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert watch(workplace, out, "--learn") == 2
+    said = "--learn: found --detector classical, expected --detector learned: it adapts the network that this runs"
+    assert capsys.readouterr().err == f"imgcal: {said}\n"
+    given = ["--rig", "T4", "--out", str(out), "--detector", "learned", "--learn"]
+    assert main(["watch", str(workplace.capture), *given, "--object", "lights"]) == 2
+    assert "--learn: found lights, expected one object" in capsys.readouterr().err
+    save_detections(moments[0].blobs, tmp_path / "blobs.csv")
+    assert main(["watch", str(tmp_path / "blobs.csv"), *given, "--object", "asymmetric8"]) == 2
+    assert "--learn: found blobs without frames (" in capsys.readouterr().err
+    assert not out.exists() or not list(out.iterdir())
