@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from imgcal.io import load_object, read_rig
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import CameraRig
+from imgcal.types import CalibrationObject, CameraRig
 
 LEFT_OUT = pytest.StashKey[dict[str, int]]()
 SLOW = {

@@ -6,12 +6,10 @@ import numpy as np
 import torch
 
 from imgcal.estimation import EstimationOptions, estimate
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import load_object, read_rig
-from imgcal.synthesis.captures import simulate_truth
-from imgcal.synthesis.rigs import PhysicalDrift
-from imgcal.types.observations import Detections, Observations
+from imgcal.synthesis import PhysicalDrift, simulate_truth
+from imgcal.types import Detections, Observations
 
 
 class Stream:

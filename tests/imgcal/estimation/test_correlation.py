@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from imgcal.estimation.correlation import autocorrelation, correlation_time, effective_size
+from imgcal.estimation import autocorrelation, correlation_time, effective_size
 
 
 def _autoregressive(rho: float, count: int, width: int, seed: int = 0) -> np.ndarray:

@@ -10,8 +10,7 @@ import torch
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_rotation
 from imgcal.io import load_object, read_rig
-from imgcal.pipeline import calibrate, score
-from imgcal.pipeline.units import unit_doubt
+from imgcal.pipeline import calibrate, score, unit_doubt
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 
 RIGS = ("O10", "O6", "U7", "T4", "room10")
