@@ -7,6 +7,7 @@ the markers, `align_rig` improves it first, from the unlabelled blobs of many mo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -60,7 +61,7 @@ class Lights:
         """Keep the given rows (mask or indices)."""
         return Lights(self.row[rows], self.moment[rows], self.point[rows], self.odds[rows], self.margin[rows])
 
-    @property
+    @cached_property
     def cameras(self) -> NDArray[np.int64]:
         """Number of cameras that show each: (R,)."""
         return np.asarray((self.row >= 0).sum(1))

@@ -46,7 +46,7 @@ from .map_estimate import (
     object_prior_std,
 )
 from .map_operator import encode_options, map_state, prepend_lenses, split_lenses
-from .moves import find_moves
+from .moves import find_moves, longest_episode
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ScaleEvidence, ShapeEvidence, offsets
 from .pose_initialization import initial_pose
 from .pose_support import ON_A_LINE, UndeterminedPosesError, has_poses, require_poses
@@ -116,6 +116,7 @@ __all__ = [
     "linearize",
     "linearize_lights",
     "linearize_rig",
+    "longest_episode",
     "make_estimate",
     "make_loss",
     "make_problem",

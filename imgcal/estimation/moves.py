@@ -47,11 +47,16 @@ LEAST_SIGMAS = 5.0
 """Smallest size in standard deviations, given the dispersion, of the kind of values that explains a step best."""
 MOST_UNEXPLAINED = 0.5
 """Largest share of a camera's misfit that may remain after it is given several places."""
+MOST_MISFIT = 4.0
+"""Largest cost of a label in the middle snapshot of a new place, in multiples of what noise alone would leave."""
 LEAST_LEAD = 0.8
 """Relative to the best camera's statistic: another one that reaches this may be the one that moved."""
 
 EPISODE, LEAST_EPISODE = 2.0, 3
 """Longest transient error in correlation times, and its smallest length in snapshots where errors are correlated."""
+PERSISTENT = 1e-3
+"""Error probability of the evidence that must remain on either side of a step without its most supportive half, where
+errors are correlated: a camera that has moved stays there, but the error of a second or two ends."""
 LEAST_LABELS = 2
 """Smallest number of labels from which the shift of a camera's image in a snapshot is computed."""
 
@@ -122,6 +127,11 @@ class Places:
         """Cost of each snapshot's labels if their camera were at one of its places: (S,) half chi-squared."""
         loss, _ = huber(self._squared_residuals(place, self.camera_places(self.camera[place])), CLIP)
         return 0.5 * loss.sum(-1).numpy()
+
+    def cost_per_label(self, place: int) -> float:
+        """Median, over a place's snapshots, of the mean cost of a label; noise alone leaves one."""
+        labels = (self.problem.root_weight[0][:, place] > 0).sum(-1).numpy()
+        return float(np.median((self.costs(place) / np.maximum(labels, 1))[labels > 0]))
 
     def misfit(self, camera: int) -> float:
         """Chi-squared of a camera's labels, each clipped, in excess of the noise."""
@@ -220,6 +230,12 @@ class Change:
         return kind, length, float(direction @ (alone * scale * scale[:, None]) @ direction) ** 0.5
 
 
+def longest_episode(problem: Problem, state: State, camera: int) -> int:
+    """Longest transient error of a camera, in successive snapshots; 0 = errors are not correlated."""
+    cameras = problem.uv.shape[2]
+    return Places(problem, state, tuple(range(cameras)), (0,) * cameras).episode(camera)
+
+
 def find_moves(
     problem: Problem, state: State, camera_names: tuple[str, ...], snapshot_names: tuple[str, ...],
     options: EstimationOptions,
@@ -256,7 +272,8 @@ def find_moves(
                 and divided.shift(step.camera, new) >= LEAST_MOVE * left**0.5
                 and (change := divided.change(step.camera, new, left)).is_physical
                 and change.is_certain
-                and _outlasts_an_episode(places, divided, step.camera, least_significant(candidates, ERROR) * left)
+                and divided.cost_per_label(new) <= MOST_MISFIT * left
+                and _outlasts_an_episode(places, divided, step.camera, least_significant(candidates, ERROR), left)
             ):
                 doubts[new] = _doubts(places, step)
                 places, noise = divided, left
@@ -286,8 +303,8 @@ def _locate(places: Places, step: Step, options: EstimationOptions) -> Places | 
     return divided
 
 
-def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: float) -> bool:
-    """Check that a step stays significant without its most supportive episode on either side.
+def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: float, noise: float) -> bool:
+    """Check that a step stays significant without its most supportive episode, and evident without half of either side.
 
     A transient error is no motion: a target at the edge of an image, or behind an arm, may seem to be off by pixels for
     some snapshots.
@@ -297,6 +314,7 @@ def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: fl
         divided: afterwards; the new place is the last.
         camera: index of the divided place.
         least: smallest significant statistic.
+        noise: factor by which statistics exceed those of independent noise.
     """
     new = len(divided.camera) - 1
     length, row = divided.episode(divided.camera[new]), divided.first[new]
@@ -307,10 +325,11 @@ def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: fl
     for rows, gain in ((shown[shown < row], -saved), (shown[shown >= row], saved)):
         if len(rows) <= length:
             return False
-        first = int(np.convolve(gain[rows], np.ones(length), "valid").argmax())
-        rest = places.drop_labels(camera, rows[first : first + length])
-        if rest.blocks.statistics([camera], np.array([row]))[0, 0] < least:
-            return False
+        for dropped, enough in ((length, least), (len(rows) // 2, least_significant(1, PERSISTENT))):
+            first = int(np.convolve(gain[rows], np.ones(dropped), "valid").argmax())
+            rest = places.drop_labels(camera, rows[first : first + dropped])
+            if rest.blocks.statistics([camera], np.array([row]))[0, 0] < enough * noise:
+                return False
     return True
 
 

@@ -126,6 +126,13 @@ def model_file(path: str | Path) -> Path:
     return path
 
 
+def shipped_networks() -> str:
+    """List the shipped networks, and say what has more of them where those for whole rigs are not installed."""
+    names = shipped_names("models", SUFFIX)
+    more = "" if any(name.startswith("points-") for name in names) else " (imgcal-models, in data/models, has more)"
+    return f"a file, the folder of a training run, or one of {', '.join(names)}{more}"
+
+
 def model_name(path: Path) -> str:
     """Name a network by its file, or by the folder where a training run has put it."""
     return title_from_name(path.absolute().parent if path.name == MODEL else path)

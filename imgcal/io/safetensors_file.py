@@ -13,7 +13,7 @@ from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.io.atomic import write_bytes
-from imgcal.io.names import check_regular
+from imgcal.io.names import check_regular, shipped_networks
 
 # First bytes of what torch.save and pickle.dump write.
 PICKLES = (b"PK\x03\x04", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
@@ -63,6 +63,8 @@ def read_texts(path: str | Path, file_format: str) -> dict[str, str]:
     """Read only the texts; errors as for `read_tensors`, but damaged tensors go unnoticed."""
     path = Path(path)
     check_regular(path)
+    if not path.exists() and path == Path(path.stem):
+        raise InputError(f"{path}: found no such file or network, expected {shipped_networks()}")
     try:
         with open(path, "rb") as raw:
             start = raw.read(4)

@@ -142,7 +142,7 @@ def load_initializer(
     why = "".join(f" ({reason})" for reason in reasons[:1])
     raise InputError(
         f"first guess `{name}`: found no shipped network for rig {rig.name} and object {obj.name}, expected one of "
-        f"{', '.join(shipped) or 'none'}: train one with `imgcal train` and give its file{why}"
+        f"{', '.join(shipped) or 'those of imgcal-models'}: train one with `imgcal train` and give its file{why}"
     )
 
 

@@ -19,6 +19,7 @@ from imgcal.estimation import (
     State,
     find_moves,
     initial_state,
+    longest_episode,
     make_problem,
     minimize,
     pose_at,
@@ -162,7 +163,7 @@ def _moves(
         fit = _fit(arrange_labels(again, rig, obj), rig, obj, options)
     names = tuple(labelled.snapshots[s].name for s in labelled.used)
     found = find_moves(fit.problem, fit.state, rig.camera_names, names, options.estimation)
-    gone = _find_gone(fit.tally, labelled, rig, {move.camera for move in found})
+    gone = _find_gone(fit, labelled, rig, {move.camera for move in found})
     return tuple(sorted((*found, *gone), key=lambda move: names.index(move.snapshot))), fits
 
 
@@ -244,12 +245,13 @@ def _row_of(
     return np.where(fiducial >= 0, table[labelled.moments[row], obj.part_of[fiducial]], row)
 
 
-def _find_gone(counts: LabelCounts, labelled: Associations, rig: CameraRig, known: set[str]) -> list[MovedCamera]:
+def _find_gone(fit: _Fit, labelled: Associations, rig: CameraRig, known: set[str]) -> list[MovedCamera]:
     """Find cameras that first saw the object in the right place and later in a wrong one, or vice versa.
 
     The probability that a moment separates the agreeing from the disagreeing snapshots so cleanly follows from random
-    order.
+    order. Where errors are correlated, more snapshots are needed than a transient error lasts.
     """
+    counts = fit.tally
     moves = []
     agrees, differs = counts.kept > counts.unexplained, counts.unexplained > counts.kept
     differs &= 2 * counts.unexplained >= counts.expected
@@ -260,7 +262,10 @@ def _find_gone(counts: LabelCounts, labelled: Associations, rig: CameraRig, know
         total, count = len(rows), int(wrong.sum())
         if name in known or not LEAST_SNAPSHOTS <= count <= total - LEAST_SNAPSHOTS:
             continue
-        place = np.arange(LEAST_SNAPSHOTS, total - LEAST_SNAPSHOTS + 1)
+        least = max(LEAST_SNAPSHOTS, longest_episode(fit.problem, fit.state, camera) + 1)
+        if total < 2 * least:
+            continue
+        place = np.arange(least, total - least + 1)
         before = np.cumsum(wrong)[place - 1]
         chance = np.minimum(
             hypergeom.sf(before - 1, total, count, place), hypergeom.sf(count - before - 1, total, count, total - place)

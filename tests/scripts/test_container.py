@@ -4,6 +4,7 @@ import json
 import re
 import runpy
 import shlex
+import shutil
 import socket
 from pathlib import Path
 
@@ -116,9 +117,9 @@ from imgcal import RigKeeper, load_detections, load_object, load_rig
 from imgcal.cli.main import main
 from imgcal.io import open_capture
 
-sample = sys.argv[1]
+sample, *networks = sys.argv[1:]
 given = ["--rig", sample + "/rig.yaml", "--object", sample + "/object.csv"]
-for guess in ("none", "points", "vit"):
+for guess in ("none", *networks):
     assert main(["calibrate", sample, *given, "--out", "result", "--first-guess", guess]) == 0
 assert main(["detect", sample, "--out", "blobs.csv"]) == 0
 assert main(["score", "blobs.csv", *given]) == 0
@@ -143,6 +144,7 @@ files = {f.py_func.__qualname__: f._cache._cache_file for f in ours if hasattr(f
 left = [name for name, file in files.items() if not file._load_index()]
 print(json.dumps([Compiled.names, sorted(left)]))
 """
+NETWORKS = [ROOT / "data" / "models" / f"{name}-O10-asymmetric8.safetensors" for name in ("points", "vit")]
 UNUSED = {"_minimize_all", "_pair", "_gradients", "_through_profile"}  # many rigs at once, and training
 OTHER_LENSES = "_chosen.<locals>"  # compiled where a rig has one
 
@@ -161,7 +163,8 @@ def test_the_image_is_built_has_all_compiled_and_its_page_answers(capfd):
         image.start()
         assert ": healthy\n" in capfd.readouterr().out
         (sample,) = image.root.glob("opt/imgcal/lib/python*/site-packages/imgcal/data/samples/O10")
-        done = image.run(["python", "-c", USE, str(sample)], capture_output=True, text=True)
+        networks = [shutil.copy(path, image.root / "data") for path in NETWORKS]
+        done = image.run(["python", "-c", USE, sample, *networks], capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         compiled, left = json.loads(done.stdout.splitlines()[-1])
         assert compiled == [] and "imgcal: compiling" not in done.stderr

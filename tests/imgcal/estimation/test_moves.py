@@ -8,7 +8,7 @@ import torch
 
 from imgcal.association import accepted_observations, associate
 from imgcal.estimation import EstimationOptions, estimate, find_moves
-from imgcal.estimation.change_points import Step
+from imgcal.estimation.change_points import Step, dispersion
 from imgcal.estimation.moves import Change, Places, _outlasts_an_episode
 from scripts.benchmarks import camera_faults as faults
 
@@ -76,23 +76,38 @@ def stepping(first: int, size: float) -> tuple[Places, Places, float]:
 def test_a_step_must_be_significant_without_its_best_episode(first):
     places, divided, statistic = stepping(first, 0.06)
     assert 3 <= divided.episode(CAMERA) < 6
-    assert not _outlasts_an_episode(places, divided, CAMERA, 0.8 * statistic)
-    assert _outlasts_an_episode(places, divided, CAMERA, 0.1 * statistic)
+    assert not _outlasts_an_episode(places, divided, CAMERA, 0.8 * statistic, 1.0)
+    assert _outlasts_an_episode(places, divided, CAMERA, 0.1 * statistic, 1.0)
 
 
 def test_a_step_in_the_middle_does_not_rest_on_an_episode():
     places, divided, statistic = stepping(30, 0.06)
-    assert _outlasts_an_episode(places, divided, CAMERA, 0.6 * statistic)
+    assert _outlasts_an_episode(places, divided, CAMERA, 0.6 * statistic, 1.0)
 
 
 def test_what_is_no_longer_than_an_episode_is_no_step():
     places, divided, _ = stepping(3, 0.06)
-    assert not _outlasts_an_episode(places, divided, CAMERA, 0.0)
+    assert not _outlasts_an_episode(places, divided, CAMERA, 0.0, 1.0)
+
+
+def test_an_error_that_ends_is_no_step_however_much_of_it_remains_without_an_episode():
+    rig, wand, truth = faults.wand_in_a_room(60, 1)
+    observations, _ = accepted_observations(associate(faults.blobs(truth, 1, labelled=True), rig, wand), rig, wand)
+    uv, first = lasting(observations.uv, 0.06), 48
+    off = torch.tensor([0.11, 0.55, 0.32, 0.17, 0.33, 0.42, 0.18], dtype=uv.dtype)  # px, recorded in a room
+    uv[first : first + len(off), CAMERA] += off[:, None, None]
+    fit = estimate(replace(observations, uv=uv, sigma=torch.full_like(observations.sigma, 0.06)), rig, wand)
+    places = Places(fit.problem, fit.solution.state, tuple(range(10)), (0,) * 10)
+    statistic = float(places.blocks.statistics([CAMERA], np.array([first]))[0, 0])
+    divided = places.divide(Step(CAMERA, first, statistic, np.zeros(10)), OPTIONS)
+    noise = dispersion(divided.blocks, divided.seen)
+    assert divided.episode(CAMERA) < len(off)
+    assert not _outlasts_an_episode(places, divided, CAMERA, 0.2 * statistic / noise, noise)
 
 
 def test_where_errors_do_not_last_every_snapshot_counts():
     places, divided, statistic = stepping(3, 0.0)
-    assert _outlasts_an_episode(places, divided, CAMERA, statistic)
+    assert _outlasts_an_episode(places, divided, CAMERA, statistic, 1.0)
 
 
 def test_errors_that_do_not_last_have_no_episode(bumped):

@@ -160,6 +160,35 @@ def test_a_camera_that_is_off_now_and_then_has_not_moved():
     assert list_moves(associate(table, rig, obj), rig, obj, PipelineOptions()) == ()
 
 
+def with_lasting_errors(table, seed):
+    """Shift each camera's image by errors of 0.06 px that last some two snapshots."""
+    draw, shift = np.random.default_rng(seed), np.zeros((len(table.snapshot_names), len(table.camera_names), 2))
+    for row in range(len(shift)):
+        shift[row] = 0.5 * shift[row - 1] + 0.06 * 0.75**0.5 * draw.standard_normal(shift.shape[1:])
+    table.uv[:] += shift[table.snapshot, table.camera]
+    return table
+
+
+def test_an_error_of_the_last_snapshots_is_a_doubt_and_no_motion():
+    rig, obj, truth = damage.wand_in_a_room(60, 1)
+    table = with_lasting_errors(damage.blobs(truth, 1, labelled=True), 1)
+    for row, shift in enumerate((1.0, 3.0, 3.5), 57):  # no longer than a transient error may last
+        table.uv[(table.camera == CAMERA) & (table.snapshot == row)] += (shift, -shift)
+    result = calibrate(table, rig, obj)
+    assert result.moved == ()
+    assert [doubt.camera for doubt in result.doubtful] == ["cam04"]
+
+
+@pytest.mark.parametrize("count", [2, 3])
+@pytest.mark.parametrize("kind", MAKE)
+def test_labels_at_the_end_that_no_place_of_the_camera_explains_are_no_motion(kind, count):
+    rig, obj, truth = MAKE[kind](40, 1)
+    table, draw = damage.blobs(truth, 1, labelled=True), np.random.default_rng(1)
+    wrong = (table.camera == CAMERA) & (table.snapshot >= 40 - count) & (table.fiducial >= 0)
+    table.uv[wrong] -= np.array([1.8, 0.9]) * (1 + 0.5 * draw.standard_normal((wrong.sum(), 1)))  # one way, uneven
+    assert list_moves(associate(table, rig, obj), rig, obj, PipelineOptions()) == ()
+
+
 @pytest.mark.parametrize("seed", [94, 100, 145])  # named with a size, twice, and without one
 def test_markers_that_merge_are_no_motion(seed):
     made, _ = merging_wands.capture(seed)
