@@ -24,8 +24,8 @@ from imgcal.cli.common import (
     select_cameras,
     start_pose,
 )
-from imgcal.cli.describe import describe, describe_refusal
 from imgcal.cli.outcome import doubtful_cameras, findings, print_outcome, refused_summary, summary
+from imgcal.cli.report_content import describe, describe_refusal
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import Gauge
 from imgcal.extras import advice, missing

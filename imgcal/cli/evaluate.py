@@ -1,4 +1,4 @@
-"""`imgcal evaluate` and `imgcal compare`: how good networks and classical methods are on random rigs."""
+"""`imgcal evaluate`: how good networks and classical methods are on random rigs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +15,6 @@ from rich.console import Console
 from imgcal.cli import arguments
 from imgcal.cli.arguments import Setting
 from imgcal.cli.common import check_folder, open_rig, progress_bar
-from imgcal.cli.compare_captures import WORK, compare_captures
 from imgcal.errors import InputError
 from imgcal.extras import advice, missing
 from imgcal.fleet import StoredResults, workers
@@ -31,8 +29,8 @@ CHECKED_RIGS = 32
 """On which encoders are checked."""
 FEW = 8
 """Batches, or captures, that are done before Ray has started."""
-OF_BOTH = ("rig", "object", "seed", "address", "cores")
-"""What a comparison of captures reads of a `Setting`, too."""
+WORK = ".work"
+"""Folder beside results of what has been done, until all is."""
 
 
 class Evaluate(arguments.Evaluate):
@@ -40,53 +38,11 @@ class Evaluate(arguments.Evaluate):
 
     def run(self) -> None:
         """Evaluate, print and write."""
-        _run(self.models, self.setting, self.baselines, self.out)
+        evaluate_models(self.models, self.setting, self.baselines, self.out)
 
 
-class Compare(arguments.Compare):
-    """Run `imgcal compare`."""
-
-    def run(self) -> None:
-        """Compare, print and write."""
-        self._check_options()
-        if self.captured.captures:
-            rig, obj = self.setting.rig or "O10", self.setting.object or "asymmetric8"
-            who = partial(_workers, self.setting)
-            compare_captures(self.models, self.captured, rig, obj, self.setting.seed, self.out, who)
-            return
-        from imgcal.pipeline import DETECTORS
-
-        named = [path for path in self.models if str(path) in DETECTORS and not path.exists()]
-        if named:
-            raise InputError(
-                f"compare: found {named[0]}, which is a detector, expected networks; detectors are compared on "
-                "captured frames: --captures 20 simulates 20 at every difficulty"
-            )
-        if len(self.models) < 2:
-            raise InputError(f"compare: found {len(self.models)} models, expected two or more")
-        _run(self.models, self.setting, self.baselines, self.out)
-
-    def _check_options(self) -> None:
-        """Refuse options that are for the other kind of comparison.
-
-        Raises:
-            InputError: names the first of them, and what it is for.
-        """
-        unread: list[tuple[Setting | Compare | arguments.Captures, str]]
-        if self.captured.captures:
-            how, meant = "with", "networks are compared on points"
-            unread = [(self.setting, name) for name in vars(self.setting) if name not in OF_BOTH]
-            unread.append((self, "baselines"))
-        else:
-            how, meant = "without", "detectors are compared on captured frames"
-            unread = [(self.captured, name) for name in vars(self.captured)]
-        for options, name in unread:
-            if getattr(options, name) != getattr(type(options), name):
-                option = name.replace("_", "-")
-                raise InputError(f"--{option}: found it {how} --captures, expected it where {meant}")
-
-
-def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path | None) -> None:
+def evaluate_models(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path | None) -> None:
+    """Measure networks and baselines, print tables, and write them where `out` says."""
     # Imported late: what brings networks and plots along takes seconds, which the other commands should not wait.
     from imgcal.evaluation import BASELINES, PLOTS, QUICK_BASELINES, RESULT, TABLES, Protocol, write
 
@@ -100,7 +56,7 @@ def _run(paths: tuple[Path, ...], setting: Setting, baselines: bool, out: Path |
     methods = {model.name: model.method for model in models}
     methods |= _select_suited(BASELINES if baselines else QUICK_BASELINES, conditions.rig)
     kept = None if out is None else StoredResults(out / WORK, _scope(models))
-    with _workers(setting, protocol.batches, kept, models) as mapped:
+    with open_workers(setting, protocol.batches, kept, models) as mapped:
         summary = _measure(methods, conditions, protocol, setting, mapped)
     summary = replace(summary, facts={model.name: _check_model(model, conditions, setting) for model in models})
     _print_tables(summary)
@@ -128,7 +84,7 @@ def _scope(models: list[Model]) -> str:
 
 
 @contextmanager
-def _workers(
+def open_workers(
     setting: Setting, batches: int, kept: StoredResults | None, models: Sequence[Model] = ()
 ) -> Iterator[Mapper]:
     """Worker processes, if the job is long enough to be worth starting them; on a GPU only this process."""

@@ -35,9 +35,6 @@ COMMANDS = (
     "train", "evaluate", "compare", "fleet", "demo", "warmup",
 )  # fmt: skip
 """Each has a class of its name, among the arguments and in the module of its name."""
-ELSEWHERE = {"describe": "experiment_keys", "compare": "evaluate"}
-"""Modules of commands that have none of their name."""
-
 DESCRIPTION = """Recalibrate infrared multi-camera rigs from images of a known calibration object.
 
 imgcal COMMAND --help tells more, imgcal --version which one this is. Exit codes: 0 done, 2 unusable input (or a fault
@@ -104,7 +101,7 @@ def _parse(arguments: list[str]) -> Runnable:
         given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=options)
         _check_values(given, options)
         with end_at_once():  # imports take a while
-            command = getattr(import_module(f"imgcal.cli.{ELSEWHERE.get(first, first)}"), first.capitalize())
+            command = getattr(import_module(f"imgcal.cli.{first}"), first.capitalize())
         return command(**vars(given))
     # The shell's completion knows the options of every command; all else ends here, and names and summaries will do.
     load = _arguments if first.startswith("--tyro-") else _summary

@@ -85,10 +85,6 @@ class Findings:
         return lines
 
 
-UNKNOWN: dict[str, Any] = {"motion": None, "timing_untested": None, "knowledge": None}
-"""`Findings.values` of a refused run."""
-
-
 def findings(calibration: Calibration, gauge: Gauge, covariance: RigCovariance) -> Findings:
     """Derive motion and coverage from a calibration."""
     motion, knowledge = motion_since_factory(calibration, gauge), measure_coverage(calibration, covariance.std)
@@ -152,10 +148,8 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
             "rms_px_after": rms_length(calibration.residual[:, camera], seen[:, camera]),
             **counts_by_camera(calibration, camera),
         }
-    alternatives, names = (
-        max(snapshots[s].alternatives for s in labelled.used),
-        {snapshots[s].name for s in labelled.used},
-    )
+    alternatives = max(snapshots[s].alternatives for s in labelled.used)
+    names = {snapshots[s].name for s in labelled.used}
     return {
         "version": imgcal.__version__,
         "status": "ok",
@@ -264,43 +258,17 @@ def refused_summary(
     """Summarize a refusal under the same keys."""
     moved = refusal.moved if isinstance(refusal, MovedError) else ()
     return {
-        "version": imgcal.__version__,
-        "status": "refused",
-        "reason": refusal.for_command,
-        "identity": None,
-        "identity_alternatives": None,
-        "detector": {},
-        "from_scratch": None,
-        "rms_px_before": None,
-        "rms_px_after": None,
-        "first_guess": None,
-        "chi2_per_dof": None,
-        "model_error_px": None,
-        "outliers": None,
-        "prior_too_narrow": {},
-        "snapshots_used": 0,
-        "snapshots_rejected": len(detections.snapshot_names),
-        "lights": None,
-        "rejected": {},
-        "moved": [move.as_values() for move in moved],
-        "late": [],
-        "doubtful": [],
-        "unsynchronized": None,
-        "per_camera": blobs_by_camera(detections, rig),
-        "per_snapshot": {},
-        "object": [],
-        "object_displaced": [],
-        "object_lost": [],
-        "object_scale_sigma": None,
-        "object_bent_sigma": None,
-        "board_bend": None,
-        "covariance": None,
-        "predicted_error": None,
-        "scale": None,
-        "repeats": None,
-        **UNKNOWN,
-        "seconds": seconds,
-    }
+        "version": imgcal.__version__, "status": "refused", "reason": refusal.for_command,
+        "identity": None, "identity_alternatives": None, "detector": {}, "from_scratch": None,
+        "rms_px_before": None, "rms_px_after": None, "first_guess": None,
+        "chi2_per_dof": None, "model_error_px": None, "outliers": None, "prior_too_narrow": {},
+        "snapshots_used": 0, "snapshots_rejected": len(detections.snapshot_names), "lights": None, "rejected": {},
+        "moved": [move.as_values() for move in moved], "late": [], "doubtful": [], "unsynchronized": None,
+        "per_camera": blobs_by_camera(detections, rig), "per_snapshot": {},
+        "object": [], "object_displaced": [], "object_lost": [], "object_scale_sigma": None, "object_bent_sigma": None,
+        "board_bend": None, "covariance": None, "predicted_error": None, "scale": None, "repeats": None,
+        "motion": None, "timing_untested": None, "knowledge": None, "seconds": seconds,
+    }  # fmt: skip
 
 
 def predicted_line(predicted: dict[str, Any]) -> str:

@@ -79,20 +79,16 @@ class Watch(arguments.Watch):
     def run(self) -> None:
         """Watch until the end."""
         rig, given = open_rig(self.rig), load_objects(self.object)
-        obj = given.as_unknown()
-        if len(given.points) > 1 and obj is not given:
-            print(
-                f"note: markers of {given.name} are followed one by one: their distances are not used", file=sys.stderr
-            )
         check_folder(self.out)
-        _check_poses(self.poses, obj, self.out)
+        _check_poses(self.poses, given.as_unknown(), self.out)
         with holding(self.out) as folder:
-            self._watch(rig, obj, given.rows, folder)
+            self._watch(rig, given, folder)
 
-    def _watch(self, rig: CameraRig, obj: CalibrationObject, labels: Fiducials, folder: Path) -> None:
+    def _watch(self, rig: CameraRig, given: CalibrationObject, folder: Path) -> None:
+        obj = given.as_unknown()
         with _going_on():
             progress = None if self.fresh else Progress.load(folder)
-        source, origin = self._source(rig, labels, progress), self._origin()
+        source, origin = self._source(rig, given.rows, progress), self._origin()
         rate = source.rate if isinstance(source, BlobTable) else None
         goes_on = source.live and not self.keep_all  # what came since the last state is gone
         knows = goes_on or isinstance(source, Folder)  # a folder knows which files have been read
@@ -104,6 +100,9 @@ class Watch(arguments.Watch):
             keeper, restored = self._keeper(folder, rig, obj)
             stack.enter_context(keeper)
             stack.enter_context(intake).wait_until_open()  # before anything is written
+            if len(given.points) > 1 and obj is not given:
+                note = f"note: markers of {given.name} are followed one by one: their distances are not used"
+                print(note, file=sys.stderr)
             poses = [
                 stack.enter_context(Poses(name, _pose_sink(name, rig, obj)))
                 for name in sorted(self.poses, key=_is_table)

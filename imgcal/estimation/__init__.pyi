@@ -1,8 +1,7 @@
 from . import levenberg_marquardt_cpu
 from .accuracy import MAP_DEPTHS, MAP_SIZE, PredictedError, WorkingVolume, predicted_error
-from .blocks import BlockScatter, block_scatter
 from .change_points import CLIP, LEAST_SNAPSHOTS
-from .correlation import autocorrelation, correlation_time, effective_size
+from .correlation import autocorrelation, correlation_time
 from .covariance import (
     camera_covariance,
     camera_std,
@@ -53,9 +52,10 @@ from .pose_support import ON_A_LINE, UndeterminedPosesError, has_poses, require_
 from .reference_cameras import Gauge
 from .rig_error import displace, error_between, step_by_error
 from .rig_from_points import PointStart, cold_start_from_points, move_to_pair_frame, prior_of_pair
-from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens, single_camera_poses
+from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens, robust_std, single_camera_poses
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion, uncertainty_over
 from .robust_losses import squared
+from .snapshot_scatter import BlockScatter, block_scatter
 from .variance_components import BENT, ObjectQuestion, Start, estimate_variance_components
 
 __all__ = [
@@ -98,7 +98,6 @@ __all__ = [
     "cold_start_from_points",
     "correlation_time",
     "displace",
-    "effective_size",
     "encode_options",
     "equations_at",
     "error_between",
@@ -142,6 +141,7 @@ __all__ = [
     "retract",
     "rig_at",
     "rigid_motion",
+    "robust_std",
     "scale_response",
     "select_blocks",
     "single_camera_poses",

@@ -89,16 +89,6 @@ def correlation_time(series: NDArray[np.floating]) -> NDArray[np.float64]:
     return tau
 
 
-def effective_size(series: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Effective number of independent samples of each source: (C,).
-
-    Args:
-        series: (S, C, ...), as for `correlation_time`. A time counts once, however many parallel series have a sample.
-    """
-    known = np.isfinite(series).reshape(*series.shape[:2], -1).any(-1)
-    return known.sum(0) / correlation_time(series)
-
-
 def _centre(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Subtract the medians of series (S, C, D) and clip outliers."""
     known = np.isfinite(x)

@@ -32,7 +32,7 @@ LEAST_STD = 1e-9
 """Floor of prior standard deviations (rad, mm, pixels, 1) in divisions, for fixed parameters."""
 HUBER = 3.0
 """Huber threshold in standard deviations, as for an estimate: larger residuals count less in couplings."""
-FEW_SNAPSHOTS = 10
+FEW_POSES = 10
 """Up to this many, `remaining_variance` eliminates the cameras (exact object only) instead of the poses."""
 
 
@@ -198,7 +198,7 @@ def remaining_variance(solution: Solution) -> NDArray[np.float64]:
     if equations.cost.device.type != "cpu":
         diagonal = whitened_covariance(solution).diagonal(dim1=-2, dim2=-1)
         variance = diagonal.unflatten(-1, (cameras, -1)).cpu().numpy()
-    elif snapshots <= FEW_SNAPSHOTS and equations.object is None:
+    elif snapshots <= FEW_POSES and equations.object is None:
         variance = _by_poses(equations)
     else:
         variance = _by_cameras(equations)

@@ -12,7 +12,7 @@ from imgcal.estimation import EstimationOptions, estimate
 from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
-FINE = 0.1
+GAUGE_TOLERANCE = 0.1
 """Pixels: tolerated difference between two estimates before a camera counts as moved."""
 
 
@@ -38,7 +38,7 @@ def align(rig: CameraRig, reference: CameraRig, points_reference: Tensor, camera
     seen = there.visible
     if int(seen.sum()) < 4:
         return rig
-    observations = Observations(there.uv[None], torch.full_like(there.uv[None, ..., 0], FINE), seen[None])
+    observations = Observations(there.uv[None], torch.full_like(there.uv[None, ..., 0], GAUGE_TOLERANCE), seen[None])
     cloud = CalibrationObject(points_reference, torch.ones_like(points_reference))
     start = RigidTransform.identity(1, dtype=points_reference.dtype)
     fixed_std = torch.zeros(len(chosen), rig.num_parameters, dtype=points_reference.dtype)

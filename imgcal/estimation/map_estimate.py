@@ -26,7 +26,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.messages import brief
 from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior, check_observations
 
-PATIENCE = 15
+RESTART_AFTER = 15
 """Steps after which a rig starts over; from factory values within their prior, 6 are usual."""
 COARSER = (3000.0, 300.0, 30.0, 3.0)
 """Factors on the standard deviation of the observations, in stages."""
@@ -174,16 +174,16 @@ def make_loss(options: EstimationOptions) -> NamedLoss:
 def minimize(problem: Problem, start: State, options: EstimationOptions) -> levenberg_marquardt.Solution:
     """Minimize from a start, on the CPU with the compiled solver; no gradient flows through the result.
 
-    Precise observations make narrow, winding valleys of the cost. A rig that has not converged after `PATIENCE` steps
+    Precise observations make narrow, winding valleys of the cost. A rig without convergence after `RESTART_AFTER` steps
     starts over with larger standard deviations, which shrink to the given ones in stages (graduated non-convexity).
     """
-    first = _solve(problem, start, replace(options, max_iterations=min(options.max_iterations, PATIENCE)))
+    first = _solve(problem, start, replace(options, max_iterations=min(options.max_iterations, RESTART_AFTER)))
     rows = (~first.converged).nonzero().squeeze(-1)
     left = options.max_iterations - first.iterations
     if left <= 0 or not len(rows):
         return first
     slow = problem.select(rows)
-    coarse = replace(options, tolerance=COARSE_TOLERANCE, max_iterations=min(options.max_iterations, 2 * PATIENCE))
+    coarse = replace(options, tolerance=COARSE_TOLERANCE, max_iterations=min(options.max_iterations, 2 * RESTART_AFTER))
     state, spent = levenberg_marquardt.select_rows(start, rows), first.iterations
     for factor in COARSER:
         stage = _solve(replace(slow, root_weight=slow.root_weight / factor), state, coarse)

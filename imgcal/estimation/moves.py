@@ -34,7 +34,8 @@ from imgcal.estimation.map_estimate import equations_at, minimize
 from imgcal.estimation.robust_losses import NamedLoss, huber
 from imgcal.types import PARAMETER_KINDS, Kind, MovedCamera
 
-ERROR = 1e-5
+# When a camera has moved.
+FALSE_ALARM = 1e-5
 """Probability of naming a camera in a capture in which none has moved, if the noise is as stated."""
 LEAST_MOVE = 0.15
 """Pixels, in the image of the camera: smaller moves do no harm, and slow drifts of every rig reach them. Multiplied by
@@ -52,6 +53,7 @@ MOST_MISFIT = 4.0
 LEAST_LEAD = 0.8
 """Relative to the best camera's statistic: another one that reaches this may be the one that moved."""
 
+# Correlated errors.
 EPISODE, LEAST_EPISODE = 2.0, 3
 """Longest transient error in correlation times, and its smallest length in snapshots where errors are correlated."""
 PERSISTENT = 1e-3
@@ -259,7 +261,7 @@ def find_moves(
     for _ in range(3 * cameras):
         seen = places.seen & ~np.isin(places.camera, list(left_out))
         candidates = int(places.seen.sum())
-        step = likeliest_step(places.blocks, seen, least_significant(candidates, ERROR))
+        step = likeliest_step(places.blocks, seen, least_significant(candidates, FALSE_ALARM))
         if step is None:
             break
         divided = _locate(places, step, options)
@@ -268,12 +270,12 @@ def find_moves(
             left = dispersion(divided.blocks, divided.seen)
             new = len(divided.camera) - 1
             if (
-                is_significant(step.statistic / left, candidates, ERROR)
+                is_significant(step.statistic / left, candidates, FALSE_ALARM)
                 and divided.shift(step.camera, new) >= LEAST_MOVE * left**0.5
                 and (change := divided.change(step.camera, new, left)).is_physical
                 and change.is_certain
                 and divided.cost_per_label(new) <= MOST_MISFIT * left
-                and _outlasts_an_episode(places, divided, step.camera, least_significant(candidates, ERROR), left)
+                and _outlasts_an_episode(places, divided, step.camera, least_significant(candidates, FALSE_ALARM), left)
             ):
                 doubts[new] = _doubts(places, step)
                 places, noise = divided, left

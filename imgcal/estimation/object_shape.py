@@ -34,6 +34,7 @@ from imgcal.geometry import pose_rank
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 
+# Tolerances of fiducials.
 UNSURE = 1e-9
 """Relative to the largest information: directions of the shape below it are undetermined (e.g. a rigid motion)."""
 WIDE = 0.05
@@ -44,6 +45,8 @@ MOST_FIDUCIALS = 64
 """Largest number of fiducials whose shape is tested: larger boards and clouds are trusted as measured."""
 WIDEST = 2.0
 """Largest factor on the variance of a common tolerance that allows for the few displacements behind it."""
+
+# Evidence for them.
 COMPLEXITY = 3.0
 """Log evidence that each further tolerance must gain."""
 LEAD = 5.0

@@ -27,7 +27,7 @@ from imgcal.types import CalibrationObject, CameraRig, Observations
 from renderers.compiling import njit
 
 STARTS = 8
-AT_REST = 1e-9
+LEAST_TURN = 1e-9
 """Radians: a smaller step means that the rotation has converged."""
 
 
@@ -216,7 +216,7 @@ def _minimize_each(matrix, vector, rotation, iterations):
                         old[i, j] = now[i, j]
                 kernels.exponential(step, turned, left)
                 kernels.multiply(turned, old, now)
-                if length < AT_REST:
+                if length < LEAST_TURN:
                     break
 
 

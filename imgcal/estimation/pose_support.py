@@ -67,16 +67,16 @@ def has_poses(seen: NDArray[np.bool_], points: Tensor, part_of: NDArray[np.int64
         enough: NDArray[np.bool_] = (seen.sum(1) >= 2).sum(1) >= least
         return enough
     shown, where = seen.any(1), points.detach().cpu().double().numpy()
-    whole = _breadth(where)
+    whole = breadth(where)
     if whole > 0 and shown.all():
         return np.ones(len(seen), dtype=bool)
     # Patterns repeat: thousands of snapshots show only a few different parts of an object.
     parts, which = np.unique(shown, axis=0, return_inverse=True)
-    broad = np.array([_breadth(where[part]) > LEAST_BREADTH * whole for part in parts], dtype=bool)
+    broad = np.array([breadth(where[part]) > LEAST_BREADTH * whole for part in parts], dtype=bool)
     return broad[which.reshape(-1)]
 
 
-def _breadth(points: NDArray[np.float64]) -> float:
+def breadth(points: NDArray[np.float64]) -> float:
     """Second largest extent of points (M, 3): zero on a line."""
     if len(points) < 3:
         return 0.0

@@ -20,13 +20,13 @@ from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.types import CameraRig
 
 EXTRINSICS = 6
-SCALE = (0.01,) * 3 + (10.0,) * 3
+VOTE_SCALE = (0.01,) * 3 + (10.0,) * 3
 """Radians and millimetres with equal weight when cameras vote: they move an image equally at about arm's length."""
 ROUNDS = 30
 ALIGNMENTS = 4
 """Alignment rounds; each squares the remaining error."""
 LEAST_APART = 1e-6
-"""In units of `SCALE`: cameras closer than this to the common motion have equal weight."""
+"""In units of `VOTE_SCALE`: cameras closer than this to the common motion have equal weight."""
 
 
 @dataclass(frozen=True)
@@ -122,5 +122,5 @@ class Gauge:
 
 
 def _scale(step: Tensor) -> Tensor:
-    """Extrinsics (..., 6 or K) in units of `SCALE`: (..., 6)."""
-    return step[..., :EXTRINSICS] / step.new_tensor(SCALE)
+    """Extrinsics (..., 6 or K) in units of `VOTE_SCALE`: (..., 6)."""
+    return step[..., :EXTRINSICS] / step.new_tensor(VOTE_SCALE)

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.estimation.map_estimate import Estimate, EstimationOptions, estimate
-from imgcal.estimation.rig_initialization import FINE, ROUGH, ordinary_lens, require_connected
+from imgcal.estimation.map_estimate import EstimationOptions, estimate
+from imgcal.estimation.rig_initialization import FINE_SIGMA, ROUGH_SIGMA, ordinary_lens, require_connected, robust_std
 from imgcal.geometry import RigidTransform, undistort
 from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 
@@ -94,7 +94,7 @@ def cold_start_from_points(
         found = _fit_jointly(observations, move_to_pair_frame(rig, pair), cameras)
         if found is not None and (best is None or found.spread < best.spread):
             best = found
-        if best is not None and best.spread < FINE:
+        if best is not None and best.spread < FINE_SIGMA:
             break
     if best is None:
         common = [int((seen[:, [c]] & np.delete(seen, c, 1)).any(1).sum()) for c in range(cameras.num_cameras)]
@@ -242,20 +242,16 @@ def _fit_jointly(
     lens_fixed = std.clone()
     lens_fixed[:, 8:] = 0.0
     poses = None
-    for noise, spread in ((ROUGH, lens_fixed), (ROUGH, std), (FINE, std)):
+    for noise, spread in ((ROUGH_SIGMA, lens_fixed), (ROUGH_SIGMA, std), (FINE_SIGMA, std)):
         part = replace(some, sigma=torch.full_like(some.sigma, noise))
         options = EstimationOptions(loss="cauchy", max_iterations=60)
         fit = estimate(part, given, light, poses, prior_std=spread, initial_rig=rig, options=options)
         rig, poses = fit.rig, fit.rig_from_object
     assert fit is not None
     placed, _ = move_to_pair_frame(fit.rig, pair)
-    return PointStart(replace(placed, prior=cameras.prior), pair, _spread(fit))
-
-
-def _spread(fit: Estimate) -> float:
-    """Robust standard deviation of the residuals, per axis, px."""
-    seen = fit.problem.root_weight[0] > 0
-    return float(fit.residual.norm(dim=-1)[seen].median()) / 1.1774
+    return PointStart(
+        replace(placed, prior=cameras.prior), pair, robust_std(fit.residual[fit.problem.root_weight[0] > 0])
+    )
 
 
 def _select_moments(seen: Tensor) -> Tensor:

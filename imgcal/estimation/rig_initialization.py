@@ -18,6 +18,7 @@ from torch import Tensor
 from imgcal.errors import RefusedError
 from imgcal.estimation.map_estimate import Estimate, EstimationOptions, estimate
 from imgcal.estimation.pose_initialization import initial_pose
+from imgcal.estimation.pose_support import LEAST_BREADTH, breadth
 from imgcal.estimation.relative_poses import as_transforms, relate, tree
 from imgcal.geometry import RigidTransform
 from imgcal.messages import list_names
@@ -25,11 +26,11 @@ from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 
 LEAST_FIDUCIALS = 4
 """Smallest number in one image for a pose from that image alone."""
-ROUGH = 3.0
+ROUGH_SIGMA = 3.0
 """Pixels: standard deviation of an observation while the lens is wrong."""
-FINE = 0.5
+FINE_SIGMA = 0.5
 """Pixels: standard deviation of an observation in the final fit."""
-OUTLYING = 6.0
+OUTLYING_SPREADS = 6.0
 """Multiple of the residuals' robust spread beyond which labels are excluded."""
 CAPPED = 30.0
 """Pixels at which reprojection errors are clipped when poses are compared."""
@@ -92,7 +93,7 @@ def cold_start(observations: Observations, cameras: CameraRig, obj: CalibrationO
     poses.rotation[rows], poses.translation[rows] = fit.rig_from_object.rotation, fit.rig_from_object.translation
     first = RigidTransform(fit.rig.cam_from_rig.rotation[:1], fit.rig.cam_from_rig.translation[:1])
     placed = replace(fit.rig, cam_from_rig=fit.rig.cam_from_rig @ first.inverse(), prior=cameras.prior)
-    return ColdStart(placed, first @ poses, posed, all_kept, _spread(fit.residual.norm(dim=-1)[torch.from_numpy(kept)]))
+    return ColdStart(placed, first @ poses, posed, all_kept, robust_std(fit.residual[torch.from_numpy(kept)]))
 
 
 def single_camera_poses(
@@ -159,12 +160,8 @@ def _find_posable(seen: NDArray[np.bool_], obj: CalibrationObject) -> NDArray[np
     """Find images (S, C) with enough labels for a pose: four fiducials that are not collinear."""
     points = obj.points.double().numpy()
     parts, which = np.unique(seen.reshape(-1, seen.shape[-1]), axis=0, return_inverse=True)
-    good = [part.sum() >= LEAST_FIDUCIALS and _breadth(points[part]) > 0.05 * _breadth(points) for part in parts]
+    good = [part.sum() >= LEAST_FIDUCIALS and breadth(points[part]) > LEAST_BREADTH * breadth(points) for part in parts]
     return np.array(good)[which.reshape(-1)].reshape(seen.shape[:2])
-
-
-def _breadth(points: NDArray[np.float64]) -> float:
-    return float(np.linalg.svd(points - points.mean(0), compute_uv=False)[1])
 
 
 def _fit_jointly(
@@ -189,7 +186,7 @@ def _fit_jointly(
     lens_fixed = std.clone()
     lens_fixed[:, 8:] = 0.0
     seen, start, fit = observations.seen, rig, None
-    for noise, spread in ((ROUGH, lens_fixed), (ROUGH, std), (FINE, std)):
+    for noise, spread in ((ROUGH_SIGMA, lens_fixed), (ROUGH_SIGMA, std), (FINE_SIGMA, std)):
         poses = best_poses(observations, seen, start, cam_from_object, known, obj, fit)
         part = Observations(observations.uv, torch.full_like(observations.sigma, noise), seen)
         options = EstimationOptions(loss="cauchy", max_iterations=60)
@@ -241,6 +238,6 @@ def ordinary_lens(std: Tensor) -> Tensor:
     return narrow
 
 
-def _spread(lengths: Tensor) -> float:
-    """Robust standard deviation per axis from residuals' lengths."""
-    return float(lengths.median()) / 1.1774
+def robust_std(residual: Tensor) -> float:
+    """Robust standard deviation of residuals (M, 2), per axis: from the median of their lengths."""
+    return float(residual.norm(dim=-1).median()) / 1.1774

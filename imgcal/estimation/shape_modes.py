@@ -28,7 +28,7 @@ from imgcal.estimation.robust_losses import NamedLoss
 
 POINTS_AT_ONCE = 2**16
 """Pixels whose derivatives are in memory at the same time."""
-AT_REST = 0.02
+CONVERGED_STEP = 0.02
 """Largest step of a converged mode, in its posterior standard deviations."""
 
 
@@ -106,7 +106,7 @@ class ModeEvidence:
     @property
     def at_rest(self) -> bool:
         """Whether the remaining step is negligible."""
-        return bool((np.abs(self.step) <= AT_REST * np.sqrt(self.covariance.diagonal())).all())
+        return bool((np.abs(self.step) <= CONVERGED_STEP * np.sqrt(self.covariance.diagonal())).all())
 
 
 def mode_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ModeEvidence | None:

@@ -2,8 +2,8 @@ from .address import Address, parse_address
 from .commands import Action, Command
 from .demonstration import Demonstration
 from .live_page import LivePage
-from .page import content_policy, to_json
-from .rig_drawing import up_and_forward
+from .page import read_asset, render_page, to_json, viewer_script
+from .rig_drawing import frustum_length, frustums, up_and_forward
 from .security import Gate
 
 __all__ = [
@@ -13,8 +13,12 @@ __all__ = [
     "Demonstration",
     "Gate",
     "LivePage",
-    "content_policy",
+    "frustum_length",
+    "frustums",
     "parse_address",
+    "read_asset",
+    "render_page",
     "to_json",
     "up_and_forward",
+    "viewer_script",
 ]

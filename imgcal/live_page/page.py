@@ -1,21 +1,22 @@
-"""The page's one HTML file: style and script are inside, and nothing else may run or be fetched."""
+"""Pages of one HTML file: style and scripts are inside, and nothing else may run or be fetched."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from html import escape
 from importlib.resources import files
 from typing import Any
 
+import jinja2
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
-SCRIPTS = ("words", "scene", "timelines", "cameras", "pictures", "volume", "events", "controls", "main")
+SCRIPTS = ("viewer", "words", "scene", "timelines", "cameras", "pictures", "volume", "events", "controls", "main")
 """Files of the script, in the order in which they stand in the page: later ones use earlier ones."""
 
 
@@ -70,42 +71,57 @@ def report_page(title: str, contents: dict[str, Any]) -> Page:
 
 
 def _page(title: str, data: dict[str, Any], connections: str) -> Page:
-    style, script = _style(), _script()
-    policy = content_policy([script], f"'{_digest(style)}'", "data: blob:", connections)
-    text = _asset("page.html")
-    parts = {
-        "POLICY": escape(policy), "TITLE": escape(title), "STYLE": style, "DATA": to_json(data), "SCRIPT": script
-    }  # fmt: skip
-    for name, part in parts.items():
-        before, mark, after = text.partition(f"<!--{name}-->")
-        assert mark, name
-        text = before + part + after
+    script = "\n".join(read_asset(f"live_page/assets/{name}.js") for name in SCRIPTS)
+    style = read_asset("live_page/assets/page.css")
+    sources = {"img-src": "data: blob:", "connect-src": connections}
+    return render_page("live_page/assets/page.html", style, [script], sources, title=title, data=Markup(to_json(data)))
+
+
+def render_page(
+    template: str, style: str, scripts: Sequence[str] = (), sources: Mapping[str, str] | None = None, **parts: Any
+) -> Page:
+    """Fill the template of a page that carries its style and scripts, and forbid it everything else.
+
+    Args:
+        template: a file below the package, which uses `policy`, `style` and `scripts`.
+        style: the page's own style sheet, after the one that all pages share.
+        scripts: what may run.
+        sources: further directives of the Content-Security-Policy; a `style-src` replaces the digest of the style.
+        **parts: what else the template uses.
+    """
+    style = read_asset("live_page/assets/base.css") + style
+    directives = {
+        "default-src": "'none'",
+        "script-src": " ".join(_digest(script) for script in scripts) or "'none'",
+        "style-src": _digest(style),
+        "base-uri": "'none'",
+        "form-action": "'none'",
+    } | dict(sources or {})
+    policy = "; ".join(f"{name} {allowed}" for name, allowed in directives.items())
+    text = _template(template).render(
+        policy=policy, style=Markup(style), scripts=[Markup(script) for script in scripts], **parts
+    )
     return Page(text, f"{policy}; frame-ancestors 'none'")
 
 
-def content_policy(scripts: Sequence[str], styles: str, images: str, connections: str = "'none'") -> str:
-    """Forbid a page everything but the scripts that it carries, and what is listed: a Content-Security-Policy."""
-    digests = " ".join(f"'{_digest(script)}'" for script in scripts)
-    return (
-        f"default-src 'none'; script-src {digests}; style-src {styles}; img-src {images}; connect-src {connections}; "
-        "base-uri 'none'; form-action 'none'"
+def viewer_script() -> str:
+    """The script that defines `Viewer`, a rig in 3D on a canvas; it reads the colours --page, --ink and --muted."""
+    return read_asset("live_page/assets/viewer.js")
+
+
+@cache
+def read_asset(path: str) -> str:
+    """Read a text file below the package."""
+    return files("imgcal").joinpath(*path.split("/")).read_text(encoding="utf-8")
+
+
+@cache
+def _template(path: str) -> jinja2.Template:
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    return environment.from_string(read_asset(path))
 
 
 def _digest(text: str) -> str:
-    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
-
-
-@cache
-def _script() -> str:
-    return '"use strict";\n' + "\n".join(_asset(f"{name}.js") for name in SCRIPTS)
-
-
-@cache
-def _style() -> str:
-    return _asset("page.css")
-
-
-@cache
-def _asset(name: str) -> str:
-    return files("imgcal.live_page").joinpath("assets", name).read_text(encoding="utf-8")
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

@@ -86,21 +86,18 @@ def arrangement(rig: CameraRig, volume: WorkingVolume) -> dict[str, Any]:
         volume: where the object is seen.
 
     Returns:
-        Plain values: cameras (their axes as rows: right, down, ahead; tangents of half their angles of view), `up` and
-        `ahead` (unit vectors across each other), whether cameras look inward from all sides, `size` of a camera (mm),
-        and the volume.
+        Plain values: `centres` and `cameras` as `frustums` draws them (mm), `up` and `ahead` (unit vectors across each
+        other), whether cameras look inward from all sides, and the volume.
     """
     centres, axes = rig.positions.double().numpy(), rig.cam_from_rig.rotation.double().numpy()
     low, high = volume.low.double().numpy(), volume.high.double().numpy()
     up = upright(centres, axes, (low + high) / 2)
     return {
         "centres": round_values(centres),
-        "axes": round_values(axes),
-        "view": round_values((rig.image_size / rig.focal_length.double() / 2).numpy()),
+        "cameras": round_values(frustums(rig, frustum_length(rig, np.stack((low, high))))),
         "up": round_values(up),
         "ahead": round_values(forward(centres, axes, up)),
         "inward": bool(_level(axes[:, 2].mean(0), up) < CLEAR),
-        "size": _camera_size(centres, low, high),
         "low": round_values(low),
         "high": round_values(high),
     }
@@ -161,11 +158,32 @@ def _level(vector: Array, up: Array) -> float:
     return float(np.linalg.norm(vector - (vector @ up) * up))
 
 
-def _camera_size(centres: Array, low: Array, high: Array) -> float:
-    """Length of a drawn camera: small beside the distances between neighbours, and never too small to be seen."""
-    whole = float(np.linalg.norm(np.maximum(centres.max(0), high) - np.minimum(centres.min(0), low)))
-    if len(centres) == 1:
-        return 0.06 * whole
-    distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
-    np.fill_diagonal(distance, np.inf)
-    return float(np.clip(0.45 * np.median(distance.min(1)), 0.02 * whole, 0.06 * whole))
+def frustum_length(rig: CameraRig, points: Array | None = None) -> float:
+    """Size of the drawn cameras, mm: so small beside the distances between neighbours that they stay apart."""
+    centres = rig.positions.double().numpy()
+    if len(centres) > 1:
+        distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+        np.fill_diagonal(distance, np.inf)
+        least = 0.03 * float(np.linalg.norm(np.ptp(centres, axis=0)))
+        return max(0.45 * float(np.median(distance.min(axis=1))), least, 1e-3)
+    if points is not None and len(points):
+        return 0.15 * float(np.linalg.norm(points.reshape(-1, 3).mean(axis=0) - centres[0]))
+    return 0.2 * (rig.working_distance or 500.0)
+
+
+def frustums(rig: CameraRig, length: float) -> Array:
+    """Centre of each camera and the corners of its view, from the top left one: (C, 5, 3) mm in the rig.
+
+    The view is cut off where its depth or its half diagonal reaches `length`.
+    """
+    rig = rig.to(torch.float64)
+    focal = rig.focal_length.clamp_min(1.0)
+    low = ((-0.5 - rig.principal_point) / focal).detach()  # (C, 2) on the plane z = 1
+    high = ((rig.image_size - 0.5 - rig.principal_point) / focal).detach()
+    half = (high - low).norm(dim=-1) / 2
+    depth = length / half.clamp_min(1.0)
+    (left, top), (right, bottom) = low.unbind(-1), high.unbind(-1)
+    one, zero = torch.ones_like(left), torch.zeros_like(left)
+    corners = [(zero, zero, zero), (left, top, one), (right, top, one), (right, bottom, one), (left, bottom, one)]
+    rays = torch.stack([torch.stack(corner, -1) for corner in corners], dim=1) * depth[:, None, None]
+    return (rays @ rig.cam_from_rig.rotation + rig.positions[:, None]).detach().cpu().numpy()

@@ -82,9 +82,9 @@ def likeliest_age(recent: RecentSnapshots, camera: int, age: int) -> int:
     return best
 
 
-def likeliest_camera(test: ChangeTest, known: Collection[int] = ()) -> int:
-    """The camera that most probably changed in any way, out of those not in `known`."""
-    odds = {camera: test.odds({camera: None}) for camera in range(len(test.pixels)) if camera not in known}
+def likeliest_camera(test: ChangeTest, cameras: Collection[int] | None = None) -> int:
+    """The camera that most probably changed in any way, out of some or all."""
+    odds = {camera: test.odds({camera: None}) for camera in (range(len(test.pixels)) if cameras is None else cameras)}
     return max(odds, key=lambda camera: odds[camera])
 
 
@@ -113,8 +113,7 @@ def changed_cameras(
         }
         if free and max(others.values(), default=0.0) < ALARM_CHI2:
             break
-        odds = {camera: given.odds({camera: None}) for camera in others}
-        camera = max(odds, key=lambda camera: odds[camera])
+        camera = likeliest_camera(given, others)
         free[camera], evidence[camera] = None, others[camera]
     return free, evidence
 

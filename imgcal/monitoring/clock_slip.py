@@ -65,12 +65,7 @@ class ClockSlipExplanation(Explanation):
 
 
 def _slip(case: Case, start: Start, cameras: Sequence[int]) -> Variant:
-    """Find the most probable clock slips.
-
-    Args:
-        case: its earlier snapshots help to show how the object moves.
-        start: since when the clocks may have slipped.
-        cameras: the cameras whose clocks may have slipped.
+    """Find the most probable clock slips of some cameras since a start; earlier snapshots show how the object moves.
 
     Raises:
         RefusedError: the other cameras do not see enough of the object, its motion is unknown, or no slip is

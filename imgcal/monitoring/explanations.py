@@ -182,12 +182,7 @@ class Diagnosis:
     waited: int = 0  # successive cases without a leading explanation
 
     def decide(self, case: Case, patient: bool, explanations: Sequence[Explanation] = EXPLANATIONS) -> Verdict:
-        """Weigh a case.
-
-        Args:
-            case: the snapshots.
-            patient: waiting for more snapshots is possible.
-            explanations: the explanations to weigh.
+        """Weigh a case; `patient`: waiting for more snapshots is possible.
 
         Raises:
             RefusedError: the case cannot be decided yet.

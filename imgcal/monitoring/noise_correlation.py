@@ -29,19 +29,24 @@ from imgcal.monitoring.change_test import MODEL_ERROR
 from imgcal.monitoring.shaking import shared_shifts
 from imgcal.types import Observations
 
-MEMORY = 1024
+# Correlation times.
+MEMORY_SNAPSHOTS = 1024
 """Number of latest snapshots used to measure correlation times ..."""
 FIRST_MEASUREMENTS, MEASUREMENT_INTERVAL = (48, 64, 96), 128
 """... counts of snapshots at which they are first measured, and the interval after that."""
 USUAL, USUAL_SECONDS, USUAL_SNAPSHOTS = 0.4, 0.1, 256
 """Autocorrelation of the errors of infrared cameras at short intervals, its decay time (s, to 1/e), and the number of
 snapshots until which a calibrated rig is assumed to have no less: fewer snapshots cannot tell."""
+
+# Time between snapshots.
 FASTEST, SLOWEST = 1 / 60, 1.0
 """Seconds between snapshots while their rate is unknown; the longest interval that is not a pause."""
 PAUSE = 2.5
 """Number of intervals between snapshots after which the previous shift of an image says nothing about the next one."""
 SMOOTHING = 0.1
 """Weight of the latest interval in the running mean of intervals."""
+
+# Persistent and passing errors.
 EPISODE, EPISODE_SECONDS = 2.0, 0.4
 """How long a passing error may last: correlation times, and at least so many seconds. A target at the edge of an image,
 behind somebody's arm, or with wrong labels stays so for a while, and may seem to be shifted by pixels."""
@@ -53,6 +58,8 @@ LEAST_SHIFT = 6.0
 """Minimum image shift of a change, relative to the usual size of persistent errors."""
 TAIL, TAIL_SIGMAS = 0.99, 3.03
 """Quantile of the shifts that is compared, and its distance from the mean in standard deviations for normal shifts."""
+
+# Shifts of images.
 SETTLING_SNAPSHOTS = 64
 """Snapshots to leave out after a camera has changed: their errors come from how little is known about it."""
 LEAST_POINTS = 2
@@ -77,7 +84,7 @@ class NoiseCorrelation:
     cameras: int
     time: Tensor = field(init=False)  # (C,) correlation time in snapshots; 1 = independent
     lasting: Tensor = field(init=False)  # (C,) px, one standard deviation of a persistent image shift
-    shifts: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=MEMORY))  # (C, 2) px
+    shifts: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=MEMORY_SNAPSHOTS))  # (C, 2) px
     taken: int = 0  # snapshots
     usual: float = 1.0  # least correlation time until enough snapshots are taken
     interval: float = 0.0  # s between snapshots; 0 = unknown

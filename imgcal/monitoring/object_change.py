@@ -23,7 +23,7 @@ ONE_MM = 3.0
 """Millimetres per axis: one fiducial was bent or moved."""
 ALL_MM = 0.2
 """Millimetres per axis, for all fiducials: the object was made or measured less accurately than stated."""
-SCALE = 0.1
+SCALE_CHANGE = 0.1
 """Relative scale of the object."""
 
 # Which changes of an object are tested, and how significant they must be.
@@ -58,7 +58,7 @@ def free_object(belief: RigBelief, fiducial: int | None, by: float = ONE_MM) -> 
         tolerance = torch.zeros(obj.num_fiducials, dtype=torch.float64)
         if fiducial is not None:
             tolerance[slice(None) if fiducial == SHAPE else fiducial] = by
-        obj = replace(obj, tolerance=tolerance, scale_tolerance=SCALE if fiducial is None else 0.0)
+        obj = replace(obj, tolerance=tolerance, scale_tolerance=SCALE_CHANGE if fiducial is None else 0.0)
         size = 3 * obj.num_fiducials + 1
         factor = torch.eye(wide + size, dtype=torch.float64)
         factor[:wide, :wide] = belief.factor
@@ -66,7 +66,7 @@ def free_object(belief: RigBelief, fiducial: int | None, by: float = ONE_MM) -> 
     std = object_prior_std(obj)
     rows = _rows(known, fiducial)
     spread = torch.zeros(wide + known, dtype=torch.float64)
-    spread[wide + rows] = (SCALE if fiducial is None else by) / std[rows].clamp_min(1e-6)
+    spread[wide + rows] = (SCALE_CHANGE if fiducial is None else by) / std[rows].clamp_min(1e-6)
     covariance = torch.cholesky_inverse(belief.factor) + spread.square().diag()
     return replace(belief, factor=cholesky_factor(torch.cholesky_inverse(cholesky_factor(covariance))))
 
@@ -145,10 +145,8 @@ def _measure_change(before: RigBelief, after: RigBelief, fiducial: int | None) -
 def _similarities(points: Tensor) -> Tensor:
     """Directions of fiducials (N, 3) in which an object moves, turns or grows without changing its shape: (3 N, 7)."""
     arms = points - points.mean(0)
-    shifts, turns = (
-        torch.eye(3).to(points).expand(len(points), -1, -1),
-        torch.linalg.cross(torch.eye(3).to(points)[None], arms[:, None], dim=-1),
-    )
+    shifts = torch.eye(3).to(points).expand(len(points), -1, -1)
+    turns = torch.linalg.cross(shifts[:1], arms[:, None], dim=-1)
     return torch.cat((shifts, turns, arms[:, None]), 1).movedim(1, -1).flatten(0, 1)
 
 

@@ -110,12 +110,7 @@ class PendingChange:
         return ChangeTest.of(known, self.brought, pull, change, pixel_changes(before.rig))
 
     def decide(self, test: ChangeTest, camera: int, last: bool) -> tuple[str | None, str | None] | None:
-        """Decide how a camera has changed.
-
-        Args:
-            test: see `test`.
-            camera: its number.
-            last: decide now.
+        """Decide how a camera has changed, now if it is the `last` chance.
 
         Returns:
             The kind to believe (None = any) and the kind to report (None = no single kind); None = cannot be decided

@@ -12,7 +12,7 @@ from imgcal.estimation import Estimate, joint_information, step_by_error
 from imgcal.monitoring.rig_belief import RigBelief, cholesky_factor
 from imgcal.types import CalibrationObject, CameraRig, RigPosterior
 
-NEAR = 1e-3
+ROUNDING_MM = 1e-3
 """Millimetres between equal fiducials whose coordinates were rounded in a file."""
 
 
@@ -87,4 +87,4 @@ def calibration_posterior(rig: CameraRig) -> RigPosterior | None:
 
 
 def _same(points: torch.Tensor, others: torch.Tensor) -> bool:
-    return points.shape == others.shape and bool((points - others).abs().max() < NEAR)
+    return points.shape == others.shape and bool((points - others).abs().max() < ROUNDING_MM)

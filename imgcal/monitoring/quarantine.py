@@ -94,7 +94,7 @@ class Quarantine:
         """Add cameras that seem to be unsynchronized.
 
         Args:
-            snapshots: observations (1, C, N) and the object's pose (1,) of each snapshot since then.
+            snapshots: since then.
             pauses: s before each of them.
             cameras: the cameras to add.
             uncertain: their poses are hardly known.
@@ -112,12 +112,12 @@ class Quarantine:
         Raises:
             RefusedError: nothing is known about the rig.
         """
-        total = recent.snapshots(len(recent))
+        total, pauses = recent.latest(len(recent))
         most = CASE_SNAPSHOTS_UNCERTAIN if self.uncertain else CASE_SNAPSHOTS
         window = list(self.seen)[-min(most, len(total)) :]
         count = len(window)
         snapshots = [*total[:-count], *zip(window, [pose for _, pose in total[-count:]], strict=True)]
-        before, pauses = recent.belief_before(count), recent.pauses(len(recent))
+        before = recent.belief_before(count)
         excluded = {
             Shaking.name: "the error is too large for shaking",
             ObjectChanged.name: "the other cameras see an unchanged object",

@@ -21,6 +21,7 @@ from torch import Tensor
 from imgcal.errors import RefusedError
 from imgcal.estimation import displace
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring.case import Snapshot
 from imgcal.monitoring.change_test import CHANGES, MODEL_ERROR, ChangeTest, camera_change_errors, pixel_changes
 from imgcal.monitoring.recent_screening import add_error, add_row, put, screen
 from imgcal.monitoring.rig_arrays import RigArrays
@@ -184,37 +185,21 @@ class RecentSnapshots:
             self._seen.append(entry)
         self._follow(result.belief)
 
-    def replace(
-        self,
-        snapshots: Sequence[tuple[Observations, RigidTransform]],
-        pauses: Sequence[float],
-        result: MeasurementUpdate,
-    ) -> None:
-        """Forget all snapshots, and add some that were absorbed together.
-
-        Args:
-            snapshots: observations (1, C, N) and poses (1,).
-            pauses: s before each of them.
-            result: their joint update.
-        """
+    def replace(self, snapshots: Sequence[Snapshot], pauses: Sequence[float], result: MeasurementUpdate) -> None:
+        """Forget all snapshots, and add some with their joint update; `pauses`: s before each of them."""
         self._seen = deque(_Seen(*snapshot, pause) for snapshot, pause in zip(snapshots, pauses, strict=True))
         self.relinearize(result)
 
     def rebase(self, belief: RigBelief, information: Tensor) -> None:
-        """Replace the belief by another one that includes the information of these snapshots.
-
-        Args:
-            belief: the current belief.
-            information: (D, D) of it, before aging.
-        """
+        """Replace the belief by another one that includes these snapshots; its `information` (D, D) is not aged."""
         at = self._follow(belief)
         brought, weighted = self._sums(0, self._next)
         self._bases = [_Base(self._next - len(self), information - brought, information @ at - weighted)]
         self._aged = True
 
-    def snapshots(self, age: int) -> list[tuple[Observations, RigidTransform]]:
-        """The latest `age` snapshots."""
-        return [(entry.observations, entry.rig_from_object) for entry in list(self._seen)[-age:]]
+    def latest(self, age: int) -> tuple[list[Snapshot], list[float]]:
+        """The latest `age` snapshots, and the seconds before each."""
+        return [(entry.observations, entry.rig_from_object) for entry in list(self._seen)[-age:]], self.pauses(age)
 
     def seconds(self, age: int) -> float:
         """Seconds since the snapshot before the latest `age` ones."""

@@ -21,7 +21,7 @@ TOGETHER = (*range(2, 17), 20, 25, 32, 40, 50, 64, 80, 100, 128)
 MEMORY = TOGETHER[-1]
 YOUNG_SECONDS = 60.0
 """Time for which a rig may be assumed to stand still: its drift is far below the noise of a snapshot."""
-LEAST_SECONDS = 1.0
+LEAST_AGING_SECONDS = 1.0
 """Minimum time worth an inversion of the information."""
 
 
@@ -130,7 +130,7 @@ class RigFilter:
             alone = horizon.without(self.belief, shown(self._early), observations.seen[0].any(-1), self._first)
         passed = max(seconds, 0.0) if self.count and self.horizon is None else 0.0
         self._span, self._waited = self._span + passed, self._waited + passed
-        due = self._waited if self._waited >= LEAST_SECONDS else 0.0
+        due = self._waited if self._waited >= LEAST_AGING_SECONDS else 0.0
         belief = age_belief(self.belief, due, self.walk) if alone is None else alone.first
         start = None if alone is None else self.belief
         result = absorb(belief, observations, rig_from_object, self.options, start)

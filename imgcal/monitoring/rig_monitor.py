@@ -324,10 +324,8 @@ class RigMonitor:
 
     def _case(self, before: RigBelief, age: int, cameras: tuple[int, ...], excluded: Mapping[str, str]) -> Case:
         """Make a case of cameras that seem to have moved before the latest `age` snapshots."""
-        kept = len(self._recent)
-        snapshots, pauses = self._recent.snapshots(kept), self._recent.pauses(kept)
         return Case(
-            before, snapshots, pauses, age, self.filter.options, cameras,
+            before, *self._recent.latest(len(self._recent)), age, self.filter.options, cameras,
             lasting=self.noise.correlated, beginning=self._beginning, excluded=excluded,
         )  # fmt: skip
 
@@ -338,12 +336,7 @@ class RigMonitor:
         return self._anywhere(self._moved_early) if everything else None
 
     def _adopt(self, case: Case, verdict: Verdict, new: bool = False) -> MonitorUpdate:
-        """Learn snapshots again according to the best explanation.
-
-        Args:
-            case: the explained case.
-            verdict: its explanations.
-            new: the filter has not absorbed these snapshots before.
+        """Learn a case's snapshots again by the best explanation; `new`: the filter has not absorbed them before.
 
         Raises:
             RefusedError: see `absorb`.
@@ -425,13 +418,7 @@ class RigMonitor:
     def _restart(
         self, before: RigBelief, snapshots: Sequence[Snapshot], pauses: Sequence[float], new: bool = False
     ) -> MeasurementUpdate:
-        """Restart the filter with the latest snapshots.
-
-        Args:
-            before: the belief before them.
-            snapshots: observations (1, C, N) and the object's pose (1,) of each.
-            pauses: s before each of them.
-            new: the filter has not absorbed them before.
+        """Restart the filter with its latest snapshots; `new`: it has not absorbed them before.
 
         Raises:
             RefusedError: see `absorb`; the monitor is unchanged.
@@ -444,11 +431,9 @@ class RigMonitor:
     def _diagnose_misfit(self, age: int) -> MonitorUpdate | None:
         """Learn the object again if it has changed and the latest snapshots therefore fit worse."""
         age = min(age, len(self._recent))
-        if self.filter.learnt_since(self.known_since) - age < OBJECT_SNAPSHOTS:
-            return None
-        with contextlib.suppress(RefusedError):  # nothing was known about the rig
-            before = self._recent.belief_before(age)
-            return self._adopt_object(before, self._recent.snapshots(age), self._recent.pauses(age))
+        if self.filter.learnt_since(self.known_since) - age >= OBJECT_SNAPSHOTS:
+            with contextlib.suppress(RefusedError):  # nothing was known about the rig
+                return self._adopt_object(self._recent.belief_before(age), *self._recent.latest(age))
         return None
 
     def _diagnose_first_misfit(self, result: MeasurementUpdate) -> MonitorUpdate | None:
@@ -457,7 +442,7 @@ class RigMonitor:
         first = not self.known_since and self._pending is None and len(self._recent) == count
         if not first or not has_never_fitted(result, count):
             return None
-        return self._adopt_object(self._prior, self._recent.snapshots(count), self._recent.pauses(count))
+        return self._adopt_object(self._prior, *self._recent.latest(count))
 
     def diagnose_object(
         self, snapshots: Sequence[Snapshot], pauses: Sequence[float], learnt: bool
@@ -465,7 +450,7 @@ class RigMonitor:
         """Diagnose whether labels do not fit because the object has changed, and learn it again if so.
 
         Args:
-            snapshots: observations (1, C, N) with those labels, and poses (1,), of the latest snapshots.
+            snapshots: the latest ones, with those labels.
             pauses: s before each of them.
             learnt: the snapshots were absorbed without those labels; otherwise not at all.
 
@@ -487,7 +472,7 @@ class RigMonitor:
         """Quarantine the cameras because of which labels no longer fit in most cameras.
 
         Args:
-            snapshots: observations (1, C, N) with those labels, and poses (1,), of the latest snapshots; not absorbed.
+            snapshots: the latest ones, with those labels; not absorbed.
             pauses: s before each of them.
 
         Returns:

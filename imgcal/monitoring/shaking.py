@@ -27,7 +27,7 @@ SHAKES = (0.15, 0.5, 1.5)
 """Pixels, one standard deviation: candidate shake levels. A camera that shakes more than that counts as moved."""
 SHAKE_SNAPSHOTS = 64
 """Number of snapshots between estimates of the level."""
-OTHER = 2.0
+DIFFERENT_VARIANCE = 2.0
 """Minimum ratio of variances that counts as different; 1.3 occurs by chance."""
 LEAST_POINTS = 3
 """Minimum number of points in a camera that show a shared shift."""
@@ -148,6 +148,6 @@ class ShakeLevel:
         expected[often] = np.nanmedian(known[:, 2, often], axis=0)
         before = self.shake.numpy()
         ratio = found / (expected + before**2)
-        other = often & ((ratio > OTHER) | (ratio < 1 / OTHER))
-        variance = np.where(found > OTHER * expected, found - expected, 0.0)
+        other = often & ((ratio > DIFFERENT_VARIANCE) | (ratio < 1 / DIFFERENT_VARIANCE))
+        variance = np.where(found > DIFFERENT_VARIANCE * expected, found - expected, 0.0)
         self.shake = torch.from_numpy(np.where(other, np.sqrt(np.maximum(variance, 0.0)), before))

@@ -79,21 +79,11 @@ def unsynchronized_evidence(
 def _evidence_of_own_poses(
     observations: Observations, cameras: Collection[int], options: EstimationOptions, result: MeasurementUpdate
 ) -> float:
-    """Log probability of what unsynchronized cameras see, given the update by the others.
-
-    Args:
-        observations: (S, C, N).
-        cameras: the unsynchronized cameras, each with its own times.
-        options: how to minimize.
-        result: the update by the same snapshots without these cameras.
-
-    Raises:
-        RefusedError: the other cameras do not determine poses.
-    """
-    poses, evidence = result.rig_from_object, 0.0
+    """The part of `unsynchronized_evidence` that the cameras add to the update by the others."""
+    poses = result.rig_from_object
     others = _pose_information(result.belief, drop_cameras(observations, cameras), poses)
     every = _pose_information(result.belief, observations, poses)
-    evidence += 0.5 * float((torch.logdet(every) - torch.logdet(others)).sum())  # `absorb` leaves out shared terms
+    evidence = 0.5 * float((torch.logdet(every) - torch.logdet(others)).sum())  # `absorb` leaves out shared terms
     for camera in cameras:
         rest = [other for other in range(observations.seen.shape[1]) if other != camera]
         alone = drop_cameras(observations, rest)

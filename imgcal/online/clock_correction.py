@@ -16,7 +16,7 @@ from imgcal.types import Detections
 INEXACT, UNSTEADY = 0.1, 30.0
 """Error of a corrected blob: a share of the distance moved, and pixels per second of delay. The place is extrapolated,
 and the extrapolation error is the same for all blobs of a snapshot."""
-LONGEST = 0.2
+LONGEST_GAP = 0.2
 """Maximum time (s) since the last snapshot but one for which the object's motion is known."""
 POSES = 16
 """Number of latest snapshots that give the motion."""
@@ -46,7 +46,7 @@ def clock_shifts(
     cameras = np.flatnonzero(late)
     if not len(cameras):
         return shift
-    known = len(poses) > 1 and time - poses[-2][0] <= LONGEST
+    known = len(poses) > 1 and time - poses[-2][0] <= LONGEST_GAP
     if not known:
         shift[np.isin(blobs.camera, cameras)] = np.nan
         return shift

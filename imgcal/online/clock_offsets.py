@@ -15,22 +15,27 @@ from imgcal.monitoring import ClockSlip, MeasurementUpdate
 from imgcal.online.events import Event
 from imgcal.online.rig_state import RigState
 
-MEMORY = 5.0
+# Residuals that count.
+MEMORY_SECONDS = 5.0
 """Decay time (s, to 1/e) of a residual's weight."""
-LONGEST = 0.2
+LONGEST_INTERVAL = 0.2
 """Maximum time (s) between snapshots for which the difference of predictions is a velocity."""
+
+# Offsets that are reported and corrected.
 OFFSET_CHI2, LEAST = 40.0, 1e-3
 """Chi-squared (one degree of freedom; chance: once in 10^9 independent tests), and seconds, to report an offset ..."""
 LEAST_KNOWN = 1e-4
 """... and seconds from which it is corrected."""
-INEXACT = 0.05
+LEAST_CHANGE = 0.05
 """Relative change of an offset at which it is reported again."""
 LEAST_MEMORY = 1.0
 """Seconds of motion required before a report."""
+
+# When motion and shift can be separated.
 LEAST_MOTION, LEAST_SIGMAS = 0.5, 5.0
 """Pixels, and standard deviations, by which blobs (their median) must move between snapshots: less is noise of the
 pose, which correlates with the residuals. Predictions would not do: they also move as the rig is learnt."""
-STEP, STEPS = 0.2, 3
+CAMERA_STEP, STEP_SNAPSHOTS = 0.2, 3
 """Change (px) of a camera's image, and number of snapshots that it must last, to restart that camera's estimate."""
 LEAST_DETERMINED = 1e-6
 """Minimum determinant, scaled to a unit diagonal, for separating motion and shift."""
@@ -64,7 +69,7 @@ class ClockOffsets:
         pose, last = state.rig_from_object, self._last
         places = self._places(state)
         self._last = None if pose is None else (state.time, pose, places)
-        if last is None or pose is None or not 0 < state.time - last[0] <= LONGEST:
+        if last is None or pose is None or not 0 < state.time - last[0] <= LONGEST_INTERVAL:
             return ()
         self._period = state.time - last[0]
         went = np.linalg.norm(places - last[2], axis=-1)
@@ -95,7 +100,7 @@ class ClockOffsets:
         """Correct an offset (s) from now on, and report it if significant."""
         self.late[camera] = late
         self._begin(camera)
-        if abs(late - self._told[camera]) < LEAST + INEXACT * abs(late):
+        if abs(late - self._told[camera]) < LEAST + LEAST_CHANGE * abs(late):
             return ()
         self._told[camera] = late
         return (self._event(state, camera, late, sigma, evidence, since),)
@@ -136,7 +141,7 @@ class ClockOffsets:
 
     def _add(self, state: RigState, velocity: NDArray[np.float64]) -> None:
         """Add the residuals of a snapshot; `velocity` (C, N, 2) pixels a second."""
-        keep = math.exp(-self._period / MEMORY)
+        keep = math.exp(-self._period / MEMORY_SECONDS)
         self._normal *= keep
         self._right *= keep
         self._seconds = self._seconds * keep + self._period
@@ -182,9 +187,9 @@ class ClockOffsets:
         middle = _middle(np.where(good[..., None], off, np.inf), count)
         usual = _middle(np.where(good, sigma, np.inf)[..., None], count)[:, 0]
         with np.errstate(invalid="ignore"):
-            other = known & (np.linalg.norm(middle, axis=1) > np.maximum(STEP, 6 * usual / np.sqrt(count)))
+            other = known & (np.linalg.norm(middle, axis=1) > np.maximum(CAMERA_STEP, 6 * usual / np.sqrt(count)))
         self._other = np.where(other, self._other + 1, np.where(known, 0, self._other))
-        restarted = self._other >= STEPS
+        restarted = self._other >= STEP_SNAPSHOTS
         self._begin(restarted)
         return other & ~restarted
 

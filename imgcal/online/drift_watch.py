@@ -11,13 +11,13 @@ from torch import Tensor
 
 from imgcal.estimation import Gauge
 from imgcal.monitoring import CHANGES, RigBelief
-from imgcal.online.events import UNITS, ChangeKind, Event
+from imgcal.online.events import ChangeKind, Event
 from imgcal.online.relearning import relative_std
-from imgcal.types import CameraRig
+from imgcal.types import SHOWN_UNITS, CameraRig
 
 EVERY_SECONDS = 10.0
 """Time between two checks."""
-WORTH = {"rotation": math.radians(0.05), "position": 0.5, "focal_length": 1.0, "principal_point": 1.0}
+LEAST_DRIFT = {"rotation": math.radians(0.05), "position": 0.5, "focal_length": 1.0, "principal_point": 1.0}
 """Drift (rad, mm, pixels) that is reported if significant."""
 DRIFT_SIGMAS = 5.0
 """Significance of the drift, in standard deviations of the values at the start of the measurement."""
@@ -77,14 +77,14 @@ class DriftWatch:
         best: tuple[float, ChangeKind, float] | None = None
         for kind, part in CHANGES.items():
             size = float(change[part].norm())
-            least = max(WORTH[kind], DRIFT_SIGMAS * float(std[part].max()))
+            least = max(LEAST_DRIFT[kind], DRIFT_SIGMAS * float(std[part].max()))
             if size >= least and (best is None or size / least > best[0]):
                 best = size / least, kind, size  # type: ignore[assignment]
         return None if best is None else best[1:]
 
     def _event(self, camera: int, kind: ChangeKind, size: float, std: Tensor, time: float, number: int) -> Event:
-        unit, name = UNITS[kind], self.names[camera]
-        scale = math.degrees(1.0) if unit == "deg" else 1.0
+        name = self.names[camera]
+        unit, scale = SHOWN_UNITS[kind]
         assert self.std is not None
         part = CHANGES[kind]
         sigma = float((self.std[camera, part].square() + std[part].square()).max().sqrt()) * scale

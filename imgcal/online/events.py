@@ -26,9 +26,6 @@ EventKind = Literal[
 ChangeKind = Literal["rotation", "position", "focal_length", "principal_point", "unknown"]
 Unit = Literal["deg", "mm", "px", "frames"]
 
-UNITS: dict[ChangeKind, Unit | None] = {
-    "rotation": "deg", "position": "mm", "focal_length": "px", "principal_point": "px", "unknown": None,
-}  # fmt: skip
 EVENT_KINDS: tuple[EventKind, ...] = get_args(EventKind)
 
 

@@ -17,43 +17,50 @@ from imgcal.online.rig_state import RigState
 
 Array = NDArray[np.float64]
 
-BLOCK = 1.0
+# Blocks of snapshots, which are averaged.
+BLOCK_SECONDS = 1.0
 """Duration of a block, whose snapshots are averaged."""
 INTERVAL = 0.06
 """Minimum time between evaluated snapshots: more of them add nothing."""
 LEAST_FIDUCIALS = np.array((10.0, 10.0, 20.0))
 """Minimum number of fiducials in a block, for each measure; a block with fewer continues."""
-LONGEST = 60.0
+LONGEST_BLOCK = 60.0
 """Age (s) at which an unfinished block is discarded: the object was away."""
 CORRELATION_SECONDS = 4.0
 """Time constant of what place and distance do not explain: arms in front, motion blur, the object's attitude. On the
 ten-camera stream the autocorrelation at one second is below 0.3 for nine cameras and 0.6 for the tenth."""
-CENTRES = (-2 / 3, 0.0, 2 / 3)
+
+# What place and distance explain.
+TERM_CENTRES = (-2 / 3, 0.0, 2 / 3)
 """Centres of the local terms across and down the image, relative to its centre, in half image sizes ..."""
-WIDTH = 0.5
+TERM_WIDTH = 0.5
 """... and the standard deviation of each."""
-FEATURES = 1 + len(CENTRES) ** 2 + 2 + 3  # constant, local terms, log distance and its square, direction
-SPREAD = np.array((0.03, 0.15, 0.1))
+FEATURES = 1 + len(TERM_CENTRES) ** 2 + 2 + 3  # constant, local terms, log distance and its square, direction
+
+# What is known beforehand, and how it is learnt.
+LEAST_SPREAD = np.array((0.03, 0.15, 0.1))
 """Minimum standard deviations of a block: size (3 %), sigma (15 %), share missing (0.1, on the real stream)."""
 PRIOR = np.array(((10.0, 0.1, 0.3, 0.1), (10.0, 0.5, 2.0, 0.5), (0.3, 0.2, 0.2, 0.2)))
 """Prior standard deviations of the coefficients of each measure: constant, local terms, distance, direction."""
 PRIOR_BLOCKS = 20
-"""Weight of the prior `SPREAD`, in blocks."""
-MEMORY = 600
+"""Weight of the prior `LEAST_SPREAD`, in blocks."""
+MEMORY_BLOCKS = 600
 """Number of blocks over which the spread is averaged."""
 LEARNT = 0.1
 """A place is known if the variance of its expected value is below this, in variances of a block. Only known places are
 tested; nothing is learnt there, so that slow changes are not absorbed."""
 SUSPICION = 0.3
 """Share of the alarm threshold above which nothing is learnt: it may be the fault itself."""
+
+# The test.
 RUN_LENGTH = 1e7
 """Mean number of blocks between false alarms of a camera and measure, if blocks were normal: four months in view."""
-REFERENCE = 0.5
+SUBTRACTED = 0.5
 """Standard deviations that are subtracted from each block."""
 MOST_SPREADS = np.array((4.0, 4.0, 1.0))
 """Maximum number of standard deviations that one block counts for. An arm hides fiducials for seconds, dirt until it is
 cleaned: evidence for missing fiducials grows with time alone, and suffices after half a minute."""
-COMMON = 4
+SHARED_CAMERAS = 4
 """Minimum number of cameras for a shared effect (a fast object, a hand, a weak lamp) to be blamed on none of them."""
 CLEAN, CLEAN_BLOCKS = 1.5, 5
 """Standard deviations below which a block is normal, and how many such blocks in a row end an alarm."""
@@ -86,12 +93,12 @@ class ImageQuality:
         self._last_value, self._last_place = np.zeros(shape), np.zeros((*shape, FEATURES))  # ... and its contents
         self._coefficients = np.zeros((*shape, FEATURES))
         self._covariance = np.broadcast_to(_prior()[:, None], (*shape, FEATURES, FEATURES)).copy()
-        self._variance = np.repeat(SPREAD[:, None] ** 2, cameras, 1)  # of a block
+        self._variance = np.repeat(LEAST_SPREAD[:, None] ** 2, cameras, 1)  # of a block
         self._blocks = np.zeros(shape)
         self._usual = np.zeros(shape)  # successive normal blocks
         self._bad = np.zeros(shape, dtype=bool)
         self._good = np.zeros(shape)  # s, last time without a sign of a fault
-        self._test = Cusum(3 * cameras, REFERENCE, RUN_LENGTH)
+        self._test = Cusum(3 * cameras, SUBTRACTED, RUN_LENGTH)
 
     def __call__(
         self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: MeasurementUpdate | None
@@ -100,11 +107,11 @@ class ImageQuality:
         if self._began is None:  # also after a restart, when earlier times are not exact
             self._good[:] = state.time
         self._good = np.minimum(self._good, state.time)  # clocks may be set back
-        if self._began is None or not 0 <= state.time - self._began < LONGEST:
+        if self._began is None or not 0 <= state.time - self._began < LONGEST_BLOCK:
             self._began = state.time
             self._discard(np.ones_like(self._bad))
         events = []
-        if state.time - self._began >= BLOCK:
+        if state.time - self._began >= BLOCK_SECONDS:
             events = self._judge(state)
             self._began = state.time
         if state.rig_from_object is not None and not 0 <= state.time - self._collected < INTERVAL:
@@ -149,7 +156,7 @@ class ImageQuality:
         total = np.maximum(self._count, 1)
         value, place = self._sum / total, self._place / total[..., None]
         self._discard(done)
-        correlation = np.exp(-np.maximum(state.time - self._last_time, BLOCK) / CORRELATION_SECONDS)
+        correlation = np.exp(-np.maximum(state.time - self._last_time, BLOCK_SECONDS) / CORRELATION_SECONDS)
         own = self._variance * (1 - correlation**2)  # of the innovation; after a long pause all of it
         step_place = place - correlation[..., None] * self._last_place
         step = value - correlation * self._last_value - (step_place * self._coefficients).sum(-1)
@@ -165,8 +172,10 @@ class ImageQuality:
         self._coefficients += gain * step[..., None]
         self._covariance -= gain[..., None] * spread[..., None, :]
         self._blocks += done
-        excess = np.where(done, np.minimum(z**2, 9.0) - 1.0, 0.0) / np.minimum(PRIOR_BLOCKS + self._blocks, MEMORY)
-        self._variance = np.maximum(self._variance * (1 + excess), SPREAD[:, None] ** 2)
+        excess = np.where(done, np.minimum(z**2, 9.0) - 1.0, 0.0) / np.minimum(
+            PRIOR_BLOCKS + self._blocks, MEMORY_BLOCKS
+        )
+        self._variance = np.maximum(self._variance * (1 + excess), LEAST_SPREAD[:, None] ** 2)
         self._last_time[done] = state.time
         self._last_value[done], self._last_place[done] = value[done], place[done]
         risen = self._test.update(np.minimum(_own_part(z), MOST_SPREADS[:, None]).ravel()).reshape(z.shape)
@@ -214,7 +223,7 @@ _KEPT = ("distance", "coefficients", "covariance", "variance", "blocks", "usual"
 
 def _prior() -> Array:
     """Prior covariance of the coefficients of each measure: (3, F, F)."""
-    std = np.repeat(PRIOR, (1, len(CENTRES) ** 2, 2, 3), axis=1)
+    std = np.repeat(PRIOR, (1, len(TERM_CENTRES) ** 2, 2, 3), axis=1)
     return std[..., None] ** 2 * np.eye(FEATURES)
 
 
@@ -246,7 +255,7 @@ def _place(state: RigState, points: Array, inside: NDArray[np.bool_], reference:
     distance = np.log((points[..., 2:] * weight).sum((1, 2)))
     reference[:] = np.where(reference == 0, np.nan_to_num(distance), reference)
     far = (distance - reference)[:, None]
-    local = [np.exp(-0.5 * np.square((axis[:, None] - CENTRES) / WIDTH)) for axis in centre.T]
+    local = [np.exp(-0.5 * np.square((axis[:, None] - TERM_CENTRES) / TERM_WIDTH)) for axis in centre.T]
     nearby = (local[0][:, :, None] * local[1][:, None, :]).reshape(len(points), -1)
     ray = (rig.positions - pose.apply(state.belief.points_object).mean(0)) @ pose.rotation
     direction = (ray / ray.norm(dim=-1, keepdim=True)).numpy()
@@ -255,7 +264,7 @@ def _place(state: RigState, points: Array, inside: NDArray[np.bool_], reference:
 
 def _own_part(z: Array) -> Array:
     """Subtract the effect shared by most cameras from z (3, C), if there are enough cameras."""
-    enough = np.isfinite(z).sum(1) >= COMMON
+    enough = np.isfinite(z).sum(1) >= SHARED_CAMERAS
     common = np.zeros(len(z))
     common[enough] = np.maximum(np.nanmedian(z[enough], axis=1), 0.0)
     return z - common[:, None]

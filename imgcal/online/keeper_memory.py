@@ -40,7 +40,7 @@ UNUSUAL = 5.0
 """Error of most cameras, in multiples of its usual size, above which labels or pose must be wrong, not the cameras."""
 LEAST_LOOKS = 8
 """Number of snapshots of a camera in its current pose after which its labels can be predicted."""
-LEAST_USUAL = 8
+USUAL_SNAPSHOTS = 8
 """Number of snapshots that define the usual error of most cameras."""
 
 
@@ -161,7 +161,7 @@ class KeeperMemory:
     @property
     def most_usual(self) -> float:
         """Maximum error of most cameras, px."""
-        if len(self.usual) < LEAST_USUAL:
+        if len(self.usual) < USUAL_SNAPSHOTS:
             return math.inf
         return self.options.identity_error + UNUSUAL * max(
             float(np.median(self.usual)), float(np.median(self.noise.additive))

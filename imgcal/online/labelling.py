@@ -25,7 +25,7 @@ slipped by a pitch unnoticed."""
 LEAST_FOLLOWED = 0.9
 """Share of the last snapshot's labels that must be found again and fit."""
 
-NEAR = "near the last prediction"
+NEAR_PREDICTION = "near the last prediction"
 
 
 class Labelling:

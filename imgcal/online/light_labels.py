@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 LEAST_MARGIN = 5.0
 """Log odds of a light against the best other light that uses one of its blobs."""
-ASTRAY_SECONDS, ASTRAY_BLOBS = 2.0, 3
+FAR_SECONDS, FAR_BLOBS = 2.0, 3
 """Seconds, and number of blobs away from all lights, after which a camera may be reported to have moved far."""
 WINDOW = 60.0
 """Maximum image shift (px) in the search."""
@@ -76,7 +76,7 @@ def label_lights(memory: KeeperMemory, tracks: LightTracks, blobs: Detections) -
     for camera in sought:
         found_at = scene.find_shift(camera, tracks.shift[camera])
         if found_at is None:
-            lost[camera] = scene.bare(camera) >= ASTRAY_BLOBS
+            lost[camera] = scene.bare(camera) >= FAR_BLOBS
             continue
         shift, labels = found_at
         middle = scene.expected[camera, labels[labels >= 0]].mean(0)
@@ -92,7 +92,7 @@ def label_lights(memory: KeeperMemory, tracks: LightTracks, blobs: Detections) -
     fits[sought] = False
     tracks.shift[fits] = 0.0
     tracks.astray = np.where(lost, np.where(tracks.astray <= time, tracks.astray, time), np.nan)
-    astray = frozenset(np.flatnonzero(time - tracks.astray >= ASTRAY_SECONDS).tolist())
+    astray = frozenset(np.flatnonzero(time - tracks.astray >= FAR_SECONDS).tolist())
     named = np.where(scene.label >= 0, numbers[scene.label], -1)
     place = np.full((memory.obj.num_fiducials, 3), np.nan)
     place[numbers[numbers >= 0]] = found.point[numbers >= 0]

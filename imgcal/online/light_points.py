@@ -17,7 +17,7 @@ from imgcal.types import Detections
 
 Array = NDArray[np.float64]
 
-STEPS = 3
+NEWTON_STEPS = 3
 """Gauss-Newton steps, from a position that is right to a pixel."""
 
 
@@ -77,7 +77,7 @@ def light_points(
     )
     weight, uv = torch.from_numpy(1 / variance).double(), torch.from_numpy(blobs.uv[rows]).double()
     point = torch.from_numpy(found.point).double()
-    for _ in range(STEPS):
+    for _ in range(NEWTON_STEPS):
         by_point, _ = _jacobians(belief, point, camera, light)
         information = _information(by_point, weight, light, count)
         image = rig.expand(1).project_values(point[None]).uv[0][camera, light]

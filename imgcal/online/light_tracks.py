@@ -16,13 +16,13 @@ MOST_STILL = 32
 """Number of static blobs of each camera."""
 STILL_PIXELS, STILL_SECONDS = 1.0, 2.0
 """Distance (px) and time (s) that define a static blob; the same time applies to how long it may be hidden."""
-LONGEST = 0.5
+HIDDEN_SECONDS = 0.5
 """Time (s) for which a hidden light keeps its number."""
-NEAR = 100.0
+NEAR_MM = 100.0
 """Maximum distance (mm) between a light and its prediction for it to keep its number."""
-ERROR, ACCELERATION = 10.0, 50_000.0
+PREDICTION_ERROR, ACCELERATION = 10.0, 50_000.0
 """Error of a light's prediction from its velocity: mm, and mm/s^2."""
-FASTEST = 5000.0
+UNKNOWN_SPEED = 5000.0
 """Speed (mm/s) of a light with unknown velocity."""
 NEIGHBOUR, DIFFERENCE = 500.0, 2000.0
 """Distance (mm) from a light with known velocity within which a new light is assumed to move likewise, and the possible
@@ -64,7 +64,7 @@ class LightTracks:
         Unused numbers are given out first, then those unused for the longest time.
         """
         since = time - self.time
-        self.place[(since > LONGEST) | (since < 0)] = np.nan
+        self.place[(since > HIDDEN_SECONDS) | (since < 0)] = np.nan
         velocity, reach = self._expected_velocity(points, since)
         expected = self.place + velocity * since[:, None]
         distance = np.linalg.norm(points[:, None] - expected, axis=-1)
@@ -105,30 +105,30 @@ class LightTracks:
         """
         alive = np.isfinite(self.place[:, 0])
         known = alive & np.isfinite(self.velocity[:, 0])
-        velocity, reach = self.velocity.copy(), np.minimum(ERROR + ACCELERATION / 2 * since**2, NEAR)
+        velocity, reach = self.velocity.copy(), np.minimum(PREDICTION_ERROR + ACCELERATION / 2 * since**2, NEAR_MM)
         unknown = np.flatnonzero(alive & ~known)
         if known.any() and len(unknown):
             others = np.flatnonzero(known)
             away = np.linalg.norm(self.place[unknown, None] - self.place[others], axis=-1)
             near = away.min(1) < NEIGHBOUR
             velocity[unknown[near]] = self.velocity[others[away.argmin(1)[near]]]
-            reach[unknown] = np.minimum(reach[unknown] + DIFFERENCE * since[unknown], NEAR)
+            reach[unknown] = np.minimum(reach[unknown] + DIFFERENCE * since[unknown], NEAR_MM)
         elif len(unknown) and len(points):
             velocity[unknown] = self._common_velocity(points, unknown, since)
         alone = unknown[~np.isfinite(velocity[unknown, 0])]
         velocity[alone] = 0.0
-        reach[alone] = np.minimum(ERROR + FASTEST * since[alone], NEAR)
+        reach[alone] = np.minimum(PREDICTION_ERROR + UNKNOWN_SPEED * since[alone], NEAR_MM)
         return velocity, reach
 
     def _common_velocity(self, points: Array, rows: NDArray[np.int64], since: Array) -> Array:
         """Velocity (3,) mm/s that takes most of some lights to present lights; nan = none matches two."""
         passed = since[rows].max()
         shift = (points[:, None] - self.place[rows]).reshape(-1, 3)
-        shift = shift[np.linalg.norm(shift, axis=1) < ERROR + FASTEST * passed]
+        shift = shift[np.linalg.norm(shift, axis=1) < PREDICTION_ERROR + UNKNOWN_SPEED * passed]
         if not len(shift) or passed <= 0:
             return np.full(3, np.nan)
         moved = self.place[rows] + shift[:, None]  # (T, R, 3)
-        there = np.linalg.norm(moved[:, :, None] - points, axis=-1).min(2) < ERROR
+        there = np.linalg.norm(moved[:, :, None] - points, axis=-1).min(2) < PREDICTION_ERROR
         count = there.sum(1)
         best = int(np.lexsort((np.linalg.norm(shift, axis=1), -count))[0])
         return shift[best] / passed if count[best] >= 2 else np.full(3, np.nan)

@@ -15,13 +15,13 @@ from imgcal.association import Associations, PipelineOptions, SnapshotIdentity
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring import MeasurementUpdate, shared_shifts
-from imgcal.online.labelling import NEAR
+from imgcal.online.labelling import NEAR_PREDICTION
 from imgcal.pipeline import fit_labelled
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 
-ASKED = (1, 2, 4, 8, 16, 32)
+TESTED_TOGETHER = (1, 2, 4, 8, 16, 32)
 """Numbers of first snapshots that are tested together."""
-OTHER = 1.2
+DIFFERENT_LEVEL = 1.2
 """Minimum ratio of noise levels that counts as different."""
 FIRST_ESTIMATES, ESTIMATE_INTERVAL = (16, 32), 64
 """Numbers of snapshots at which cameras are first tested one by one; then the interval, and the most snapshots used."""
@@ -72,12 +72,12 @@ class NoiseLevel:
         """
         again = False
         if self._asking:
-            self._asking = steady and count == len(self._early) + 1 and count <= ASKED[-1]
+            self._asking = steady and count == len(self._early) + 1 and count <= TESTED_TOGETHER[-1]
             if self._asking:
-                identity = SnapshotIdentity(f"{count}", "by_tracking", NEAR, 1, result.rig_from_object[0])
+                identity = SnapshotIdentity(f"{count}", "by_tracking", NEAR_PREDICTION, 1, result.rig_from_object[0])
                 self._early.append((blobs, identity))
-                again = count in ASKED and self._estimate()
-                if count == ASKED[-1]:
+                again = count in TESTED_TOGETHER and self._estimate()
+                if count == TESTED_TOGETHER[-1]:
                     self._asking = False
             if not self._asking:
                 self._early = []
@@ -105,7 +105,7 @@ class NoiseLevel:
     def _differs(self, additive: float) -> bool:
         sigma = float(np.median(self._early[-1][0].sigma))
         before, now = math.hypot(sigma, float(np.median(self.additive))), math.hypot(sigma, additive)
-        return max(before, now) > OTHER * min(before, now)
+        return max(before, now) > DIFFERENT_LEVEL * min(before, now)
 
     def _follow(self, observations: Observations, result: MeasurementUpdate, count: int) -> None:
         """Track the noise by the residuals of single snapshots."""
@@ -131,7 +131,7 @@ class NoiseLevel:
         if not some.any():
             return
         ratio = np.nanmedian(known[:, some], axis=(0, 2))
-        other = np.maximum(ratio, 1 / np.maximum(ratio, 1e-9)) > OTHER**2
+        other = np.maximum(ratio, 1 / np.maximum(ratio, 1e-9)) > DIFFERENT_LEVEL**2
         if not other.any():
             return
         sigma = torch.where(observations.seen[0], observations.sigma[0], torch.nan)[torch.from_numpy(some)]

@@ -17,7 +17,7 @@ from imgcal.online.events import Event
 from imgcal.online.label_consistency import Checked
 from imgcal.types import Detections
 
-ASKED = 8
+LATEST = 8
 """Successive snapshots with a fiducial, or the object, in an impossible place; they are tested together."""
 LEAST_CAMERAS = 2
 """Number of cameras that must see a fiducial in the wrong place."""
@@ -62,26 +62,28 @@ class ObjectChecks:
             self.odd[fiducial] = self.odd.get(fiducial, 0) + 1
         kept = np.where(np.isin(checked.given.fiducial, list(self.odd)), checked.given.fiducial, blobs.fiducial)
         shown = Detections(**{**vars(blobs), "fiducial": kept})
-        self.learnt = [*self.learnt, UnfittedSnapshot(shown, checked.rig_from_object, seconds, time)][-ASKED:]
+        self.learnt = [*self.learnt, UnfittedSnapshot(shown, checked.rig_from_object, seconds, time)][-LATEST:]
         self.vain = max(self.vain - 1, 0)
-        return len(self.learnt) == ASKED and max(self.odd.values(), default=0) >= ASKED and not self.vain
+        return len(self.learnt) == LATEST and max(self.odd.values(), default=0) >= LATEST and not self.vain
 
     def observe_refused(self, checked: Checked, learnt: float, time: float) -> None:
         """Take a snapshot that fits in no camera; `learnt`: time (s) of the last absorbed one."""
         seconds = max(time - (self.refused[-1].time if self.refused else learnt), 0.0)
-        self.refused = [*self.refused, UnfittedSnapshot(checked.given, checked.rig_from_object, seconds, time)][-ASKED:]
+        self.refused = [*self.refused, UnfittedSnapshot(checked.given, checked.rig_from_object, seconds, time)][
+            -LATEST:
+        ]
         self.vain = max(self.vain - 1, 0)
 
     @property
     def due(self) -> bool:
         """Tell whether to test the snapshots that fit in no camera."""
-        return len(self.refused) == ASKED and not self.vain
+        return len(self.refused) == LATEST and not self.vain
 
     def record_test(self, found: bool) -> None:
         """Restart if the object was found to have changed; otherwise wait for the next test."""
         if found:
             self.learnt, self.odd = [], {}
-        self.refused, self.vain = [], 0 if found else 8 * ASKED
+        self.refused, self.vain = [], 0 if found else 8 * LATEST
 
     def _count(self, given: Detections, left: Detections) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Number of cameras that see each fiducial in the wrong place, and in the right place: (N,) each."""

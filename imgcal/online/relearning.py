@@ -10,7 +10,8 @@ from torch import Tensor
 
 from imgcal.estimation import Gauge
 from imgcal.monitoring import CHANGES, Change, RigBelief
-from imgcal.online.events import UNITS, ChangeKind, Event
+from imgcal.online.events import ChangeKind, Event
+from imgcal.types import SHOWN_UNITS
 
 RELEARNT = 1.1
 """Largest standard deviations of a relearnt camera, relative to those before it moved."""
@@ -47,8 +48,8 @@ class Relearning:
             before: a belief before the change.
         """
         kind: ChangeKind = change.kind  # type: ignore[assignment]
-        unit, name = UNITS[kind], self.names[change.camera]
-        scale = math.degrees(1.0) if unit == "deg" else 1.0
+        name = self.names[change.camera]
+        unit, scale = SHOWN_UNITS.get(kind, (None, 1.0))
         size, sigma = (None, None) if unit is None else (change.size * scale, change.sigma * scale)
         how = HOW[kind] if size is None else f"{HOW[kind]} {size:.3g} +- {sigma:.1g} {unit}"
         evidence = change.evidence if math.isfinite(change.evidence) else None
@@ -110,4 +111,4 @@ def change_sigma(std: Tensor, change: ChangeKind | None) -> float | None:
     """Standard deviation along the worst direction of a kind of change, from a camera's (K,), in the event's unit."""
     if change is None or change not in CHANGES:
         return None
-    return float(std[CHANGES[change]].max()) * (math.degrees(1.0) if change == "rotation" else 1.0)
+    return float(std[CHANGES[change]].max()) * SHOWN_UNITS[change][1]

@@ -20,7 +20,7 @@ TRIES = 1200
 """Number of blob triples to match with fiducial triples: about 300 tries find a correct one."""
 FIRST, SHORTLIST = 4, 128
 """Number of evenly spread snapshots that rate all poses, and number of poses to rate by all snapshots."""
-ROUGH, FINE = 6.0, 2.0
+ROUGH_PX, FINE_PX = 6.0, 2.0
 """Maximum distance (px) between a blob and its fiducial: for a pose from three of them, and after a fit of all."""
 LEAST_MATCHES = 8
 """Minimum number of matches over all snapshots: four in one snapshot may agree by chance."""
@@ -60,8 +60,8 @@ def resect_camera(
     if not len(poses):
         return None
     focal = float(camera.focal_length.mean())
-    poses = poses[_promising(poses, points, seen, ROUGH / focal)]
-    labels = [_matches(poses, p, xy, ROUGH / focal) for p, xy in zip(points, seen, strict=True)]  # S x (K, M)
+    poses = poses[_promising(poses, points, seen, ROUGH_PX / focal)]
+    labels = [_matches(poses, p, xy, ROUGH_PX / focal) for p, xy in zip(points, seen, strict=True)]  # S x (K, M)
     count = sum((found >= 0).sum(1) for found in labels)
     best = int(np.argmax(count))
     first = [found[best] for found in labels]
@@ -70,7 +70,7 @@ def resect_camera(
         return None
     inside = fitted.expand(len(points)).project(points_rig).visible[:, 0].sum(-1).numpy()
     final = [
-        _matches(_pose(fitted), p, _ideal(uv, fitted), FINE / focal)[0] for p, uv in zip(points, blobs, strict=True)
+        _matches(_pose(fitted), p, _ideal(uv, fitted), FINE_PX / focal)[0] for p, uv in zip(points, blobs, strict=True)
     ]
     matches = sum(int((found >= 0).sum()) for found in final)
     possible = sum(min(int(n), len(xy)) for n, xy in zip(inside, seen, strict=True))
@@ -89,7 +89,7 @@ def labels_at(uv: NDArray[np.float64], points_rig: Tensor, camera: CameraRig) ->
         points_rig: (N, 3) mm, the fiducials.
         camera: a rig of one camera.
     """
-    tolerance = FINE / float(camera.focal_length.mean())
+    tolerance = FINE_PX / float(camera.focal_length.mean())
     labels = _matches(_pose(camera), points_rig.numpy(), _ideal(uv, camera), tolerance)[0]
     possible = min(int(camera.project(points_rig).visible.sum()), len(uv))
     found = int((labels >= 0).sum())

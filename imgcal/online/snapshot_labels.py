@@ -21,7 +21,7 @@ from imgcal.online.prediction_labels import near_prediction
 from imgcal.online.snapshot_update import test_clocks, test_object
 from imgcal.types import Detections
 
-PATIENCE = 64
+MOST_VAIN = 64
 """Successive snapshots that fit in no camera, after which the rig is relearnt from the factory calibration."""
 
 
@@ -75,7 +75,7 @@ def label_snapshot(
     if checked.usual > memory.most_usual:
         memory.doubts.observe_refused(checked, memory.time if memory.learnt is None else memory.learnt, memory.time)
         memory.in_vain += 1
-        if memory.in_vain >= PATIENCE:
+        if memory.in_vain >= MOST_VAIN:
             memory.reset()
         raise RefusedError(
             f"estimation: labels are {checked.usual:.1f} px off in most cameras: labels are wrong, or this is "

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from imgcal.estimation import Gauge
 from imgcal.pipeline.calibration import Calibration
-from imgcal.types import MovedCamera
+from imgcal.types import SHOWN_UNITS, Kind, MovedCamera
 
 MOVED = 3.0
 """A value has moved if its change from the factory is larger than this many standard deviations."""
@@ -51,14 +51,9 @@ class Motion:
         size = change.norm(dim=-1)
         sigma = (change * std).norm(dim=-1) / size.clamp_min(1e-30)  # of the length, along the change
         turned = bool(size[0] * sigma[1] >= size[1] * sigma[0])
-        row, unit = (0, 180 / math.pi) if turned else (1, 1.0)
-        return MovedCamera(
-            self.camera_names[camera],
-            None,
-            "rotation" if turned else "position",
-            float(size[row]) * unit,
-            float(sigma[row]) * unit,
-        )
+        kind: Kind = "rotation" if turned else "position"
+        row, (_, scale) = int(not turned), SHOWN_UNITS[kind]
+        return MovedCamera(self.camera_names[camera], None, kind, float(size[row]) * scale, float(sigma[row]) * scale)
 
     @property
     def sentence(self) -> str:

@@ -24,7 +24,13 @@ from imgcal.estimation import (
     make_problem,
 )
 from imgcal.pipeline.calibration import Calibration
-from imgcal.pipeline.checks import (
+from imgcal.pipeline.initialization import Initialization, Initializer, prediction_residual
+from imgcal.pipeline.label_counts import count_labels
+from imgcal.pipeline.labelled_capture import LabelledCapture, arrange_labels
+from imgcal.pipeline.motion_check import steady_part
+from imgcal.pipeline.object_checks import object_offsets
+from imgcal.pipeline.object_size import require_one_size
+from imgcal.pipeline.refusals import (
     require_cameras,
     require_fit,
     require_most_labels,
@@ -32,12 +38,6 @@ from imgcal.pipeline.checks import (
     require_same_residuals,
     require_views,
 )
-from imgcal.pipeline.initialization import Initialization, Initializer, prediction_residual
-from imgcal.pipeline.label_counts import count_labels
-from imgcal.pipeline.labelled_capture import LabelledCapture, arrange_labels
-from imgcal.pipeline.motion_check import steady_part
-from imgcal.pipeline.object_checks import object_offsets
-from imgcal.pipeline.object_size import require_one_size
 from imgcal.types import (
     CalibrationObject,
     CameraRig,

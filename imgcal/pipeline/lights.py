@@ -28,7 +28,7 @@ from imgcal.association import (
     predicted_misses,
 )
 from imgcal.errors import RefusedError
-from imgcal.estimation import Estimate, EstimationOptions, estimate
+from imgcal.estimation import Estimate, EstimationOptions, estimate, robust_std
 from imgcal.geometry import RigidTransform
 from imgcal.messages import list_names
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
@@ -387,7 +387,7 @@ def narrow(
         if fit is None or error == FINEST:
             return None if fit is None else fit.rig
         now = fit.rig
-        spread = float(fit.residual.norm(dim=-1)[fit.problem.root_weight[0] > 0].median()) / 1.1774
+        spread = robust_std(fit.residual[fit.problem.root_weight[0] > 0])
         error = max(FINEST, min(NARROWER * error, 3 * spread))
 
 

@@ -6,11 +6,9 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
@@ -18,6 +16,7 @@ from numpy.typing import NDArray
 from imgcal.fleet import Dataset, KindOfRig, LearntPrior, standardized_offsets
 from imgcal.fleet import refusals as reasons_of
 from imgcal.io import write_text
+from imgcal.live_page import read_asset, render_page
 from imgcal.report import svg
 from imgcal.report.svg import Axes
 from imgcal.types import PARAMETER_KINDS, RigPrior
@@ -57,10 +56,10 @@ def write_fleet_report(dataset: Dataset, taught: Sequence[Taught], before: RigPr
         InputError: there are no results, or the file cannot be written.
     """
     table = dataset.latest(("status", "device", "time", "rms_px", "labels", "seconds")).to_pydict()
-    template = files("imgcal.report").joinpath("templates")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    page = environment.from_string(template.joinpath("fleet.html.j2").read_text(encoding="utf-8")).render(
-        style=Markup(template.joinpath("report.css").read_text(encoding="utf-8")),
+    page = render_page(
+        "report/templates/fleet.html.j2",
+        read_asset("report/templates/report.css"),
+        sources={"style-src": "'unsafe-inline'"},
         sentence=_sentence(table, taught),
         status=Counter(table["status"]).most_common(),
         total=len(table["status"]),
@@ -73,7 +72,7 @@ def write_fleet_report(dataset: Dataset, taught: Sequence[Taught], before: RigPr
         ],
         days=_days(table),
     )
-    write_text(path, page)
+    write_text(path, page.text)
 
 
 def _sentence(table: Mapping[str, Sequence[Any]], taught: Sequence[Taught]) -> str:

@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
 from imgcal.io import write_text
-from imgcal.live_page import content_policy, to_json
+from imgcal.live_page import read_asset, render_page, to_json
 from imgcal.pipeline import MOVED, UNDETERMINED
 from imgcal.report import accuracy, charts, overlay, scene, svg, tables
 from imgcal.report.content import ReportContent
@@ -44,13 +41,13 @@ def write_report(content: ReportContent, path: str | Path) -> None:
 
 def render(content: ReportContent) -> str:
     """Build the page; the same content gives the same text."""
-    scripts = rig_view_script(), _resource("report.js")
-    parts = dict(
+    return render_page(
+        "report/templates/report.html.j2",
+        read_asset("report/templates/report.css"),
+        (rig_view_script(), read_asset("report/templates/report.js")),
+        {"style-src": "'unsafe-inline'", "img-src": "data:"},
         content=content,
         verdict=judge(content),
-        style=Markup(_resource("report.css")),
-        scripts=[Markup(script) for script in scripts],
-        policy=content_policy(scripts, "'unsafe-inline'", "data:"),
         snapshots=_snapshots(content),
         residuals=_residuals(content),
         coverage=_coverage(content),
@@ -65,20 +62,7 @@ def render(content: ReportContent) -> str:
         times=charts.time_bars(content.seconds) if content.seconds else None,
         total=charts.duration(sum(content.seconds.values())),
         subsampling=_subsampling(content),
-    )
-    return _template().render(parts)
-
-
-@cache
-def _template() -> jinja2.Template:
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.from_string(_resource("report.html.j2"))
-
-
-def _resource(name: str) -> str:
-    return files("imgcal.report").joinpath("templates", name).read_text(encoding="utf-8")
+    ).text
 
 
 def _snapshots(content: ReportContent) -> dict[str, object]:

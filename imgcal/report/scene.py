@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from imgcal.live_page import frustum_length
 from imgcal.report.content import Array, ReportContent
-from imgcal.report.rig_view import DrawnRig, Scene, frustum_length, rig_scene
+from imgcal.report.rig_view import DrawnRig, Scene, rig_scene
 from imgcal.types import CameraRig
 
 EXAGGERATIONS = (1, 2, 5, 10, 20, 50, 100)

@@ -31,7 +31,7 @@ from .rigs import (
     synthesize,
     synthesize_at_once,
 )
-from .simulated_rig import SimulatedRig
+from .simulated_rig import SimulatedRig, simulate_blobs
 from .volumes import find_seen_volume, place_markers, sample_path, sample_volume, simulate_volume
 
 __all__ = [
@@ -79,6 +79,7 @@ __all__ = [
     "sample_volume",
     "second_look",
     "share_of_good_rigs",
+    "simulate_blobs",
     "simulate_board",
     "simulate_frames",
     "simulate_shots",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -90,29 +91,10 @@ class SimulatedRig:
         """
         passed, self._at = max(seconds - self._at, 0.0), seconds
         self._warmth += (float(self.warm) - self._warmth) * (1 - math.exp(-passed / WARMING_SECONDS))
-        rig, random = self.rig, self._random
-        seen = rig.project(self.pose(seconds).apply(self.obj.points.double()), self.obj.radius)
-        shown = seen.visible.numpy() & (random.random(seen.visible.shape) > HIDDEN) & (not self.away)
-        camera, fiducial = np.nonzero(shown)
-        uv = seen.uv.numpy()[camera, fiducial] + NOISE * random.standard_normal((len(camera), 2))
-        false = np.repeat(np.arange(rig.num_cameras), random.poisson(FALSE, rig.num_cameras))
-        size = rig.image_size.double().numpy()
-        uv = np.concatenate((uv, random.random((len(false), 2)) * (size[false] - 1)))
-        camera = np.concatenate((camera, false))
-        uv = np.clip(uv, 0, size[camera] - 1)
-        kept = np.flatnonzero(~np.isin(camera, list(self.covered)))
-        order = random.permutation(kept)
-        return Detections(
-            uv=uv[order],
-            sigma=np.full(len(order), NOISE),
-            camera=camera[order].astype(np.int64),
-            snapshot=np.zeros(len(order), dtype=np.int64),
-            fiducial=np.full(len(order), -1, dtype=np.int64),
-            radius=np.full(len(order), np.nan),
-            flags=np.full(len(order), int(BlobFlag.NONE), dtype=np.uint8),
-            camera_names=rig.camera_names,
-            snapshot_names=("0",),
-        )
+        points = self.pose(seconds).apply(self.obj.points.double())
+        hidden = 1.0 if self.away else HIDDEN
+        blobs, _ = simulate_blobs(self.rig, points, self.obj.radius, self._random, NOISE, hidden, FALSE)
+        return blobs.select(~np.isin(blobs.camera, list(self.covered)))
 
     def frames(self, width: int) -> Frames:
         """Render the frames of the last snapshot, small: camera name -> (H, W)."""
@@ -129,3 +111,62 @@ class SimulatedRig:
 
     def _dark(self, frame: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
         return self._random.normal(DARK, 2.0, frame.shape).clip(0, 255).astype(np.uint8)
+
+
+def simulate_blobs(
+    rig: CameraRig,
+    points: Tensor,
+    radius: Tensor | None,
+    random: np.random.Generator,
+    noise: float = NOISE,
+    hidden: float = 0.0,
+    false: float = 0.0,
+    blind: Collection[int] = (),
+) -> tuple[Detections, NDArray[np.int64]]:
+    """Simulate what cameras see in one snapshot: blobs without labels, in any order.
+
+    Args:
+        rig: without batch axes.
+        points: (N, 3) mm, fiducials in the rig's frame.
+        radius: (N,) mm, of the markers, or none.
+        random: source of randomness.
+        noise: px, of a blob's centre.
+        hidden: share of fiducials that a camera misses.
+        false: blobs of nothing in an image.
+        blind: cameras that see nothing of the object.
+
+    Returns:
+        The blobs, and the fiducial of each; -1 = none.
+
+    Examples:
+        >>> import imgcal
+        >>> rig, point = imgcal.load_rig("T4"), torch.tensor([[0.0, 0.0, 850.0]], dtype=torch.float64)
+        >>> blobs, fiducials = simulate_blobs(rig, point, None, np.random.default_rng(0), blind=(2,))
+        >>> sorted(blobs.camera.tolist()), fiducials.tolist()
+        ([0, 1, 3], [0, 0, 0])
+    """
+    seen = rig.project(points, radius)
+    shown = seen.visible.numpy().copy()
+    shown[list(blind)] = False
+    if hidden:
+        shown &= random.random(shown.shape) > hidden
+    camera, fiducial = np.nonzero(shown)
+    uv = seen.uv.numpy()[camera, fiducial] + noise * random.standard_normal((len(camera), 2))
+    nothing = np.repeat(np.arange(rig.num_cameras), random.poisson(false, rig.num_cameras))
+    size = rig.image_size.double().numpy()
+    uv = np.concatenate((uv, random.random((len(nothing), 2)) * (size[nothing] - 1)))
+    camera, fiducial = np.concatenate((camera, nothing)), np.concatenate((fiducial, np.full(len(nothing), -1)))
+    order = random.permutation(len(camera))
+    camera, uv = camera[order], np.clip(uv, 0, size[camera] - 1)[order]
+    blobs = Detections(
+        uv=uv,
+        sigma=np.full(len(order), noise),
+        camera=camera,
+        snapshot=np.zeros(len(order), dtype=np.int64),
+        fiducial=np.full(len(order), -1, dtype=np.int64),
+        radius=np.full(len(order), np.nan),
+        flags=np.full(len(order), int(BlobFlag.NONE), dtype=np.uint8),
+        camera_names=rig.camera_names,
+        snapshot_names=("0",),
+    )
+    return blobs, fiducial[order]

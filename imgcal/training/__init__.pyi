@@ -11,7 +11,6 @@ from .frame_dataset import (
     FrameDataset,
     PatchDataset,
     adaptation,
-    load_frames,
     load_patches,
     load_splits,
 )
@@ -51,7 +50,6 @@ __all__ = [
     "cut_labelled",
     "is_finished",
     "load_experiment",
-    "load_frames",
     "load_patches",
     "load_splits",
     "load_state",

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -17,9 +17,7 @@ from imgcal.networks import Queries
 from imgcal.synthesis import Patches
 from imgcal.types import PATCH_SIZE, BlobKind
 
-FORMAT = "imgcal-frames/1"
 TRAIN, HELD_OUT, CARD = "train.safetensors", "held_out.safetensors", "README.md"
-PATCHES_FORMAT = "imgcal-patches/1"
 TRAIN_PATCHES, HELD_OUT_PATCHES = "train_patches.safetensors", "held_out_patches.safetensors"
 ADAPTATION = (
     "training.steps=400",
@@ -37,13 +35,66 @@ NARROW = 3.0
 """Crop pixels, standard deviation of the shift of most cameras."""
 
 
+class Samples:
+    """Tensors with one row for each sample, in a file of their own."""
+
+    FORMAT: ClassVar[str]
+    NOUN: ClassVar[str]
+
+    @classmethod
+    def names(cls) -> list[str]:
+        """Names of the tensors; the first has the number of samples."""
+        return [field.name for field in fields(cls)]  # type: ignore[arg-type]
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Expected shapes of the tensors that are not (M,)."""
+        raise NotImplementedError
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        return {name: getattr(self, name) for name in self.names()}
+
+    def __len__(self) -> int:
+        return len(getattr(self, self.names()[0]))
+
+    def select(self, rows: Tensor) -> Self:
+        """Select samples by row."""
+        return type(self)(*(tensor[rows] for tensor in self.tensors().values()))
+
+    def save(self, path: str | Path, about: Mapping[str, Any]) -> None:
+        """Write a file in one step; `about` has plain values that describe the origin of the samples."""
+        write_tensors(path, self.tensors(), self.FORMAT, {"about": json.dumps(about)})
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Load what `save` wrote.
+
+        Raises:
+            InputError: no such file, another kind of file, or inconsistent tensors.
+        """
+        tensors, _ = read_tensors(path, cls.FORMAT)
+        if set(tensors) != set(cls.names()):
+            found = ", ".join(sorted(tensors))
+            raise InputError(f"{path}: found tensors {found}, expected {', '.join(cls.names())}")
+        samples = cls(**tensors)
+        shapes = dict.fromkeys(tensors, (len(samples),)) | samples.shapes()
+        for name in cls.names():
+            if tuple(tensors[name].shape) != shapes[name]:
+                raise InputError(f"{path}: {name}: found shape {tuple(tensors[name].shape)}, expected {shapes[name]}")
+        if not len(samples):
+            raise InputError(f"{path}: found no {cls.NOUN}, expected some")
+        return samples
+
+
 @dataclass(frozen=True)
-class FrameDataset:
+class FrameDataset(Samples):
     """Crops of frames with the projections of an object's fiducials: M crops, up to N fiducials each.
 
     Brightness is relative to the background of a crop, in units of its markers: the background is about 0, a marker
     about 1.
     """
+
+    FORMAT, NOUN = "imgcal-frames/1", "crops"
 
     crops: Tensor  # (M, S, S) float16, NaN outside the image
     place: Tensor  # (M, N, 2) float32, crop pixels: fiducials projected with the calibrated rig
@@ -55,115 +106,61 @@ class FrameDataset:
     camera: Tensor  # (M,) int64, index in the rig
     snapshot: Tensor  # (M,) int64, index in the capture
 
-    def __len__(self) -> int:
-        return len(self.crops)
-
-    def select(self, rows: Tensor) -> FrameDataset:
-        """Select crops by row."""
-        return FrameDataset(*(getattr(self, field.name)[rows] for field in fields(self)))
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """See `Samples.shapes`."""
+        each = len(self), self.place.shape[1]
+        found = dict.fromkeys(("sigma", "radius", "depth", "asked", "seen"), each)
+        return found | {"crops": (len(self), *self.crops.shape[1:2] * 2), "place": (*each, 2)}
 
     def to(self, device: torch.device) -> FrameDataset:
         """Move to a device."""
-        return FrameDataset(*(getattr(self, field.name).to(device) for field in fields(self)))
-
-    def save(self, path: str | Path, about: Mapping[str, Any]) -> None:
-        """Write a file in one step; `about` has plain values that describe the origin of the crops."""
-        tensors = {field.name: getattr(self, field.name) for field in fields(self)}
-        write_tensors(path, tensors, FORMAT, {"about": json.dumps(about)})
+        return FrameDataset(*(tensor.to(device) for tensor in self.tensors().values()))
 
 
 @dataclass(frozen=True)
-class PatchDataset:
+class PatchDataset(Samples):
     """Patches at full scale around the markers of frames, for the measurer: M of them.
 
     Light is measured as in `FrameDataset`, in units of the patch's own marker.
     """
 
+    FORMAT, NOUN = "imgcal-patches/1", "patches"
+
     light: Tensor  # (M, 24, 24) float16
     radius: Tensor  # (M,) float32, patch pixels, of the marker's image
     offset: Tensor  # (M, 2) float32, patch pixels, from the middle of the patch to where the calibrated rig has it
-    camera: Tensor  # (M,) int64, number in the rig
-    snapshot: Tensor  # (M,) int64, number in the capture
+    camera: Tensor  # (M,) int64, index in the rig
+    snapshot: Tensor  # (M,) int64, index in the capture
 
-    def __len__(self) -> int:
-        return len(self.light)
-
-    def select(self, rows: Tensor) -> PatchDataset:
-        """Keep the patches of these rows."""
-        return PatchDataset(*(getattr(self, field.name)[rows] for field in fields(self)))
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """See `Samples.shapes`."""
+        return {"light": (len(self), PATCH_SIZE, PATCH_SIZE), "offset": (len(self), 2)}
 
     def as_patches(self) -> Patches:
         """Give the patches as rendered ones are given: whole markers."""
         kind = torch.full((len(self),), int(BlobKind.WHOLE), device=self.light.device)
         return Patches(self.light.float(), self.radius, self.offset, kind)
 
-    def save(self, path: str | Path, about: Mapping[str, Any]) -> None:
-        """Write a file in one step; see `FrameDataset.save`."""
-        tensors = {field.name: getattr(self, field.name) for field in fields(self)}
-        write_tensors(path, tensors, PATCHES_FORMAT, {"about": json.dumps(about)})
-
 
 def load_patches(folder: str | Path) -> tuple[PatchDataset, PatchDataset]:
-    """Read the patches of a dataset of `imgcal harvest`: to learn from, and held out.
+    """Load the patches of a dataset of `imgcal harvest`: for training, and held out.
 
     Raises:
-        InputError: no such files, or something else in them.
+        InputError: see `Samples.load`.
     """
-    found = []
-    for name in (TRAIN_PATCHES, HELD_OUT_PATCHES):
-        path = Path(folder) / name
-        tensors, _ = read_tensors(path, PATCHES_FORMAT)
-        names = [field.name for field in fields(PatchDataset)]
-        if set(tensors) != set(names):
-            raise InputError(f"{path}: found tensors {', '.join(sorted(tensors))}, expected {', '.join(names)}")
-        part, count = PatchDataset(**tensors), len(tensors["light"])
-        shapes = {"light": (count, PATCH_SIZE, PATCH_SIZE), "offset": (count, 2)}
-        for each in names:
-            expected = shapes.get(each, (count,))
-            if tuple(tensors[each].shape) != expected:
-                raise InputError(f"{path}: {each}: found shape {tuple(tensors[each].shape)}, expected {expected}")
-        if not count:
-            raise InputError(f"{path}: found no patches, expected some")
-        found.append(part)
-    return found[0], found[1]
-
-
-def load_frames(path: str | Path) -> FrameDataset:
-    """Load crops that `FrameDataset.save` wrote.
-
-    Raises:
-        InputError: no such file, another kind of file, or inconsistent tensors.
-    """
-    tensors, _ = read_tensors(path, FORMAT)
-    names = [field.name for field in fields(FrameDataset)]
-    if set(tensors) != set(names):
-        raise InputError(f"{path}: found tensors {', '.join(sorted(tensors))}, expected {', '.join(names)}")
-    found = FrameDataset(**tensors)
-    count, fiducials = len(found), found.place.shape[1]
-    shapes = {
-        "crops": (count, *found.crops.shape[1:2] * 2),
-        "place": (count, fiducials, 2),
-        **dict.fromkeys(("sigma", "radius", "depth", "asked", "seen"), (count, fiducials)),
-        **dict.fromkeys(("camera", "snapshot"), (count,)),
-    }
-    for name, shape in shapes.items():
-        if tuple(tensors[name].shape) != shape:
-            raise InputError(f"{path}: {name}: found shape {tuple(tensors[name].shape)}, expected {shape}")
-    if not count:
-        raise InputError(f"{path}: found no crops, expected some")
-    return found
+    return PatchDataset.load(Path(folder) / TRAIN_PATCHES), PatchDataset.load(Path(folder) / HELD_OUT_PATCHES)
 
 
 def load_splits(folder: str | Path) -> tuple[FrameDataset, FrameDataset]:
     """Load a dataset of `imgcal harvest`: the training crops and the held-out crops.
 
     Raises:
-        InputError: see `load_frames`; or crops of different sizes.
+        InputError: see `Samples.load`; or crops of different sizes.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, expected a dataset of `imgcal harvest`")
-    train, held_out = load_frames(folder / TRAIN), load_frames(folder / HELD_OUT)
+    train, held_out = FrameDataset.load(folder / TRAIN), FrameDataset.load(folder / HELD_OUT)
     if train.crops.shape[1:] != held_out.crops.shape[1:]:
         raise InputError(f"{folder}: found crops of different sizes in {TRAIN} and {HELD_OUT}")
     return train, held_out
@@ -177,8 +174,7 @@ def turn(crops: FrameDataset, generator: torch.Generator) -> FrameDataset:
         light, place = light.flip(-1), torch.stack((last - place[..., 0], place[..., 1]), -1)
     for _ in range(quarters):  # counterclockwise: columns become rows
         light, place = light.rot90(1, (-2, -1)), torch.stack((place[..., 1], last - place[..., 0]), -1)
-    values = {field.name: getattr(crops, field.name) for field in fields(crops)}
-    return FrameDataset(**values | {"crops": light, "place": place})
+    return replace(crops, crops=light, place=place)
 
 
 def thin(crops: FrameDataset, most: int, generator: torch.Generator) -> FrameDataset:

@@ -8,12 +8,11 @@ from typing import Literal
 
 from imgcal.errors import RefusedError
 from imgcal.types.observations import Detections
+from imgcal.types.rig import SHOWN_UNITS
 
 Kind = Literal["rotation", "position", "focal_length", "unknown"]
 
 MOST_TOLD = 4  # moves in one message
-
-UNITS: dict[Kind, str] = {"rotation": "deg", "position": "mm", "focal_length": "px", "unknown": ""}
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ class MovedCamera:
     @property
     def unit(self) -> str:
         """Unit of the size."""
-        return UNITS[self.kind]
+        return SHOWN_UNITS[self.kind][0] if self.kind in SHOWN_UNITS else ""
 
     def as_values(self) -> dict[str, str | float | None]:
         """Values in the form that scripts read."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
@@ -46,6 +47,11 @@ PARAMETER_KINDS = {
     "distortion": slice(10, None),
 }
 """Position of each kind of value, named as in a rig file's `prior`, among the parameters of a camera."""
+SHOWN_UNITS: Mapping[str, tuple[Literal["deg", "mm", "px"], float]] = {
+    "rotation": ("deg", math.degrees(1.0)), "position": ("mm", 1.0),
+    "focal_length": ("px", 1.0), "principal_point": ("px", 1.0),
+}  # fmt: skip
+"""Unit in which people read a change of each kind, and the factor from rad, mm or pixels."""
 
 
 def parameter_names(lens_models: Sequence[str], width: int | None = None) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ import tyro
 
 from imgcal import load_object, load_rig
 from imgcal.association import PipelineOptions
-from imgcal.cli.compare_captures import contender
+from imgcal.cli.compare import contender
 from imgcal.detection import DetectionOptions
 from imgcal.evaluation import Contender, Outcome, Scene, compare_detectors, detector_tables
 from imgcal.fleet import workers

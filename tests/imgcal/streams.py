@@ -8,8 +8,8 @@ import torch
 from imgcal.estimation import EstimationOptions, estimate
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import load_object, read_rig
-from imgcal.synthesis import PhysicalDrift, simulate_truth
-from imgcal.types import Detections, Observations
+from imgcal.synthesis import PhysicalDrift, simulate_blobs, simulate_truth
+from imgcal.types import Observations
 
 
 class Stream:
@@ -49,30 +49,8 @@ class Stream:
     def blobs(self, s, rig=None, hidden: Collection[int] = (), noise=0.07, false=0.0):
         """What the cameras see in one snapshot, unlabelled and in any order; and the true labels."""
         rig = self.true if rig is None else rig
-        seen = rig.project(self.poses[s].apply(self.obj.points), self.obj.radius)
-        visible = seen.visible.numpy().copy()
-        visible[list(hidden)] = False
-        camera, label = np.nonzero(visible)
-        uv = seen.uv.numpy()[camera, label] + noise * self.random.standard_normal((len(camera), 2))
-        clutter = np.repeat(np.arange(rig.num_cameras), self.random.poisson(false, rig.num_cameras))
-        size = rig.image_size.numpy()
-        uv = np.concatenate((uv, self.random.random((len(clutter), 2)) * (size[clutter] - 1)))
-        camera = np.concatenate((camera, clutter))
-        label = np.concatenate((label, np.full(len(clutter), -1)))
-        uv = np.clip(uv, 0, size[camera] - 1)
-        order = self.random.permutation(len(camera))
-        count = len(camera)
-        return Detections(
-            uv=uv[order],
-            sigma=np.full(count, noise),
-            camera=camera[order],
-            snapshot=np.zeros(count, dtype=np.int64),
-            fiducial=np.full(count, -1, dtype=np.int64),
-            radius=np.full(count, np.nan),
-            flags=np.zeros(count, dtype=np.uint8),
-            camera_names=rig.camera_names,
-            snapshot_names=("0",),
-        ), label[order]
+        points = self.poses[s].apply(self.obj.points)
+        return simulate_blobs(rig, points, self.obj.radius, self.random, noise, 0.0, false, hidden)
 
     def errors(self, found, s, rig=None):
         """RMS error (px) of each camera where the object is: (C,); its pose is fitted, so that no gauge takes part."""

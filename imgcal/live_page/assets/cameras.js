@@ -50,7 +50,7 @@ function drawCameras() {
 function choose(i) {
   page.selected = i;
   history.replaceState(null, "", `#camera-${i}`);
-  drawCameras(); drawChosen(); refreshScene();
+  drawCameras(); drawChosen(); liveRig.refresh();
 }
 
 function drawChosen() {

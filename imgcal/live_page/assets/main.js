@@ -26,11 +26,11 @@ const TAKE = {
     page.selected = wanted < content.cameras.length ? wanted : 0;
     buildCameras(); buildPictures(); buildActions(); drawChosen();
   },
-  layout(content) { page.layout = content; refreshScene(); },
+  layout(content) { page.layout = content; liveRig.refresh(); },
   controls(content) { page.controls = content; drawControls(); },
   history(content) { page.history = content; drawTimelines(); },
   events(content) { page.events = content; drawEvents(); drawState(); },
-  volume(content) { page.volume = content; drawVolumeMaps(); refreshScene(); },
+  volume(content) { page.volume = content; drawVolumeMaps(); liveRig.refresh(); },
   picture(content) { page.pictures.set(content.camera, content); drawPicture(content.camera); },
   state(content) {
     const before = page.state && page.state.health.join();
@@ -39,7 +39,7 @@ const TAKE = {
     else line.gone ??= content.time;
     line.last = performance.now();
     if (before !== content.health.join()) drawEvents(); // what was so may be over
-    appendHistory(content); drawState(); refreshScene();
+    appendHistory(content); drawState(); liveRig.refresh();
     if (!numbers) numbers = setTimeout(drawNumbers, Math.max(0, CALM - (line.last - drawn)));
   },
 };
@@ -112,7 +112,7 @@ function connect() {
   };
 }
 
-startScene(); startTimelines(); startControls();
+startTimelines(); startControls();
 if (fixed) {
   for (const [key, content] of Object.entries(data.contents)) TAKE[key.split(":")[0]](content);
   drawCameras(); drawLink();

@@ -12,18 +12,6 @@ const $ = (id) => document.getElementById(id);
 const toneOf = (camera) => (page.state ? (HEALTH[page.state.health[camera]] || ["none"])[0] : "none");
 const wordOf = (camera) => (page.state ? (HEALTH[page.state.health[camera]] || ["", page.state.health[camera]])[1] : "waiting");
 
-const NAMED = ["good", "caution", "bad", "ghost", "line", "ink", "muted", "after", "before", "panel", "page"];
-let inks = null;
-function colours() { // of the style sheet, as a canvas takes them; they change between light and dark
-  if (!inks) {
-    const probe = document.body.appendChild(document.createElement("i"));
-    inks = Object.fromEntries(NAMED.map((name) => { probe.style.color = `var(--${name})`; return [name, getComputedStyle(probe).color]; }));
-    inks.none = inks.ghost;
-    probe.remove();
-  }
-  return inks;
-}
-
 function make(tag, attributes = {}, ...children) {
   const svg = ["svg", "path", "circle", "rect", "line", "text", "g", "title"].includes(tag);
   const element = svg ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);

@@ -15,8 +15,6 @@
     factor.setAttribute("aria-valuetext", `${times} times`);
     view.set(scene, +factor.value);
   });
-  every("[data-look]").forEach((button) => button.addEventListener("click", () => view.look(button.dataset.look)));
-  every("[data-zoom]").forEach((button) => button.addEventListener("click", () => view.zoom(+button.dataset.zoom)));
 
   // An overlay shows a part of its frame: the whole, what is near the object, or what was clicked at.
   const overlays = every(".overlay").map((svg) => {
@@ -60,7 +58,6 @@
     root.style.colorScheme = now === "dark" ? "light" : "dark";
     view.draw();
   });
-  dark.addEventListener("change", () => view.draw());
   let before = "";
   addEventListener("beforeprint", () => {
     before = root.style.colorScheme;

@@ -140,6 +140,18 @@ def test_a_killed_process_goes_on_and_ctrl_c_ends_it_cleanly(blobs, tmp_path):
     assert read_rig(out / "rig.yaml").num_cameras == 4
 
 
+def test_a_missing_source_is_reported_before_any_note(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "stick.csv").write_text("x,y,z\n0,0,0\n100,0,0\n")
+    arguments = ["watch", "absent", "--rig", "T4", "--object", "stick.csv", "--out", "out"]
+    assert main(arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("imgcal: absent: no such file or folder")
+    (tmp_path / "empty" / "frames" / "cam01").mkdir(parents=True)
+    assert main([*arguments[:1], "empty", *arguments[2:], "--until-idle", "0.1"]) == 3
+    assert "note: markers of stick are followed one by one" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from imgcal.estimation import autocorrelation, correlation_time, effective_size
+from imgcal.estimation import autocorrelation, correlation_time
 
 
 def _autoregressive(rho: float, count: int, width: int, seed: int = 0) -> np.ndarray:
@@ -30,9 +30,9 @@ def test_autoregressive_noise(rho: float) -> None:
     assert tau.mean() == pytest.approx(expected, rel=0.1)
 
 
-def test_variance_of_a_mean_is_that_of_the_effective_size() -> None:
+def test_variance_of_a_mean_grows_with_the_correlation_time() -> None:
     series = _autoregressive(0.8, 1000, 400, seed=3)
-    predicted = (1 / effective_size(series)).mean()
+    predicted = (correlation_time(series) / len(series)).mean()
     assert series.mean(0).var() == pytest.approx(predicted, rel=0.2)
 
 
@@ -42,7 +42,6 @@ def test_gaps() -> None:
     gaps[np.random.default_rng(2).random(whole.shape) < 0.4] = np.nan  # single frames
     gaps[1000:1800] = np.nan  # and a long time
     assert correlation_time(gaps).mean() == pytest.approx(correlation_time(whole).mean(), rel=0.15)
-    assert effective_size(gaps).mean() == pytest.approx(np.isfinite(gaps).sum(0).mean() / 9, rel=0.2)
 
 
 def test_parallel_series_are_pooled() -> None:

@@ -14,7 +14,7 @@ from imgcal.estimation import (
     relative_covariance,
     relative_difference,
 )
-from imgcal.estimation.map_estimate import PATIENCE
+from imgcal.estimation.map_estimate import RESTART_AFTER
 from imgcal.estimation.robust_losses import LOSSES
 from imgcal.synthesis import Drift, PhysicalDrift, RelativeDrift
 
@@ -87,7 +87,7 @@ def test_beginning_again_leaves_the_others_alone(simulate) -> None:
     problem, start = case.problem(), initial_state(case.problem(), together.rig_from_object, None)
     assert (
         0
-        < int((~levenberg_marquardt_cpu.minimize(problem, start, "squared", 3.0, PATIENCE, 1e-4).converged).sum())
+        < int((~levenberg_marquardt_cpu.minimize(problem, start, "squared", 3.0, RESTART_AFTER, 1e-4).converged).sum())
         < 40
     )
     for row in range(0, 40, 5):

@@ -5,7 +5,7 @@ import torch
 
 import imgcal
 from imgcal.estimation import Gauge, estimate
-from imgcal.estimation.reference_cameras import ALIGNMENTS, ROUNDS, SCALE
+from imgcal.estimation.reference_cameras import ALIGNMENTS, ROUNDS, VOTE_SCALE
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Observations
@@ -53,7 +53,7 @@ def test_the_vote_is_that_of_rigs_laid_anew_each_round_at_a_fraction_of_the_work
     rig = turned_as_a_whole(factory.retract(step * torch.tensor((1e-3,) * 3 + (1.0,) * 12, dtype=torch.float64)))
     weights = torch.ones(4, dtype=torch.float64)
     for round_ in range(ROUNDS):
-        apart = Gauge(weights).difference(rig, factory)[:, :6] / torch.tensor(SCALE, dtype=torch.float64)
+        apart = Gauge(weights).difference(rig, factory)[:, :6] / torch.tensor(VOTE_SCALE, dtype=torch.float64)
         apart = apart.norm(dim=-1)
         weights = 1 / apart if round_ < ROUNDS // 2 else 1 / (1 + (apart / apart.median()).square())
         weights = weights / weights.sum()

@@ -10,7 +10,7 @@ from imgcal.monitoring.noise_correlation import (
     FASTEST,
     FIRST_MEASUREMENTS,
     LEAST_WEIGHT,
-    MEMORY,
+    MEMORY_SNAPSHOTS,
     NoiseCorrelation,
     usual_time,
 )
@@ -49,7 +49,7 @@ def test_white_noise_counts_as_it_is() -> None:
 
 
 def test_errors_that_last_count_by_their_effective_number() -> None:
-    noise = follow([0.9, 0.0], count=MEMORY)
+    noise = follow([0.9, 0.0], count=MEMORY_SNAPSHOTS)
     # The shift has 5/6 of the variance of the mean of five points; its correlation time is (1 + r) / (1 - r).
     expected = 1 + 2 * (5 / 6) * 0.9 / 0.1
     assert 0.5 * expected < float(noise.time[0]) < 1.6 * expected
@@ -72,7 +72,7 @@ def test_passing_errors_last_for_seconds_whatever_the_rate() -> None:
 
 
 def test_a_large_error_passes_in_less_time_than_the_correlation_of_small_ones() -> None:
-    noise = follow([0.98, 0.98], count=MEMORY)
+    noise = follow([0.98, 0.98], count=MEMORY_SNAPSHOTS)
     usual = float(noise.model_error[0])
     assert noise.episode(0, 3 * usual) == noise.episodes[0] > 24
     assert noise.episode(0, 30 * usual) == 24

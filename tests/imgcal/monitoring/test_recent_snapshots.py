@@ -45,4 +45,4 @@ def test_what_was_believed_before_is_found_again(tolerance: float | None) -> Non
         apart = (found.rig.local(was.rig) / std).abs().max()
         assert apart < 0.05
         assert (found.std() / std - 1).abs().max() < 0.08
-        assert len(recent.snapshots(age)) == age
+        assert len(recent.latest(age)[0]) == age

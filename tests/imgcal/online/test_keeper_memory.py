@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import imgcal
-from imgcal.online.keeper_memory import LEAST_USUAL, KeeperMemory
+from imgcal.online.keeper_memory import USUAL_SNAPSHOTS, KeeperMemory
 from imgcal.online.state_document import StateReader, StateWriter
 from tests.imgcal.online.memories import OPTIONS, Remembered
 
@@ -22,7 +22,7 @@ def test_nothing_is_known_at_the_beginning_but_what_the_factory_says() -> None:
 
 def test_what_has_been_learnt_is_forgotten_but_for_the_factory() -> None:
     made = Remembered()
-    memory = made.learn(LEAST_USUAL)
+    memory = made.learn(USUAL_SNAPSHOTS)
     assert memory.most_usual < 2.0
     known = memory.surroundings
     assert known is not None and bool((known.std[:, 6] < known.widest[:, 6]).all())

@@ -1,7 +1,7 @@
 import numpy as np
 
 from imgcal.online import LightTracks
-from imgcal.online.light_tracks import LONGEST, STILL_SECONDS
+from imgcal.online.light_tracks import HIDDEN_SECONDS, STILL_SECONDS
 
 
 def test_lights_keep_their_numbers_while_they_move() -> None:
@@ -23,9 +23,9 @@ def test_a_number_is_free_again_once_its_light_is_gone() -> None:
     assert tracks.number_lights(here, 0.0).tolist() == [0]
     assert tracks.number_lights(elsewhere[:1], 0.1).tolist() == [1]  # the first may come back to where it was
     assert tracks.number_lights(here, 0.2).tolist() == [0]
-    assert tracks.number_lights(elsewhere[1:], 0.3 + LONGEST).tolist() == [1]  # was left longest ago
-    assert tracks.number_lights(elsewhere, 0.4 + LONGEST).tolist() == [0, 1]
-    assert tracks.number_lights(np.concatenate((here, elsewhere)), 0.5 + LONGEST).tolist() == [-1, 0, 1]
+    assert tracks.number_lights(elsewhere[1:], 0.3 + HIDDEN_SECONDS).tolist() == [1]  # was left longest ago
+    assert tracks.number_lights(elsewhere, 0.4 + HIDDEN_SECONDS).tolist() == [0, 1]
+    assert tracks.number_lights(np.concatenate((here, elsewhere)), 0.5 + HIDDEN_SECONDS).tolist() == [-1, 0, 1]
     assert tracks.number_lights(np.empty((0, 3)), 2.0).tolist() == []
 
 

@@ -12,7 +12,7 @@ from imgcal.monitoring import SHAPE, ObjectChange
 from imgcal.online import Event, RigKeeper
 from imgcal.online.camera_health import VAIN
 from imgcal.online.label_consistency import Checked
-from imgcal.online.object_checks import ASKED, ObjectChecks, object_event
+from imgcal.online.object_checks import LATEST, ObjectChecks, object_event
 from imgcal.types import Detections
 from scripts.benchmarks.rig_streams import Conditions, Stream
 
@@ -50,7 +50,7 @@ def test_an_object_that_is_not_as_its_file_says_is_told_and_learnt(
     assert event.size is not None and event.sigma is not None and event.since is not None
     assert abs(event.size - size) < 5 * event.sigma < 0.2 * size
     assert abs(60 * event.since - SINCE) <= 1
-    assert refused <= ASKED
+    assert refused <= LATEST
     off = keeper.belief.points_object - points
     assert float((off - off.mean(0)).norm(dim=-1).max()) < 0.1
 
@@ -71,15 +71,15 @@ def checked(stray: list[tuple[int, int]]) -> Checked:
 def test_labels_are_given_back_of_fiducials_that_most_cameras_see_elsewhere() -> None:
     doubts, odd, chance = ObjectChecks(8), [(0, 2), (1, 2), (3, 2)], [(0, 5), (1, 6)]
     asked = []
-    for number in range(2 * ASKED):
+    for number in range(2 * LATEST):
         now = checked([*odd, *chance])
         asked.append(doubts.observe(now, now.blobs, 1 / 60, number / 60))
-    assert asked.index(True) == ASKED - 1
+    assert asked.index(True) == LATEST - 1
     given = doubts.learnt[-1].blobs
     assert (given.fiducial < 0).sum() == len(chance)
     doubts.record_test(found=False)
     now = checked(odd)
-    assert not any(doubts.observe(now, now.blobs, 1 / 60, 1.0) for _ in range(ASKED))  # and again, but not at once
+    assert not any(doubts.observe(now, now.blobs, 1 / 60, 1.0) for _ in range(LATEST))  # and again, but not at once
     fits = checked([])
     doubts.observe(fits, fits.blobs, 1 / 60, 2.0)
     assert doubts.odd == {}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imgcal.errors import RefusedError
-from imgcal.online.snapshot_labels import PATIENCE
+from imgcal.online.snapshot_labels import MOST_VAIN
 from scripts.benchmarks.rig_streams import Conditions
 from tests.imgcal.online.memories import Remembered
 
@@ -51,7 +51,7 @@ def test_labels_that_fit_nowhere_are_refused_until_the_rig_is_given_up() -> None
     memory = made.learn(10)
     wrong = replace(made.blobs())
     wrong.fiducial[:] = np.roll(np.arange(8), 3)[wrong.fiducial]
-    memory.in_vain = PATIENCE - 2
+    memory.in_vain = MOST_VAIN - 2
     with pytest.raises(RefusedError, match="off in most cameras"):
         made.labelled(wrong)
     assert memory.monitor.filter.count == 10 and not memory.pending

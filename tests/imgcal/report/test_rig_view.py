@@ -13,9 +13,8 @@ import torch
 
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import read_rig
-from imgcal.live_page import up_and_forward
+from imgcal.live_page import frustum_length, frustums, up_and_forward
 from imgcal.report import DrawnRig, rig_scene, rig_view_script
-from imgcal.report.rig_view import frustum_length, frustums
 from tests.imgcal.report.browser import measured
 
 if TYPE_CHECKING:
@@ -85,11 +84,11 @@ LOOK = """
   const text = painter.text.bind(painter);
   painter.text = (words, x, y, colour, options) => { boxes.push({words, x, y}); text(words, x, y, colour, options); };
   const ends = {};
-  for (const name of ["oblique", "front", "side", "above"]) {
+  for (const name of ["rest", "front", "side", "above"]) {
     boxes.length = 0;
     painter.look(name);
     painter.paint();
-    const at = painter.everything().map(painter.place);
+    const at = painter.points().map(painter.place);
     ends[name] = {
       left: Math.min(...at.map((p) => p[0])), right: Math.max(...at.map((p) => p[0])),
       top: Math.min(...at.map((p) => p[1])), bottom: Math.max(...at.map((p) => p[1])),

@@ -5,8 +5,8 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.io import write_tensors
-from imgcal.training import HELD_OUT, TRAIN, FrameDataset, load_frames, load_splits
-from imgcal.training.frame_dataset import FORMAT, expect_elsewhere, thin, turn
+from imgcal.training import HELD_OUT, TRAIN, FrameDataset, load_splits
+from imgcal.training.frame_dataset import expect_elsewhere, thin, turn
 
 CROPS, FIDUCIALS, SIZE = 4, 3, 96
 
@@ -38,13 +38,13 @@ def test_tensors_that_do_not_belong_together_are_refused(crops, tmp_path) -> Non
         load_splits(tmp_path / "nowhere")
     replace(crops, place=crops.place[:2]).save(tmp_path / "a.safetensors", {})
     with pytest.raises(InputError, match=r"a.safetensors: place: found shape \(2, 3, 2\), expected \(4, 3, 2\)"):
-        load_frames(tmp_path / "a.safetensors")
+        FrameDataset.load(tmp_path / "a.safetensors")
     crops.select(torch.arange(0)).save(tmp_path / "b.safetensors", {})
     with pytest.raises(InputError, match="found no crops"):
-        load_frames(tmp_path / "b.safetensors")
-    write_tensors(tmp_path / "c.safetensors", {"crops": crops.crops}, FORMAT, {})
+        FrameDataset.load(tmp_path / "b.safetensors")
+    write_tensors(tmp_path / "c.safetensors", {"crops": crops.crops}, FrameDataset.FORMAT, {})
     with pytest.raises(InputError, match="found tensors crops, expected crops, place"):
-        load_frames(tmp_path / "c.safetensors")
+        FrameDataset.load(tmp_path / "c.safetensors")
 
 
 def test_markers_stay_under_their_places_when_crops_are_turned(crops) -> None:

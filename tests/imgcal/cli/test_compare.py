@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from imgcal.cli.compare_captures import contender
+from imgcal.cli.compare import contender
 from imgcal.cli.main import main
 from imgcal.evaluation import detectors
 

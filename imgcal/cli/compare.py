@@ -1,4 +1,4 @@
-"""`imgcal compare --captures`: detectors side by side on simulated captures, from frames to a rig."""
+"""`imgcal compare`: networks side by side on random rigs, or detectors on simulated captures, from frames to a rig."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import hashlib
 import json
 import re
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,42 +14,74 @@ from rich.console import Console
 
 from imgcal.cli import arguments
 from imgcal.cli.common import check_folder, open_rig, progress_bar
+from imgcal.cli.evaluate import WORK, evaluate_models, open_workers
 from imgcal.errors import InputError
 from imgcal.fleet import StoredResults
 from imgcal.io import load_object, nearest, object_text, publishing, rig_text, write_text
 
 if TYPE_CHECKING:
     from imgcal.evaluation import Contender, Scene
-    from imgcal.fleet import Mapper
 
 RESULT, TABLES = "captures.json", "captures.md"
-WORK = ".work"
-"""Folder beside results of what has been done, until all is."""
 LIMITS = {"captures": 100_000, "snapshots": 1000}
 SHIPPED_NETWORKS = ("learned", "both")
 """Detectors by name that are one training of a network."""
 SEED = re.compile(r"(.+)-seed(\d+)")
+OF_BOTH = ("rig", "object", "seed", "address", "cores")
+"""What a comparison of captures reads of a `Setting`, too."""
+
+
+class Compare(arguments.Compare):
+    """Run `imgcal compare`."""
+
+    def run(self) -> None:
+        """Compare, print and write."""
+        self._check_options()
+        if self.captured.captures:
+            compare_captures(self.models, self.captured, self.setting, self.out)
+            return
+        from imgcal.pipeline import DETECTORS
+
+        named = [path for path in self.models if str(path) in DETECTORS and not path.exists()]
+        if named:
+            raise InputError(
+                f"compare: found {named[0]}, which is a detector, expected networks; detectors are compared on "
+                "captured frames: --captures 20 simulates 20 at every difficulty"
+            )
+        if len(self.models) < 2:
+            raise InputError(f"compare: found {len(self.models)} models, expected two or more")
+        evaluate_models(self.models, self.setting, self.baselines, self.out)
+
+    def _check_options(self) -> None:
+        """Refuse options that are for the other kind of comparison.
+
+        Raises:
+            InputError: names the first of them, and what it is for.
+        """
+        unread: list[tuple[arguments.Setting | Compare | arguments.Captures, str]]
+        if self.captured.captures:
+            how, meant = "with", "networks are compared on points"
+            unread = [(self.setting, name) for name in vars(self.setting) if name not in OF_BOTH]
+            unread.append((self, "baselines"))
+        else:
+            how, meant = "without", "detectors are compared on captured frames"
+            unread = [(self.captured, name) for name in vars(self.captured)]
+        for options, name in unread:
+            if getattr(options, name) != getattr(type(options), name):
+                option = name.replace("_", "-")
+                raise InputError(f"--{option}: found it {how} --captures, expected it where {meant}")
 
 
 def compare_captures(
-    detectors: Sequence[Path],
-    chosen: arguments.Captures,
-    rig: str,
-    obj: str,
-    seed: int,
-    out: Path | None,
-    workers: Callable[[int, StoredResults | None], AbstractContextManager[Mapper]],
+    detectors: Sequence[Path], chosen: arguments.Captures, setting: arguments.Setting, out: Path | None
 ) -> None:
     """Calibrate simulated captures with each detector; print tables, and write them where `out` says.
 
     Args:
         detectors: names, files, or folders of training runs.
         chosen: what captures are simulated.
-        rig: file or name.
-        obj: file or name.
-        seed: the same seed gives the same captures.
+        setting: rig, object, seed and workers.
         out: folder to write; None = nothing is written.
-        workers: opens those who calibrate so many captures, and who keep what is done.
 
     Raises:
         InputError: a detector or a difficulty that there is not.
@@ -64,14 +95,15 @@ def compare_captures(
         check_folder(out)
     names = chosen.difficulty or tuple(DIFFICULTIES)
     models = {name: FrameModel(difficulty=DIFFICULTIES[name]) for name in names}
-    scene = Scene(open_rig(rig), load_object(obj), models, chosen.snapshots)
+    rig, obj = open_rig(setting.rig or "O10"), load_object(setting.object or "asymmetric8")
+    scene, seed = Scene(rig, obj, models, chosen.snapshots), setting.seed
     contenders = [contender(path) for path in detectors]
     for one in contenders:
         if one.detector != "classical":
             choose_proposer(one.detector)  # found out now, not when captures are made
     total = len(models) * chosen.captures
     kept = None if out is None else StoredResults(out / WORK, _scope(contenders, scene))
-    with workers(total, kept) as mapped, progress_bar("calibrating captures", total) as advance:
+    with open_workers(setting, total, kept) as mapped, progress_bar("calibrating captures", total) as advance:
         outcomes = compare_detectors(contenders, scene, chosen.captures, seed, advance, mapped)
     tables = detector_tables(outcomes)
     text = f"{describe(scene, chosen.captures, seed)}\n\n" + "\n".join(table.markdown() for table in tables)

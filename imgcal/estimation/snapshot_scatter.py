@@ -48,7 +48,7 @@ OWN = 0.5
 """Weight of a camera's own scatter; the remainder is the weight of the average over all cameras."""
 OVERLAP = 2 / 3
 """Variance of the average over heavily overlapping blocks, relative to that over disjoint ones."""
-WORTH = 2.0
+WORTH_MEASURING = 2.0
 """The same threshold for the first-order test, which needs no inverse per block and decides whether to measure."""
 LEAST_SAID = 1e-6
 """Smallest variance that leaving out a block must add to a parameter, in units of its prior, for it to be included."""
@@ -121,7 +121,7 @@ def _is_worth_measuring(information: Tensor, pull: Tensor, lengths: list[int], c
     for joined in lengths:
         change, blocks = reached[joined:] - reached[:-joined], len(pull) / joined
         scatter = float(change.square().mean()) * blocks / (1 - 1 / blocks)
-        if scatter > 1 + WORTH * (2 * max(OVERLAP * joined, 1.0) * spread / len(change)) ** 0.5:
+        if scatter > 1 + WORTH_MEASURING * (2 * max(OVERLAP * joined, 1.0) * spread / len(change)) ** 0.5:
             return True
     return False
 

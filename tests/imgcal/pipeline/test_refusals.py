@@ -8,7 +8,7 @@ import torch
 
 from imgcal.association import PipelineOptions
 from imgcal.errors import RefusedError
-from imgcal.pipeline.checks import require_fit, require_most_labels, require_near_prior
+from imgcal.pipeline.refusals import require_fit, require_most_labels, require_near_prior
 from imgcal.types import RigPrior
 
 OPTIONS = PipelineOptions()

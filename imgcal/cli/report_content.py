@@ -1,0 +1,170 @@
+"""Turns a calibration, or a refusal, into what the report shows."""
+
+from __future__ import annotations
+
+import platform
+import sys
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+import imgcal
+from imgcal.association import match_to_rig
+from imgcal.cli.outcome import Findings
+from imgcal.errors import RefusedError
+from imgcal.geometry import RigidTransform
+from imgcal.io import Frame
+from imgcal.pipeline import EARLIER, Calibration, rms_length
+from imgcal.report import NOT_IDENTIFIED, ReportContent, SnapshotSummary
+from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError
+
+Pictures = Mapping[str, Frame | None]
+
+
+def describe_refusal(
+    refusal: RefusedError,
+    detections: Detections,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    pictures: Pictures,
+    seconds: dict[str, float],
+) -> ReportContent:
+    """Say why there is no calibration, beside what was seen."""
+    moves: tuple[str, ...] = ()
+    count, reason = len(detections.snapshot_names), refusal.for_command
+    rejected = [reason if reason.startswith(NOT_IDENTIFIED) else ""] * count
+    if isinstance(refusal, MovedError):
+        moves = tuple(map(str, refusal.moved))
+        rejected = [EARLIER] * (count - refusal.since) + [""] * refusal.since
+        if refusal.labelled is not None:
+            detections = refusal.labelled
+    detections = match_to_rig(detections, rig)
+    found = np.bincount(detections.snapshot, minlength=len(detections.snapshot_names))
+    return ReportContent(
+        title=f"Recalibration of {rig.name}",
+        status="refused",
+        reason=reason,
+        identity="refused",
+        factory=rig,
+        detections=detections,
+        labels=detections.fiducial,
+        snapshots=tuple(
+            SnapshotSummary(name, int(blobs), 0, why)
+            for name, blobs, why in zip(detections.snapshot_names, found, rejected, strict=True)
+        ),
+        moves=moves,
+        object_points=obj.points.double().numpy(),
+        frames=tuple(pictures.get(name) for name in rig.camera_names) if pictures else (),
+        seconds=seconds,
+        command=_command(),
+        versions=_versions(),
+    )
+
+
+def describe(
+    calibration: Calibration,
+    found: Findings,
+    rig: CameraRig,
+    pictures: Pictures,
+    seconds: dict[str, float],
+) -> ReportContent:
+    """Lay a calibration out blob by blob, compared with the factory rig as the gauge of its motion says."""
+    gauge = found.motion.gauge
+    labelled, detections = calibration.labelled, calibration.labelled.detections
+    before, sigma = _blob_residuals(calibration, calibration.before.residual)
+    after, _ = _blob_residuals(calibration, calibration.residual)
+    used = np.isfinite(after).all(1)
+    blobs = np.bincount(detections.snapshot, minlength=len(labelled.snapshots))
+    taken = np.bincount(detections.snapshot[used], minlength=len(labelled.snapshots))
+    seen = calibration.observations.seen
+    return ReportContent(
+        title=f"{'Calibration' if calibration.from_scratch else 'Recalibration'} of {rig.name}",
+        status="ok",
+        reason=_about_object(calibration),
+        identity=calibration.identity,
+        factory=rig,
+        detections=detections,
+        labels=detections.fiducial,
+        snapshots=tuple(
+            SnapshotSummary(s.name, int(f), int(t), s.reason if s.status == "refused" else "")
+            for s, f, t in zip(labelled.snapshots, blobs, taken, strict=True)
+        ),
+        recalibrated=calibration.rig,
+        predicted_before=before + detections.uv,
+        predicted_after=after + detections.uv,
+        sigma=sigma,
+        std=found.motion.std.numpy(),
+        prior_std=gauge.prior_std(rig.to(torch.float64), calibration.estimate.problem.prior_std[0]).numpy(),
+        gauge=gauge,
+        predicted=calibration.predicted_error,
+        scale=str(calibration.scale),
+        moves=tuple(map(str, calibration.moved)),
+        late=tuple(map(str, calibration.late)),
+        doubtful=tuple(map(str, calibration.doubtful)),
+        unknown=found.knowledge.sentences,
+        advice=found.knowledge.advice,
+        unexplained=calibration.tally.unexplained.sum(0),
+        object_points=calibration.points_object.double().numpy(),
+        rig_from_object=_poses(calibration),
+        frames=tuple(pictures.get(name) for name in rig.camera_names) if pictures else (),
+        chi2_per_dof=float(calibration.chi2_per_dof),
+        rms_before=(not calibration.from_scratch and rms_length(calibration.before.residual, seen)) or float("nan"),
+        from_scratch=calibration.from_scratch,
+        rms_after=rms_length(calibration.residual, seen) or float("nan"),
+        seconds=seconds,
+        command=_command(),
+        versions=_versions(),
+    )
+
+
+def _about_object(calibration: Calibration) -> str:
+    """Name the fiducials that are not in their places, and those that were not found."""
+    words = []
+    if calibration.from_scratch:
+        words.append("There was no factory calibration: what is called so is a first rig made from the same data.")
+    if calibration.displaced:
+        parts = [f"fiducial {d.fiducial} is {d.distance:.3g} ± {d.sigma:.1g} mm off" for d in calibration.displaced]
+        words.append(
+            f"The object is not quite what its file says: {', '.join(parts)}. It was estimated with the rig; "
+            "object.csv beside this page holds it."
+        )
+    if calibration.lost:
+        which = ", ".join(map(str, calibration.lost))
+        words.append(
+            f"Fiducial {which} was hardly found where the others were: missing, hidden, or not where the object file "
+            "has it."
+        )
+    return " ".join(words)
+
+
+def _blob_residuals(calibration: Calibration, residual: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Residual (M, 2) and sigma (M,) of each blob, nan where it was not used; residual is (S, C, N, 2)."""
+    detections, used = calibration.labelled.detections, calibration.labelled.used
+    row = np.full(len(calibration.labelled.snapshots), -1)
+    row[used] = np.arange(len(used))
+    s, c, n = row[detections.snapshot], detections.camera, detections.fiducial
+    valid = (s >= 0) & (n >= 0)
+    valid[valid] = calibration.observations.seen.numpy()[s[valid], c[valid], n[valid]]
+    by_blob, sigma = np.full((len(detections), 2), np.nan), detections.sigma.copy()
+    by_blob[valid] = residual.numpy()[s[valid], c[valid], n[valid]]
+    sigma[valid] = calibration.observations.sigma.numpy()[s[valid], c[valid], n[valid]]
+    return by_blob, sigma
+
+
+def _poses(calibration: Calibration) -> RigidTransform:
+    count, used = len(calibration.labelled.snapshots), calibration.labelled.used
+    rotation, translation = torch.full((count, 3, 3), torch.nan), torch.full((count, 3), torch.nan)
+    rotation[used] = calibration.rig_from_object.rotation.float()
+    translation[used] = calibration.rig_from_object.translation.float()
+    return RigidTransform(rotation.double(), translation.double())
+
+
+def _command() -> str:
+    return " ".join(["imgcal", *sys.argv[1:]])
+
+
+def _versions() -> dict[str, str]:
+    return {"imgcal": imgcal.__version__, "PyTorch": torch.__version__, "Python": platform.python_version()}
