@@ -1,7 +1,7 @@
 """Add Gaussian splats to images on CPUs: compiled, so that only pixels that a splat reaches are touched.
 
 With tensors, adding windows takes an index for every pixel of every window, or a matrix product over whole images.
-Both cost several times as much. `additive_splatting.py` is the tensor version, with which tests compare this one.
+Both cost several times as much. `additive_splatting.py` is the tensor version; tests compare the two.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Places = NDArray[np.int32]
 
 # Standard deviations beyond which a profile is less than the rounding of its peak: it is cut off there.
 REACH = {torch.float32: 6.0, torch.float64: 8.6}
-# Fewer images than this are not worth the start of another thread.
+# Fewer images than this are not worth starting another thread for.
 IMAGES_PER_THREAD = 64
 NOWHERE = -(2**31)  # window start of splats that are not drawn
 FAST = {"contract", "reassoc", "nsz"}

@@ -5,7 +5,7 @@ installation may be read-only, and code of an earlier version must not be used f
 one in a container image that was warmed up when it was built, is used as it is.
 
 Machine code includes the functions it calls and the constants. Numba compiles a function again when its own file
-changes. Here it also does so when a file changes that this file imports.
+changes. Here it is also compiled again when one of the files that its file imports changes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Crops of infrared frames without the rest: the same physics as whole frames, thousands of crops at a time."""
+"""Render crops of infrared frames alone: the same physics as whole frames, thousands of crops at a time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from renderers.infrared import render_blobs
 from renderers.spots import Spots, in_crop
 
 LEAST_BLUR = 0.15  # px of the crop: smear is computed on two samples per pixel, too few for a sharper blur
-AT_ONCE = 2**22  # pixels of crops times blobs that are processed together: more overflow the caches and memory
+AT_ONCE = 2**22  # pixels of crops times blobs that are processed together: more would overflow the caches and memory
 
 
 def render_crops(

@@ -66,7 +66,7 @@ class SensorModel:
         m = peak_snr sqrt(m + ground + read^2).
 
         Args:
-            peak_snr: of a large marker's middle, in one pixel of one frame.
+            peak_snr: signal-to-noise ratio of one pixel in the middle of a large marker, in one frame.
             ground: electrons per pixel from the background.
             read: electrons, standard deviation of the read noise.
             gain: grey levels per electron.

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import torch
 
-# If PyTorch does not tell whether code runs under `torch.func`, assume that it does: correct, but somewhat slower.
+# If PyTorch cannot tell whether code runs under `torch.func`, assume that it does: correct, but somewhat slower.
 _is_transformed: Callable[[], bool] = getattr(torch._C, "_are_functorch_transforms_active", lambda: True)
 
 

@@ -1,4 +1,4 @@
-"""What the scripts of this folder share: where results lie, JSON beside the machine's name, small figures."""
+"""Helpers shared by the scripts: folders of results, JSON with the machine's name, sections of pages, small figures."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from imgcal.io import write_bytes, write_text
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
 WORK = ROOT / "out" / "work"
-"""What campaigns that were stopped have done."""
+"""Progress of campaigns that can be resumed."""
 BLUE, RED, GREEN, GREY = "#1f5fa8", "#c43c2f", "#2e8b57", "#777777"
 
 
 def machine(device: str = "cpu") -> str:
-    """Name the processor and the versions, not the host."""
+    """Describe the processor and the versions, without the host name."""
     path = Path("/proc/cpuinfo")
     models = [x for x in path.read_text().splitlines() if x.startswith("model name")] if path.is_file() else []
     name = models[0].split(":")[1].strip() if models else platform.processor()
@@ -42,8 +42,8 @@ def machine(device: str = "cpu") -> str:
 
 
 def surroundings(device: str = "cpu") -> dict[str, Any]:
-    """What every result file begins with."""
-    load = round(os.getloadavg()[0], 2)  # well above zero: others use the machine, and times are long for that
+    """Entries at the top of every result file: machine, threads, load."""
+    load = round(os.getloadavg()[0], 2)  # well above zero: the machine was busy, so times are too long
     return {"machine": machine(device), "threads": torch.get_num_threads(), "load_average": load}
 
 
@@ -67,20 +67,20 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, unless it is there.
+    """Create a folder unless it exists.
 
     Raises:
-        InputError: it cannot be made.
+        InputError: it cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: cannot be made: {error.strerror or error}") from error
+        raise InputError(f"{folder}: cannot create this folder: {error.strerror or error}") from error
 
 
 @contextmanager
 def figure(path: Path, panels: int = 1, rows: int = 1, size: tuple[float, float] = (7.0, 3.6)) -> Iterator[list[Axes]]:
-    """Make panels to draw on; when the block ends well, writes them as a PNG of a few colours: some 20 kB."""
+    """Yield panels to draw on; write them as a PNG of few colours (about 20 kB) unless the block raises."""
     canvas = FigureCanvasAgg(Figure(figsize=size, dpi=100, layout="constrained"))
     axes = [canvas.figure.add_subplot(rows, panels, number + 1) for number in range(rows * panels)]
     yield axes
@@ -96,7 +96,7 @@ def figure(path: Path, panels: int = 1, rows: int = 1, size: tuple[float, float]
 
 
 def markdown(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table; short rows are filled up."""
+    """Format a Markdown table; short rows are padded with empty cells."""
     columns = list(head)
     lines = [columns, ["---"] * len(columns)]
     lines += [[*row, *[""] * (len(columns) - len(row))] for row in rows]
@@ -104,7 +104,7 @@ def markdown(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def replaced(page: str, sections: Mapping[str, str], where: Path) -> str:
-    """Put sections between their markers `<!-- begin NAME -->` and `<!-- end NAME -->`.
+    """Replace the text between the markers `<!-- begin NAME -->` and `<!-- end NAME -->` of each section.
 
     Raises:
         InputError: a marker is missing.
@@ -118,7 +118,7 @@ def replaced(page: str, sections: Mapping[str, str], where: Path) -> str:
 
 
 def fill(page: Path, sections: Mapping[str, str]) -> None:
-    """Put sections between their markers in a page, in one step.
+    """Replace the sections of a page between their markers; the file is written in one step.
 
     Raises:
         InputError: a marker is missing; the page stays as it was.
@@ -127,7 +127,7 @@ def fill(page: Path, sections: Mapping[str, str]) -> None:
 
 
 def command(main: Callable[[], object]) -> None:
-    """Run as a command: what cannot be used or decided is one line on standard error, exit code 2 or 3."""
+    """Run as a command: bad input is one line on standard error and exit code 2, a refusal exit code 3."""
     try:
         main()
     except (InputError, RefusedError) as error:

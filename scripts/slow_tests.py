@@ -1,9 +1,9 @@
-"""Choose the tests that a newcomer's run leaves out, from what a whole run has measured.
+"""Choose the slow tests, which a default run skips, from the durations of a full run.
 
     python -m pytest --slow --numprocesses auto --dist loadfile --durations=0 > durations.log
     python -m scripts.slow_tests durations.log          # rewrites tests/slow_tests.txt
 
-The slowest tests are named until the rest fits into the budget.
+Tests are added to the list, slowest first, until the rest fits into the budget.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from scripts.output import ROOT
 
 LIST = ROOT / "tests" / "slow_tests.txt"
 LINE = re.compile(r"^\s*([\d.]+)s (?:call|setup|teardown)\s+(\S+?)(?:\[.*\])?\s*$")
-HEAD = """# Tests that take long, by the beginning of their node ids, and their seconds, by which several workers choose
-# what to begin with. CI=true or `scripts/test --slow` runs them.
-# Rewritten from measured durations by: python -m scripts.slow_tests DURATIONS.log
+HEAD = """# Slow tests, by the start of their node ids, and their seconds: several workers begin with the slowest files.
+# CI=true or `scripts/test --slow` runs them.
+# Generated from measured durations by: python -m scripts.slow_tests DURATIONS.log
 """
 
 
@@ -31,14 +31,14 @@ class Options:
     """Rewrite the list of slow tests."""
 
     log: Annotated[Path, tyro.conf.Positional]  #: output of pytest with --durations=0
-    seconds: float = 400.0  #: what the rest may take, of one core
+    seconds: float = 400.0  #: time budget for the rest, on one core
     out: Path = LIST
 
 
 def slowest(log: str, seconds: float) -> dict[str, float]:
-    """Name tests and their seconds, the slowest first, until the others take at most so many.
+    """List the slowest tests and their seconds, until the others fit into `seconds`.
 
-    Cases of a test count together.
+    Parametrized cases of a test count together.
     """
     spent: dict[str, float] = {}
     for line in log.splitlines():
@@ -54,7 +54,7 @@ def slowest(log: str, seconds: float) -> dict[str, float]:
 
 
 def main() -> None:
-    """Read, choose, write."""
+    """Read the durations, choose the slow tests, and write the list."""
     options = tyro.cli(Options, description=__doc__)
     named = slowest(options.log.read_text(), options.seconds)
     write_text(options.out, HEAD + "".join(f"{name} {took:.1f}\n" for name, took in sorted(named.items())))

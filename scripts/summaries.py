@@ -19,7 +19,7 @@ from scripts.results.measuring import NETWORK, ONE_PASS
 
 BENCHMARKS = ROOT / "docs" / "benchmarks"
 TWO_STEPS = "2 LM steps from the factory"
-QUESTION = ("question", "found", "command: `python -m scripts.benchmarks.` ...")
+QUESTION = ("question", "result", "benchmark (`python -m scripts.benchmarks.NAME`)")
 
 
 def main() -> None:
@@ -29,7 +29,7 @@ def main() -> None:
 
 
 def pages() -> dict[str, dict[str, str]]:
-    """Tables by the name of their markers, by page."""
+    """Text of each section of each page, by the names of their markers."""
     return {
         "docs/benchmarks/README.md": {
             "peers": markdown(("question", "imgcal", "best peer"), peer_rows()),
@@ -42,12 +42,12 @@ def pages() -> dict[str, dict[str, str]]:
 
 
 def peer_rows() -> list[list[str]]:
-    """Rows of imgcal beside the tools of the field."""
+    """Rows that compare imgcal with other tools of the field."""
     return [*_recalibration_rows(), *_blob_rows(), _identity_row(), _projection_row(), _splatting_row()]
 
 
 def honesty_rows() -> list[list[str]]:
-    """Rows about predicted errors: are they as large as the true ones?"""
+    """Rows that compare predicted errors with true ones."""
     ratios = [
         cell[unit]["ratio"]
         for rig in _benchmark("honesty_prediction")["rigs"].values()
@@ -66,29 +66,29 @@ def honesty_rows() -> list[list[str]]:
     ours, colmap = scratch["imgcal from scratch"], scratch["COLMAP incremental mapping"]
     return [
         [
-            "true error over predicted error; 1 is honest",
+            "true error / predicted error (1 = correct)",
             f"{min(ratios):.2f} to {max(ratios):.2f} for O10, U7, T4 and room10, 1 to 20 snapshots",
             "honesty_prediction",
         ],
         [
-            "squared error over covariance of a running rig, steady / drifting",
+            "normalized squared error (NEES / degrees of freedom) of a running rig, steady / drifting",
             f"{steady:.3f} / {drifting:.3f} over {len(over_time['steady']['filter'])} runs each",
             "rig_over_time",
         ],
         ["the same for each lens model", f"{min(joint):.2f} to {max(joint):.2f}", "lenses"],
         [
-            "steady captures in which a camera is reported to have moved",
+            "steady captures in which a camera is reported as moved",
             f"{_sum(calm, 'alarms')} of {_sum(calm, 'captures'):,}; "
             f"{lens['alarms']} of {lens['captures']} with lens errors and a single pass through the room",
             "honesty_moves",
         ],
         [
-            "mirrored, turned, swapped or late cameras",
-            f"{_sum(images, 'found')} of {total} named, {_sum(images, 'accepted') or 'none'} accepted",
+            "cameras with mirrored, rotated, swapped or late images",
+            f"{_sum(images, 'found')} of {total} identified, {_sum(images, 'accepted') or 'none'} accepted",
             "honesty_moves",
         ],
         [
-            "error without a factory calibration over error with one",
+            "error without a factory calibration / error with one",
             f"{ours['ratio']:.2f} ({ours['rigs']} rigs, {ours['wrong'] or 'none'} wrong; "
             f"COLMAP: {colmap['wrong']} of {colmap['rigs']} wrong)",
             "from_scratch",
@@ -97,7 +97,7 @@ def honesty_rows() -> list[list[str]]:
 
 
 def alarm_rows() -> list[list[str]]:
-    """Rows about events of a running rig."""
+    """Rows about the alarms of a running rig."""
     simulated = _benchmark("alarms")["found"]
     calm = [simulated["monitor steady"], simulated["monitor drifting"]]
     bumps = simulated["monitor bump"]
@@ -111,22 +111,22 @@ def alarm_rows() -> list[list[str]]:
             "alarms",
         ],
         [
-            "bumps of 0.1 degrees, 1 mm, 3 px or 1 px that are found within a second",
+            "bumps of 0.1 degrees, 1 mm, 3 px or 1 px that are detected within a second",
             f"{bumps['within_1_s']} of {bumps['bumps']}; right kind {100 * bumps['right_kind'] / bumps['bumps']:.1f} %",
             "alarms",
         ],
         [
-            "false events in forty real seconds in which nothing moved",
+            "false events in 40 s of a real recording without motion",
             f"{_sum(real['untouched'], 'false')} at any of {len(real['untouched'])} frame rates",
             "real_stream",
         ],
         [
-            "turns by 0.3 degrees in the real stream, each camera in turn, found in time",
+            "rotations by 0.3 degrees in the real recording, one camera at a time, detected in time",
             f"{bump['in_time']} of {bump['bumps']}, after {bump['median_seen_s']:g} s in view (median)",
             "real_stream",
         ],
         [
-            "false events with the real stream's noise replayed in simulated rooms",
+            "false events in simulated rooms with the noise of the real recording",
             f"{replayed['false']} in {replayed['snapshots']:,} snapshots",
             "replayed_gates",
         ],
@@ -134,26 +134,26 @@ def alarm_rows() -> list[list[str]]:
 
 
 def missed_gates() -> str:
-    """Sentences about gates that are missed with replayed noise."""
+    """Sentences about the targets that are missed with replayed noise."""
     replayed = _benchmark("replayed_noise")["found"]["all"]
     lens = _benchmark("alarms")["found"]["keeper lens"]
     missed = []
     if not 0.9 <= replayed["nees"] <= 1.1:
-        missed.append(f"The squared error is {replayed['nees']:.2f} times the covariance (wanted: 0.9 to 1.1).")
+        missed.append(f"The squared error is {replayed['nees']:.2f} times its covariance (target: 0.9 to 1.1).")
     if replayed["beyond_3_sigma"] > 0.01:
         missed.append(
             f"{100 * replayed['beyond_3_sigma']:.1f} % of the estimates are off by more than three standard deviations "
-            "(wanted: 1 %)."
+            "(target: 1 %)."
         )
-    first = "With replayed noise, these gates are missed. " if missed else ""
+    first = "With replayed noise, these targets are missed. " if missed else ""
     return (
-        f"{first}{' '.join(missed)}\nLenses whose model is off by 0.05 px over hundreds of pixels "
-        f"made {lens['alarms']} false alarms in {lens['snapshots']:,} snapshots."
+        f"{first}{' '.join(missed)}\nLens models that are wrong by 0.05 px over hundreds of pixels "
+        f"caused {lens['alarms']} false alarms in {lens['snapshots']:,} snapshots."
     )
 
 
 def paper_table() -> str:
-    """Networks beside the paper's, and beside Levenberg-Marquardt steps."""
+    """Compare our networks with the paper's, and with Levenberg-Marquardt steps."""
     rows = [
         _paper_row("points, O10, hemisphere, drift 2.5 %", "table1-row01"),
         _paper_row("points, O10, hemisphere, drift 10 %", "table1-row03"),
@@ -166,7 +166,7 @@ def paper_table() -> str:
 
 
 def real_frames_table() -> str:
-    """Real frames, as they are and made harder: how many cases each detector calibrates."""
+    """Count the cases of real frames, original and degraded, that each detector calibrates."""
     names = {"dots": "three-cameras-dots", "cavity": "cavity-two-cameras", "grid": "dot-grid-10x10"}
     detectors = ("classical", "matched", "auto", "learned")
     calibrated: dict[tuple[str, str], list[bool]] = defaultdict(list)
@@ -214,7 +214,7 @@ def _recalibration_rows() -> list[list[str]]:
             f"{mrcal}, with a start pose",
         ],
         [
-            "converges from 8 times the usual factory errors, one snapshot",
+            "convergence from 8 times the usual factory errors, one snapshot",
             f"{100 * converged['imgcal'][at]:.0f} %",
             f"{peers} %",
         ],
@@ -231,7 +231,7 @@ def _blob_rows() -> list[list[str]]:
     return [
         [
             "blob centres, disc of radius 3 px, noise 2 grey levels",
-            f"{ours:.2g} px (bound {usual['bound']:.2g}), {times['imgcal']['p50']:.1g} ms a frame",
+            f"{ours:.2g} px (bound {usual['bound']:.2g}), {times['imgcal']['p50']:.1g} ms per frame",
             f"photutils {theirs:.2g} px, {times['photutils centroid_2dg']['p50']:.0f} ms",
         ],
         [
@@ -249,10 +249,10 @@ def _identity_row() -> list[str]:
     peers = [case["the same, rig votes"] for case in both]
     wrong = _sum(ours, "wrong_labels")
     return [
-        "which blob is which, six markers and four false blobs a camera",
+        "labelling blobs, six markers and four false blobs per camera",
         f"{wrong or 'no'} wrong labels in {_sum(ours, 'snapshots')} snapshots, {_span(ours, 'ms_p50')} ms",
-        f"P3P, assignment and a vote of the rig: wrong labels in {_span(peers, 'wrong_percent')} % of the snapshots, "
-        f"{_span(peers, 'ms_p50')} ms",
+        f"P3P, assignment and a vote among the cameras: wrong labels in {_span(peers, 'wrong_percent')} % of the "
+        f"snapshots, {_span(peers, 'ms_p50')} ms",
     ]
 
 
@@ -263,7 +263,7 @@ def _projection_row() -> list[str]:
     peers = ", ".join(f"{name} {_digits(nanoseconds[key], 2)}" for key, name in names.items())
     return [
         "projection, 10,000 points of one camera",
-        f"{_digits(nanoseconds['**imgcal**'], 2)} ns a point",
+        f"{_digits(nanoseconds['**imgcal**'], 2)} ns per point",
         f"{peers} ns",
     ]
 
@@ -277,7 +277,7 @@ def _splatting_row() -> list[str]:
 
     counts = " / ".join(str(scene["fiducials"]) for scene in scenes)
     question = f"colour-coded images, 448 px, {counts} fiducials"
-    return [question, f"{rates('**imgcal**')} a second", f"Warp {rates('Warp kernel, a thread a window row')}"]
+    return [question, f"{rates('**imgcal**')} per second", f"Warp {rates('Warp kernel, a thread a window row')}"]
 
 
 def _paper_row(what: str, *names: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""Times cases side by side, so that a busy moment of the machine hits all of them."""
+"""Time cases in turn, so that a busy moment of the machine affects all of them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-SLICE = 0.05  # seconds that a case runs before the next one has its turn
+SLICE = 0.05  # seconds that a case runs before the next one
 LEAST_ROUNDS = 3
 
 
@@ -27,7 +27,7 @@ class Timing:
 
 
 def timing_of(seconds: list[float]) -> Timing:
-    """Summarize times of single calls in seconds."""
+    """Summarize the times of single calls, in seconds."""
     ms = 1e3 * np.sort(np.array(seconds))
     return Timing(float(np.median(ms)), float(np.percentile(ms, 99)), float(ms[0]), len(ms))
 
@@ -35,16 +35,16 @@ def timing_of(seconds: list[float]) -> Timing:
 def side_by_side(
     cases: Mapping[str, Callable[[], object]], seconds: float, prepare: Callable[[], object] | None = None
 ) -> dict[str, Timing]:
-    """Run cases in turn, round after round, each about as long in every round.
+    """Run cases in turn, round after round, for about the same time each.
 
     Args:
-        cases: what to call, by name; every case is called once before anything is measured (caches, compilation).
-        seconds: about how long all of it takes; three rounds are run in any case, but one of a case so slow that a
-            call takes a quarter of the time.
-        prepare: called before every single call, its time does not count.
+        cases: functions to call, by name; each is called once before anything is measured (caches, compilation).
+        seconds: approximate total time. There are at least three rounds, but only one of a case whose single call takes
+            a quarter of the time.
+        prepare: called before every call; its time does not count.
 
     Returns:
-        The times by name, in the order of the cases.
+        Times by name, in the order of the cases.
     """
     for run in cases.values():
         _once(run, prepare)

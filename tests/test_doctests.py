@@ -1,4 +1,4 @@
-"""The examples in docstrings, in the README and on the pages: each is run, and says what it says there."""
+"""Examples in docstrings, in the README and on the pages run, and print what is shown."""
 
 import doctest
 import re

@@ -1,4 +1,4 @@
-"""README's commands and its Python run as printed; those that take long are listed, each with what tries it instead."""
+"""README's commands and Python run as printed; slow ones are listed with the test that covers each."""
 
 import re
 import shlex

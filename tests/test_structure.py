@@ -1,4 +1,4 @@
-"""The structure that CONTRIBUTING draws: imports point down, rooms export what others use, each room has tests."""
+"""The structure drawn in CONTRIBUTING: imports point down, rooms export what others use, each room has tests."""
 
 import ast
 from pathlib import Path

@@ -85,7 +85,7 @@ class Calibrate(arguments.Calibrate):
         measurer = None if self.measurer is None else LearnedMeasurer.load(self.measurer)
         detector = self._detector(source, measurer)
         if self.trust and self.first_guess == "none":
-            raise InputError(f"--trust: found {shorten(self.trust[0])} without --first-guess, which it is for")
+            raise InputError(f"--trust: found {shorten(self.trust[0])}, expected --first-guess with it")
         named, trusted = self.first_guess, self.trust
         initializer = None if named == "none" else load_initializer(named, rig, obj, trusted=trusted)
         loaded = time.perf_counter()
@@ -152,7 +152,9 @@ class Calibrate(arguments.Calibrate):
                 raise InputError(f"--labelled: found {self.labelled}, expected a file in an existing folder")
             for option, given in self._inputs():
                 if self.labelled.exists() and given.exists() and self.labelled.samefile(given):
-                    raise InputError(f"--labelled: {self.labelled} is what {option} reads, expected another file")
+                    raise InputError(
+                        f"--labelled: {self.labelled} is also the input of {option}, expected another file"
+                    )
             if any(self.labelled.resolve() == (self.out / name).resolve() for name in WRITTEN):
                 raise InputError(f"--labelled: {self.labelled} is written to --out, expected another file")
         replaced = list(WRITTEN)
@@ -161,7 +163,7 @@ class Calibrate(arguments.Calibrate):
         for name in replaced:
             for option, given in self._inputs():
                 if (self.out / name).exists() and given.exists() and (self.out / name).samefile(given):
-                    raise InputError(f"--out: {self.out / name} is what {option} reads, expected another folder")
+                    raise InputError(f"--out: {self.out / name} is also the input of {option}, expected another folder")
 
     def _previous(self) -> list[str]:
         """Files of an earlier run that a refusal would replace by those of the last one."""
@@ -186,11 +188,11 @@ class Calibrate(arguments.Calibrate):
             raise InputError(f"found {found} of --rig and --cameras, expected one: a factory calibration, or none")
         if self.rig is not None:
             if self.distance is not None:
-                raise InputError("--distance: found it beside --rig, whose cameras give the scale; expected --cameras")
+                raise InputError("--distance: cannot be used with --rig, whose cameras give the scale; use --cameras")
             return open_rig(self.rig)
         if self.first_guess != "none" or self.detector != "classical":
             option = "--detector" if self.first_guess == "none" else "--first-guess"
-            raise InputError(f"{option}: found it beside --cameras, expected it with a factory calibration (--rig)")
+            raise InputError(f"{option}: cannot be used with --cameras; it needs a factory calibration (--rig)")
         assert self.cameras is not None
         return load_cameras(self.cameras)
 
@@ -265,8 +267,8 @@ def trusted_covariance(calibration: Calibration, reference: int) -> RigCovarianc
         camera, parameter = bad.nonzero()[0].tolist()
         name = calibration.rig.parameter_names_of(camera)[parameter]
         raise RefusedError(
-            f"covariance: {name} of camera {names[camera]} is known to "
-            f"{float(covariance.std[camera, parameter]):.2g} only: the blobs carry too little information (their "
+            f"covariance: {name} of camera {names[camera]} has a standard deviation of "
+            f"{float(covariance.std[camera, parameter]):.2g}: the blobs carry too little information (their "
             "sigma is too large, or they all lie in one place)"
         )
     return covariance

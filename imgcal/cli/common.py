@@ -44,8 +44,8 @@ def open_rig(given: str) -> CameraRig:
     if rig.num_cameras == 1 and path.exists() and is_foreign(path):
         title = find_format(read_foreign_rig(path).format).title
         raise InputError(
-            f"{given}: this is a {title} of one camera, without its place in the rig; give the folder "
-            f"of all files, or make a rig of this one camera: imgcal convert {given} --out rig.yaml"
+            f"{given}: this is a {title} of one camera, without its pose in the rig; give the folder "
+            f"of all files, or make a rig from this one camera: imgcal convert {given} --out rig.yaml"
         )
     return rig
 
@@ -125,7 +125,7 @@ def drop_cameras(rig: CameraRig, names: tuple[str, ...]) -> CameraRig:
             f"--without: found {list_names(unknown)}, expected cameras of the rig: {list_names(rig.camera_names)}"
         )
     if set(rig.camera_names) <= set(names):
-        raise InputError(f"--without: found all {rig.num_cameras} cameras of the rig, expected at least one to be left")
+        raise InputError(f"--without: found all {rig.num_cameras} cameras of the rig, expected at least one to remain")
     return rig.select([i for i, name in enumerate(rig.camera_names) if name not in names])
 
 

@@ -85,7 +85,7 @@ class Convert(arguments.Convert):
 
     def _check_held(self) -> None:
         if self.hold_distortion:
-            raise InputError("--hold-distortion: only when writing an imgcal rig file (--out rig.yaml)")
+            raise InputError("--hold-distortion: needs an imgcal rig file as output (--out rig.yaml)")
 
     def _check_limit(self) -> None:
         if not 0 < self.fit_limit < float("inf"):
@@ -136,7 +136,7 @@ class Convert(arguments.Convert):
         for path in written:
             for what, source in [*(("SOURCE", one) for one in self.source), *(("--into", one) for one in self.into)]:
                 if path.exists() and source.exists() and (path.samefile(source) or path.parent.samefile(source)):
-                    raise InputError(f"--out: {path} is what {what} holds, expected another place")
+                    raise InputError(f"--out: {path} would overwrite {what}, expected another path")
         if "" in files:
             write_bytes(self.out, files[""])
             return written

@@ -74,7 +74,7 @@ def _select_suited(methods: Mapping[str, Method], rig: CameraRig) -> dict[str, M
     suited = {name: method for name, method in methods.items() if method.knows(rig)}
     if left := [name for name in methods if name not in suited]:
         lenses = ", ".join(dict.fromkeys(rig.lens_models))
-        print(f"note: without {' and '.join(left)}: found {lenses} lenses, which they do not know", file=sys.stderr)
+        print(f"note: left out {' and '.join(left)}: no support for {lenses} lenses", file=sys.stderr)
     return suited
 
 
@@ -140,7 +140,7 @@ def _conditions(models: list[Model], setting: Setting) -> Conditions:
     if not 0 <= setting.level < len(LEVELS):
         raise InputError(f"--level: found {setting.level}, expected 0 to {len(LEVELS) - 1}")
     if not corruption.nothing:
-        raise InputError("--level: found --noise, --missing, --swapped or --false beside it, expected one of the two")
+        raise InputError("--level: cannot be used with --noise, --missing, --swapped or --false")
     return known.at_level(setting.level)
 
 

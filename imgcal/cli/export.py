@@ -22,7 +22,9 @@ class Export(arguments.Export):
     def run(self) -> None:
         """Load, write, compare."""
         if self.out.suffix != SUFFIXES[self.to]:
-            raise InputError(f"--out: found {self.out}, expected a file {SUFFIXES[self.to]} as of --to {self.to}")
+            raise InputError(
+                f"--out: found {self.out}, expected a name that ends in {SUFFIXES[self.to]}, for --to {self.to}"
+            )
         for name, value in (("count", self.count), ("fiducials", self.fiducials)):
             if not 1 <= value <= MOST:
                 raise InputError(f"--{name}: found {value}, expected 1 to {MOST}")
@@ -34,8 +36,8 @@ class Export(arguments.Export):
             made = Path(folder) / self.out.name
             off = (save_onnx if self.to == "onnx" else save_exported)(program, made)
             if not off <= TOLERANCE:
-                found = f"what was made of it gives other numbers (by {off:.1e}, {TOLERANCE:.0e} at most)"
-                raise InputError(f"{self.model}: {found}: not written")
+                found = f"the exported network gives different numbers (by {off:.1e}, {TOLERANCE:.0e} allowed)"
+                raise InputError(f"{self.model}: {found}; not written")
             content = made.read_bytes()
         write_bytes(self.out, content)
         for kind, named in (("in", program.inputs), ("out", program.outputs)):

@@ -312,9 +312,9 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
         lights = result["lights"]
         shares = [camera["found"] for camera in lights["held_out"].values()]
         print(
-            f"{lights['markers']} markers used; in snapshots that took no part, {100 * min(shares):.0f} to "
-            f"{100 * max(shares):.0f} % of those that the other cameras find in a camera's view are seen there, chance "
-            "apart"
+            f"{lights['markers']} markers used; in held-out snapshots, each camera sees {100 * min(shares):.0f} to "
+            f"{100 * max(shares):.0f} % of the markers that the other cameras find in its view, without matches by "
+            "chance"
         )
         if lights["note"]:
             print(f"note: {lights['note']}", file=sys.stderr)
@@ -331,13 +331,13 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
         if offset["fiducial"] in result["object_displaced"]:
             print(
                 f"note: fiducial {offset['fiducial']} of the object is {offset['offset_mm']:.3g} +- "
-                f"{offset['sigma_mm']:.1g} mm off its place",
+                f"{offset['sigma_mm']:.1g} mm from its place in the object file",
                 file=sys.stderr,
             )
     for fiducial in result["object_lost"]:
         print(
-            f"note: fiducial {fiducial} of the object was hardly found where the others were: missing, hidden, or not "
-            "where the object file has it",
+            f"note: fiducial {fiducial} of the object was rarely found where the others were: missing, hidden, or not "
+            "where the object file puts it",
             file=sys.stderr,
         )
     if result["board_bend"]:

@@ -73,9 +73,7 @@ class Simulate(arguments.Simulate):
         rig, obj = open_rig(self.rig), load_objects(self.object)
         generator = torch.Generator().manual_seed(self.seed)
         if obj.has_lights:
-            raise InputError(
-                "--object: found unknown markers beside known objects, expected one or the other to simulate"
-            )
+            raise InputError("--object: found unknown markers and known objects, expected one or the other to simulate")
         are_known = not obj.unknown_markers
         if not are_known:
             obj = place_markers(rig, self.lights, generator)
@@ -130,7 +128,7 @@ class Simulate(arguments.Simulate):
             return simulate_board(rig, obj, self.snapshots, generator, drift)
         poses = self.poses or ("hemisphere" if rig.volume is None and rig.working_distance is not None else "volume")
         if self.exposure_ms > 0 and poses != "hand-held":
-            raise InputError(f"--exposure-ms: found {self.exposure_ms:g}, expected --poses hand-held with it")
+            raise InputError(f"--exposure-ms: found {self.exposure_ms:g}, expected --poses hand-held")
         if poses == "hemisphere":
             return simulate_truth(rig, obj, self.snapshots, generator, drift, self._pose_range())
         if self._pose_range() != PoseRange():
@@ -141,7 +139,7 @@ class Simulate(arguments.Simulate):
     def _drift(self) -> Drift | None:
         kind = self.drift or ("physical" if self.kappa is None else "relative")
         if self.kappa is not None and kind != "relative":
-            raise InputError(f"--kappa: found {self.kappa:g} beside --drift {kind}, expected it with --drift relative")
+            raise InputError(f"--kappa: found {self.kappa:g} with --drift {kind}, expected --drift relative")
         kappa = 0.025 if self.kappa is None else self.kappa
         kinds: dict[str, Drift | None] = {"physical": self.physical, "none": None}
         return kinds[kind] if kind in kinds else RelativeDrift(kappa, kappa)

@@ -63,9 +63,7 @@ def train_in(
             "experiment and continue with --resume, or start again"
         ) from error
     except RefusedError as error:
-        raise RefusedError(
-            f"{folder}: {error}; the folder keeps what was written before this step, if anything"
-        ) from error
+        raise RefusedError(f"{folder}: {error}; files written before this step are kept") from error
 
 
 class TrainingFolder(Callbacks):

@@ -140,14 +140,14 @@ class Watch(arguments.Watch):
         if loop.unwritten:
             said = f"{said} | not written: {'; '.join(loop.unwritten.values())}"
         if stopped.interrupted:
-            there = "what was written last" if STATE in loop.unwritten else "there"
-            raise KeyboardInterrupt(f"interrupted after {said}; the same command goes on from {there}")
+            there = "the last state that was written" if STATE in loop.unwritten else "there"
+            raise KeyboardInterrupt(f"interrupted after {said}; the same command resumes from {there}")
         if loop.unwritten:
             raise InputError(f"watch: {said}")
         before = intake.known_before + (source.known_before() if isinstance(source, Folder) else 0)
         if tally.snapshots == 0 and before:
             read = f"all {before:,} snapshots of {self.input} had been read before"
-            said = f"{read}; --fresh begins from the factory rig | {said}"
+            said = f"{read}; --fresh starts from the factory rig | {said}"
         elif tally.latest is None or tally.learnt == 0:
             raise RefusedError(_nothing(tally, intake))
         elif before:
@@ -168,7 +168,7 @@ class Watch(arguments.Watch):
         rate = source.rate if isinstance(source, BlobTable) else None
         if not another and rate is not None and progress.rate not in (None, rate):
             expected = f"{progress.rate:g} as in {folder / STATE}"
-            raise InputError(f"--rate: found {rate:g}, expected {expected}; --fresh begins anew")
+            raise InputError(f"--rate: found {rate:g}, expected {expected}; --fresh starts over")
         gone = isinstance(source, BlobTable) and progress.name not in source.blobs.snapshot_names
         return Known(progress.time, None if gone else progress.name, another)
 
@@ -201,7 +201,7 @@ class Watch(arguments.Watch):
         self._check_options("a table of blobs")
         rate = USUAL_RATE if self.rate is None else self.rate
         if not 0 < rate < 1e6:
-            raise InputError(f"--rate: found {rate:g}, expected snapshots a second")
+            raise InputError(f"--rate: found {rate:g}, expected snapshots per second")
         source = open_input(path, rig, labels)
         assert isinstance(source, Detections)  # folders are seen to above
         return BlobTable(source, rate)
@@ -215,7 +215,7 @@ class Watch(arguments.Watch):
         for option, meant in ONLY_FOR.items():
             given = getattr(self, option.replace("-", "_"))
             if meant != kind and not (given is None or given is False or given == ()):
-                raise InputError(f"--{option}: found it with {kind} ({shorten(self.input)}), expected {meant}")
+                raise InputError(f"--{option}: needs {meant}, found {kind} ({shorten(self.input)})")
 
     def _keeper(self, folder: Path, rig: CameraRig, obj: CalibrationObject) -> tuple[RigKeeper, bool]:
         """Begin, or go on with what an earlier run knew; says whether it did."""
@@ -229,8 +229,8 @@ class Watch(arguments.Watch):
             (f"--object {' '.join(self.object)}", _object_difference(obj, keeper.obj)),
         ):
             if difference is not None:
-                known = f"{path}: found what is known of another than {option}"
-                raise InputError(f"{known} ({difference}); --fresh begins anew")
+                known = f"{path}: found a state that does not belong to {option}"
+                raise InputError(f"{known} ({difference}); --fresh starts over")
         return keeper, True
 
     def _require(self, library: str, what: str) -> None:
@@ -277,7 +277,7 @@ def _going_on() -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise InputError(f"{error}; --fresh begins anew") from error
+        raise InputError(f"{error}; --fresh starts over") from error
 
 
 class _Stopped(threading.Event):
@@ -374,5 +374,5 @@ def _topics(given: tuple[str, ...]) -> dict[str, str]:
     cameras = [camera for camera, _, _ in pairs]
     twice = [camera for camera in dict.fromkeys(cameras) if cameras.count(camera) > 1]
     if twice:
-        raise InputError(f"--topic: found camera {shorten(twice[0])} twice, expected one topic of each")
+        raise InputError(f"--topic: found camera {shorten(twice[0])} twice, expected one topic per camera")
     return {camera: topic for camera, _, topic in pairs}

@@ -75,7 +75,7 @@ class Display:
         tally, state = self._tally, self._tally.latest
         parts = [self._waiting() if state is None else state.sentence]
         if state is not None and state.refused is not None:
-            parts.append("nothing learnt now")
+            parts.append("not learning now")
         parts.append(f"{tally.snapshots:,} snapshots, {self._rate:.3g}/s")
         return " | ".join([*parts, *self._counts(), *self._clocks(), *self._trembling(), *self._unsynchronized()])
 
@@ -83,7 +83,7 @@ class Display:
         """Say in one line what came of it, and what did not: `rig` is the file."""
         tally, reasons = self._tally, self._intake.reasons
         said = f"{tally.snapshots:,} snapshots, {sum(tally.events.values()):,} events: {rig}"
-        latest = [f"the latest that could not be read: {reasons[-1]}"] if reasons else []
+        latest = [f"latest unreadable input: {reasons[-1]}"] if reasons else []
         return " | ".join([said, *self._counts(), *latest])
 
     def _counts(self) -> list[str]:
@@ -91,7 +91,7 @@ class Display:
         tally, intake = self._tally, self._intake
         counts = {"refused": tally.refused, "dropped": intake.dropped, "unreadable": intake.unreadable.total()}
         counts |= {kind: intake.synchronizer.counts[kind].total() for kind in SHOWN}
-        counts |= {"leaps of all clocks": intake.synchronizer.leaps}
+        counts |= {"jumps of all clocks": intake.synchronizer.leaps}
         counts["events not written"] = tally.problems[EVENTS]
         if self._hook is not None:
             counts |= {"hooks failed": self._hook.failed, "events without a hook": self._hook.dropped}
@@ -105,7 +105,7 @@ class Display:
     def _unsynchronized(self) -> list[str]:
         """Name the cameras whose time stamps go with no other's."""
         names, tolerance = self._intake.synchronizer.alone, self._intake.synchronizer.timing.tolerance
-        said = f"time stamps more than {1e3 * tolerance:g} ms (--tolerance) beside the other cameras': set their clocks"
+        said = f"time stamps more than {1e3 * tolerance:g} ms (--tolerance) off the other cameras': set their clocks"
         return [f"{list_names(names)}: {said}"] if names else []
 
     def _clocks(self) -> list[str]:
@@ -119,7 +119,7 @@ class Display:
         ):
             if abs(offset) > max(CLOCK_SIGMAS * sigma, LEAST_OFFSET):
                 stamped = self._tally.stamps.get(name, 0.0)
-                found.append(f"{name} exposes {1e3 * (offset - stamped):+.1f} ms beside its time stamps")
+                found.append(f"{name} exposes {1e3 * (offset - stamped):+.1f} ms off its time stamps")
         return found
 
     def _trembling(self) -> list[str]:

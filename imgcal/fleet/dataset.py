@@ -212,7 +212,7 @@ class Writer:
                 with contextlib.suppress(OSError):
                     part.unlink(missing_ok=True)
                 raise InputError(
-                    f"{folder}: cannot be written: {short_reason(error)}; {self.waiting} results are not kept"
+                    f"{folder}: cannot be written: {short_reason(error)}; {self.waiting} results were not saved"
                 ) from error
             self.written += len(rows)
             self._rows = [row for row in self._rows if _day(row) != day]

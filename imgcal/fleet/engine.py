@@ -219,7 +219,7 @@ def _ask(address: str) -> None:
     """
     if address in ("auto", "local"):
         return
-    expected = "expected the head of a running Ray cluster, HOST:PORT as `ray start --head` says it"
+    expected = "expected the head of a running Ray cluster, HOST:PORT as printed by `ray start --head`"
     host, _, port = address.rpartition("://")[2].rpartition(":")
     if not host or not port.isdecimal():
         raise InputError(f"--address: found {quote(address)}, {expected}")

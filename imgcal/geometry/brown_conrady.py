@@ -46,7 +46,7 @@ def is_before_fold(rr: Tensor, k: tuple[Tensor, ...]) -> Tensor:
     # The local minimum, (root - b) / (3 c), in forms that stay accurate as c goes to zero; nan or infinite without one.
     root = (b * b - 3 * a * c).sqrt()
     lowest = torch.where(b > 0, -a / (b + root), (root - b) / (3 * c))
-    # Where the slope dips below zero, a camera is blind from there on, though the slope may recover farther out.
+    # Beyond the radius where the slope falls below zero a camera is blind, even if the slope recovers farther out.
     blind = torch.where((lowest > 0) & (slope(lowest) <= 0), lowest, torch.inf)
     return torch.minimum(slope(rr), blind - rr) > 0
 

@@ -1,4 +1,4 @@
-"""Elementary functions for lens formulas, of tensors and, in compiled code, of scalars: one source serves both."""
+"""Elementary functions for lens formulas: the same source works on tensors and, in compiled code, on scalars."""
 
 # Numba infers types from arguments, and requires overloads to have the same signature.
 # ruff: noqa: ANN001, ANN202

@@ -15,9 +15,9 @@ import numpy as np
 from renderers.compiling import njit
 
 FAST = {"contract", "reassoc", "nsz"}
-"""Permitted floating-point optimizations; nan and inf keep their meaning, so that a bad step shows."""
+"""Permitted floating-point optimizations; nan and inf keep their meaning, so that a bad step is noticed."""
 LINE = 1e-3
-"""Largest distance of collinear points from their line, relative to their largest distance from the origin."""
+"""Points count as collinear up to this distance from a line, relative to their largest distance from the origin."""
 
 
 @njit(cache=True, fastmath=FAST)

@@ -1,4 +1,4 @@
-"""Kornia's distortion functions on the z = 1 plane, with which the formulas of the lens models are compared."""
+"""Kornia's distortion functions on the z = 1 plane; the formulas of the lens models are compared with them."""
 
 from __future__ import annotations
 

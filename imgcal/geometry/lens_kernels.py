@@ -1,8 +1,8 @@
 """Lens distortion and its derivatives for compiled loops; `lenses.py` does the same for tensors, model by model.
 
 A camera's model is given by its index in `LENS_MODELS`: see `lens_codes`. The functions that select by this index are
-built from the models' formulas. If all lenses are of the default model, None replaces the indices. To numba this is
-another type, and the code compiled for it handles no other lens and loses no time.
+built from the models' formulas. If all lenses are of the default model, None replaces the indices. Numba treats None as
+another type, so the code compiled for it handles only the default lens and loses no time on the choice.
 """
 
 # Compiled functions take their types from their arguments.
@@ -35,15 +35,15 @@ class CompiledLens(NamedTuple):
     distort: Formula  # (one, x, y, k) -> distorted x, y; Jacobian xx, xy, yy; x^2 + y^2; slope of the distorted radius
     by_coefficients: Formula  # (x, y, x^2 + y^2, k, fx, fy, at, rows (2, R)): puts fx, fy times derivatives into rows
     undistort: Formula  # (distorted x, y, k) -> x, y to far less than a pixel
-    start: Formula  # the same, as the initial guess of an exact iteration
-    blind_from: Formula  # (k) -> squared radius from which on a point is beyond the fold, whatever its slope
+    start: Formula  # like `undistort`, but only an initial guess for an exact iteration
+    blind_from: Formula  # (k) -> squared radius beyond which every point is past the fold, whatever its slope
 
 
 def compile_as(name: str, **options: Any) -> Callable[[Formula], Formula]:
     """Apply `njit` to one of several functions of the same name in the source, without a cache of its own.
 
-    Cached code refers to the functions it calls by name and a counter. In code from different processes, functions of
-    the same name would be confused.
+    Cached code refers to the functions it calls by name and a counter. Functions of the same name that were compiled
+    in different processes would be confused.
     """
 
     def decorate(function: Formula) -> Formula:
@@ -263,7 +263,7 @@ def _image_of(models, camera, px, py, depth, radius_squared, k):
 
 
 def by_coefficients(models, camera, x, y, rr, k, along, down, at, rows):
-    """Fill the columns of rows (2, R) from `at` on with derivatives with respect to the coefficients.
+    """Fill the columns of rows (2, R), starting at `at`, with derivatives with respect to the coefficients.
 
     The first row is for distorted x, times `along`; the second for distorted y, times `down`. Coefficients that the
     lens does not have get zero. Like `lenses.distort_by_coefficients`.

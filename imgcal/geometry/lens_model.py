@@ -30,8 +30,8 @@ class LensModel:
     by_coefficients: Formula  # (one, s, k) -> dg/dk of each coefficient, anything for p1 and p2
     kornia: Callable[[Tensor, Tensor], Tensor]  # (B, N, 2), (B, coefficients) -> (B, N, 2), through kornia's function
     inverse: Formula | None = None  # (one, squared distorted radius, k) -> 1 / g; None = by iteration
-    # Tensors (s, k) -> whether the distorted radius increases up to s; compiled (k) -> squared radius from which on a
-    # point is beyond the fold, whatever its slope. None = from samples.
+    # Tensors (s, k) -> whether the distorted radius increases up to s; compiled (k) -> squared radius beyond which
+    # every point is past the fold, whatever its slope. None = from samples.
     is_before_fold: Callable[[Tensor, tuple[Tensor, ...]], Tensor] | None = None
     blind_from: Formula | None = None
 

@@ -28,10 +28,10 @@ ModelNames: TypeAlias = str | tuple[str, ...]
 
 DEFAULT = BROWN_CONRADY.name
 FOLD_RADII = 0.003 * 1.05 ** torch.arange(214, dtype=torch.float64)
-"""Radii on the z = 1 plane, 0.2 to 89.4 degrees, at which the fold of a lens without a formula is searched for."""
+"""Radii on the z = 1 plane, 0.2 to 89.4 degrees, at which to look for the fold of a lens that has no formula for it."""
 
 FOLD_SHARES = torch.arange(65, dtype=torch.float64) / 64
-"""Shares of the interval between two of these radii, squared, at which the search is refined."""
+"""Fractions of the interval between two of these radii, squared, at which the search is refined."""
 
 Components: TypeAlias = tuple[Tensor, ...]
 

@@ -1,4 +1,4 @@
-"""Unobservable rotations of an object: those of a stick about its axis, and all of a single marker."""
+"""Unobservable rotations of an object: those of a stick about its axis, and all rotations of a single marker."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from imgcal.messages import brief_repr
 
 Join = Callable[[list[Tensor]], Tensor]
-"""Puts tensors together: `torch.cat`, `torch.stack`, or a choice between them."""
+"""Joins tensors: `torch.cat`, `torch.stack`, or a choice between them."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from imgcal.errors import InputError
 
 BoardKind = Literal["charuco", "aprilgrid", "checkerboard", "circles"]
 WARP = 0.002
-"""Standard deviation of the middle's deflection, as a share of the longer side, where a board's file does not say."""
+"""Standard deviation of the middle's deflection, as a share of the longer side, if a board's file gives none."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Board:
     kind: BoardKind
     columns: int  # squares, tags or circles in a row
     rows: int
-    pitch: float  # mm: side of a square; from tag to tag; from circle to circle, or half of that where asymmetric
+    pitch: float  # mm: side of a square; distance between tags or circles, or half of it if asymmetric
     marker: float = 0.0  # mm: side of a marker or tag, the black border included
     dictionary: str = ""  # of markers or tags, as OpenCV names it
     inverted: bool = False  # printed white on black
@@ -69,7 +69,7 @@ class Board:
         return self.columns, self.rows
 
     def __str__(self) -> str:
-        """Name it: `ChArUco board of 5x7 squares (DICT_4X4_50)`."""
+        """Describe it: `ChArUco board of 5x7 squares (DICT_4X4_50)`."""
         names = {"charuco": "ChArUco board", "aprilgrid": "AprilGrid", "circles": "grid"}
         parts = {"aprilgrid": "tags", "circles": "circles"}
         code = f" ({self.dictionary})" if self.is_coded else ""

@@ -18,7 +18,7 @@ from imgcal.types.board import Board
 ANY_LABEL = 1_000_000
 """Labels in a table of unknown markers are below this; they are ignored."""
 MOST_LIGHTS = 16
-"""Most markers per snapshot that a running rig learns from; of more, those that most cameras see."""
+"""Most markers per snapshot that a running rig learns from; if there are more, those that the most cameras see."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Symmetry:
     rotation: NDArray[np.float64]  # (3, 3)
     translation: NDArray[np.float64]  # (3,) mm: moved = rotation @ point + translation
     permutation: NDArray[np.int64]  # (N,) fiducial that each one maps to, -1 = none
-    residual: float  # mm, RMS distance of the fiducials that map to one
+    residual: float  # mm, RMS distance between the mapped fiducials and those that they map to
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class CalibrationObject:
     board: Board | None = None  # the printed pattern whose points these are; None = markers
     modes: Tensor | None = None  # (K, N, 3) mm: deformations with standard normal coefficients; None = rigid
     labels: tuple[int, ...] = ()  # of the fiducials in tables; empty = their row numbers
-    unknown_markers: bool = False  # every blob may be a marker of its own: see `unknown`
+    unknown_markers: bool = False  # any blob may be a separate marker: see `unknown`
     parts: tuple[CalibrationObject, ...] = ()  # several objects in one capture, see `of_several`; empty = one object
     origin: Tensor | None = None  # (3,) mm in the frame of the object's file: the origin of `points`; None = the same
 
@@ -101,7 +101,7 @@ class CalibrationObject:
 
     @classmethod
     def unknown(cls, name: str = "lights", most: int = 1) -> CalibrationObject:
-        """Make an object of unknown markers: every blob may be a marker of its own, at an unknown position.
+        """Make an object of unknown markers: any blob may be a separate marker at an unknown position.
 
         In a capture, each marker at each moment is an object of one point. A running rig numbers the markers of a
         moment: its object has a point for each number. The pose is a transform (S, N) whose translation is the position
@@ -178,7 +178,7 @@ class CalibrationObject:
         lights = [replace(obj, unknown_markers=True) for obj in objects if obj.pose_rank == 3]
         objects = [obj for obj in objects if obj.pose_rank > 3] + lights
         if len(lights) > 1:
-            raise InputError("objects: found single or unknown markers twice, expected once: there may be any number")
+            raise InputError("objects: found single or unknown markers twice, expected once, for any number of them")
         names: list[str] = []
         for obj in objects:
             number = sum(other.name == obj.name for other in objects[: len(names)]) + 1
@@ -234,7 +234,7 @@ class CalibrationObject:
         if self.parts:
             raise InputError(f"objects: found {len(self.parts)}, expected a single one {use}")
         if self.unknown_markers:
-            found = "found markers of which nothing is known, expected the file of an object"
+            found = "found unknown markers, expected the file of an object"
             raise InputError(f"object {self.name}: {found} {use}")
         if self.pose_rank < 6:
             found = "one fiducial" if len(self.points) == 1 else f"{len(self.points)} fiducials on one line"

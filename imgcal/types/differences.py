@@ -1,4 +1,4 @@
-"""Compare two rigs or two objects, apart from the rounding of numbers written as text."""
+"""Compare two rigs or two objects, ignoring the rounding of numbers in text files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from imgcal.types.calibration_object import CalibrationObject
 from imgcal.types.rig import CameraRig
 
-# Two values that agree to this (relative; mm, pixels and rad alike) are the same: both were read from text.
+# Relative tolerance, for mm, pixels and rad alike: values this close are the same, since both were read from text.
 SAME = 1e-6
 
 

@@ -103,7 +103,7 @@ def check_object(obj: CalibrationObject) -> None:
 
 
 def check_observations(observations: Observations) -> None:
-    """Raise `InputError` if something seen has a standard deviation of zero or less."""
+    """Raise `InputError` if a visible fiducial has a standard deviation of zero or less."""
     sigma = observations.sigma.expand(observations.seen.shape)
     wrong = observations.seen & (sigma <= 0)
     if bool(wrong.any()):

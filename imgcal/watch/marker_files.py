@@ -44,7 +44,7 @@ class MarkerFile:
             InputError: the file exists, or cannot be created.
         """
         if path.exists():
-            raise InputError(f"{path}: exists, expected a new file: a file of markers is one trial")
+            raise InputError(f"{path}: already exists, expected a new file: each trial has its own")
         if not path.parent.is_dir():
             raise InputError(f"{path}: cannot be written: no folder {path.parent}")
         self._path, self._labels = path, marker_labels(obj)

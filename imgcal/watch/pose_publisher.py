@@ -32,7 +32,7 @@ class PosePublisher:
             self._socket.bind(address)
         except zmq.ZMQError as error:
             self.close()
-            raise InputError(f"{shorten(address)}: cannot be published at: {error}") from error
+            raise InputError(f"{shorten(address)}: cannot publish there: {error}") from error
 
     def send(self, record: PoseRecord) -> None:
         """See `PoseSink`."""

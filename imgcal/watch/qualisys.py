@@ -299,7 +299,7 @@ def _connect(host: str, port: int, timeout: float) -> Generator[None, None, sock
             elif time.monotonic() > ends:
                 raise _Lost("no answer")
         if failed:
-            raise _Lost(f"cannot be connected to: {errno.errorcode.get(failed, failed)}")
+            raise _Lost(f"cannot connect: {errno.errorcode.get(failed, failed)}")
         connection.setblocking(True)
     except BaseException:
         connection.close()

@@ -44,7 +44,7 @@ class Known:
                 return False
             raise InputError(
                 f"found a different recording that begins at {snapshot.time:.9g} s, expected one "
-                f"after {self.time:.9g} s; --fresh begins anew"
+                f"after {self.time:.9g} s; --fresh starts over"
             )
         return self._is_named(snapshot) or snapshot.time <= self.time
 
@@ -206,7 +206,7 @@ class SourceReader:
         self._blobs = blobs if self._blobs is None else self._blobs
         if blobs != self._blobs:
             found, expected = ("blobs", "a frame") if blobs else ("a frame", "blobs")
-            raise InputError(f"{exposure.camera}: found {found}, expected {expected} as in what came first")
+            raise InputError(f"{exposure.camera}: found {found}, expected {expected} as in the first exposure")
         return exposure
 
     def _note(self, item: Unreadable) -> None:

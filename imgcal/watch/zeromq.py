@@ -77,7 +77,7 @@ class ZeroMQ:
             try:
                 socket.connect(address)
             except zmq.ZMQError as error:
-                raise InputError(f"{shorten(address)}: cannot be connected to: {error}") from error
+                raise InputError(f"{shorten(address)}: cannot connect: {error}") from error
 
 
 def _exposure(parts: list[memoryview]) -> Exposure:

@@ -1,6 +1,6 @@
-"""Benchmarks of imgcal beside its peers."""
+"""Benchmarks of imgcal and its peers."""
 
 import os
 
-# Before NumPy is imported: with small matrices the threads of its BLAS wait for each other more than they work.
+# Before NumPy is imported: for small matrices, the threads of its BLAS mostly wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

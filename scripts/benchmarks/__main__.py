@@ -1,9 +1,9 @@
-"""Run benchmarks beside their peers: ``scripts/benchmark``, or ``... blobs splatting``.
+"""Benchmark imgcal and its peers: ``scripts/benchmark``, or ``... blobs splatting``.
 
 Rewrites docs/benchmarks/tables.md.
 
 A benchmark is a module of this folder with three functions: ``measure(effort)`` returns plain values,
-``tables(result)`` makes Markdown tables by the name of their markers in the page,
+``tables(result)`` makes Markdown tables by the names of their markers in the page,
 ``draw(result, path)`` writes one plot.
 """
 
@@ -26,7 +26,7 @@ from scripts.benchmarks import comparison
 from scripts.benchmarks.effort import Effort
 from scripts.output import ROOT, command, make_folder, markdown, read_json, replaced, surroundings, write_json
 
-# In the order of the page, with minutes that they take.
+# In the order of the page, with their duration in minutes.
 BENCHMARKS = {
     "recalibration": 8,
     "blobs": 2,
@@ -42,7 +42,7 @@ RESULTS = ROOT / "docs" / "benchmarks"
 
 
 class Benchmark(Protocol):
-    """What a module of this folder offers."""
+    """Interface of the modules of this folder."""
 
     def measure(self, effort: Effort) -> dict[str, Any]: ...
     def tables(self, result: Mapping[str, Any]) -> dict[str, str]: ...
@@ -51,21 +51,21 @@ class Benchmark(Protocol):
 
 @dataclass(frozen=True)
 class Options:
-    """Measure imgcal beside its peers, on the same data in the same run."""
+    """Measure imgcal and its peers, on the same data in the same run."""
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Benchmarks to run; all of them if none is named."""
+    """Benchmarks to run; default: all."""
     smoke: bool = False
-    """Next to nothing of each, in two minutes: whether it runs, not how fast."""
+    """Run a minimal version of each, in two minutes, to check that it works."""
     compare: bool = False
-    """Measure into out/compare, leave the committed results and the page alone, and fail where a cell has become slower
-    beside its peers than it was when they were committed (1.15 times): before a release, and after every change."""
+    """Measure into out/compare, leaving the committed results and the page unchanged, and fail if a cell is slower
+    relative to its peers than in the committed results (1.15 times). For every change, and before a release."""
     out: Path | None = None
-    """Folder of the results, NAME.json and NAME.png; docs/benchmarks, or out/benchmarks of a smoke run."""
+    """Folder of the results, NAME.json and NAME.png; docs/benchmarks, or out/benchmarks for a smoke run."""
 
     @property
     def folder(self) -> Path:
-        """Where the results lie."""
+        """Folder of the results."""
         if self.out is not None:
             return self.out
         aside = "compare" if self.compare else "benchmarks" if self.smoke else None
@@ -73,7 +73,7 @@ class Options:
 
     @property
     def page(self) -> Path:
-        """The page of all tables, rewritten from the results beside it."""
+        """Page of all tables, rewritten from the results in its folder."""
         return self.folder / "tables.md"
 
 
@@ -86,10 +86,10 @@ def main(arguments: list[str]) -> int:
     options = tyro.cli(Options, args=arguments, prog="scripts/benchmark", description=__doc__)
     for name in options.names:
         if name not in BENCHMARKS:
-            raise InputError(f"{name}: found no such benchmark, expected one of {', '.join(BENCHMARKS)}")
+            raise InputError(f"{name}: not a benchmark, expected one of {', '.join(BENCHMARKS)}")
     make_folder(options.folder)
     failed = []
-    if len(options.names) == 1:  # in this process: the error's traceback is what one wants to see
+    if len(options.names) == 1:  # in this process, to show the traceback of an error
         _measure(options.names[0], options)
     else:
         for name in options.names or BENCHMARKS:
@@ -98,7 +98,7 @@ def main(arguments: list[str]) -> int:
     if not options.compare:
         _rewrite(options)
     for name in failed:
-        print(f"{name}: failed, its old result stays", file=sys.stderr)
+        print(f"{name}: failed; its old result is kept", file=sys.stderr)
     if options.compare and not failed:
         return comparison.report(options.folder, options.names or tuple(BENCHMARKS))
     return len(failed)

@@ -1,8 +1,8 @@
-"""Can the alarms be trusted? Steady and drifting rigs without end, and rigs of which cameras are bumped.
+"""Can the alarms be trusted? Long runs of steady and drifting rigs, and rigs with bumped cameras.
 
-Work is cut into items, each with its own seed, which cores or a cluster take; what is done is kept in a file, a line an
-item, so that a run can be stopped and gone on with. `monitor` items feed labelled fiducials to `RigMonitor`, `keeper`
-items unlabelled blobs among false ones to `RigKeeper`.
+Work is divided into items, each with its own seed, for the cores of a machine or a cluster. Finished items are kept in
+a file, one per line, so that a run can be stopped and resumed. `monitor` items feed labelled fiducials to `RigMonitor`,
+`keeper` items unlabelled blobs among false ones to `RigKeeper`.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ COUNTS = {
     "monitor shaking": 20, "keeper shaking": 20, "keeper shaking bump": 40, "keeper knock bump": 60,
     "keeper noisy": 20, "keeper lens": 20,
 }  # fmt: skip
-"""Items of each experiment: without a bump, eight hours of snapshots together."""
+"""Items of each experiment; those without a bump add up to eight hours of snapshots."""
 
 PACE = {"monitor bump": 1.0, "monitor steady": 3.0, "monitor drifting": 3.0}
-"""When the bumps are done, a third of the long ones is, and of the others a fifth."""
+"""When all bumps are done, a third of the long experiments is done, and a fifth of the others."""
 OTHERS = 5.0
 
 
 def items(share: float, only: tuple[str, ...] = tuple(COUNTS)) -> list[Item]:
-    """All of them, or a share; in an order in which all experiments go on together, each at its `PACE`."""
+    """All items or a share of them, in an order in which all experiments proceed together, each at its `PACE`."""
     wanted = {name: max(1, round(share * count)) for name, count in COUNTS.items() if name in only}
     every = [
         (seed / count * PACE.get(name, OTHERS), Item(name, seed))
@@ -54,7 +54,7 @@ def items(share: float, only: tuple[str, ...] = tuple(COUNTS)) -> list[Item]:
 
 
 def done(path: Path) -> list[dict[str, Any]]:
-    """What has been done; a line that was cut off is left out."""
+    """Finished items; a truncated line is ignored."""
     if not path.exists():
         return []
     lines = path.read_text("utf-8").splitlines()
@@ -63,7 +63,7 @@ def done(path: Path) -> list[dict[str, Any]]:
 
 
 def go_on(options: Options, mapped: Mapper = map) -> None:
-    """Run what is not done yet."""
+    """Run the unfinished items."""
     path = options.items
     known = {entry["key"] for entry in done(path)}
     left = [item for item in items(options.share, options.only) if item.key not in known]
@@ -79,21 +79,21 @@ def go_on(options: Options, mapped: Mapper = map) -> None:
 
 @dataclass(frozen=True)
 class Options:
-    """Run what is not done yet, and write what has been found so far."""
+    """Run unfinished items, and write the results so far."""
 
     minutes: float = 60.0
-    """Begin no item later than this; the next run goes on."""
-    address: str | None = None  #: running Ray cluster that does the items; none = this machine
-    cores: int | None = 1  #: of this machine; 1 = this process alone; none = all
+    """Start no item later than this; the next run resumes."""
+    address: str | None = None  #: running Ray cluster to run on; None = this machine
+    cores: int | None = 1  #: of this machine; 1 = this process alone; None = all
     share: float = 1.0
-    """Of the items of each experiment."""
-    only: tuple[str, ...] = tuple(COUNTS)  #: experiments; the others stay as they were
-    items: Path = ITEMS  #: a line for each that is done
-    out: Path = RESULT  #: the page and the plot are rewritten with this one alone
+    """Share of the items of each experiment."""
+    only: tuple[str, ...] = tuple(COUNTS)  #: experiments to run; the results of others are kept
+    items: Path = ITEMS  #: file with a line for each finished item
+    out: Path = RESULT  #: only this path also rewrites the page and the plot
 
 
 def main() -> None:
-    """Run, count, write, print."""
+    """Run the items, then count, write and print the results."""
     options = tyro.cli(Options, description=__doc__)
     with workers(options.address, options.cores) as mapped:
         go_on(options, mapped)

@@ -1,4 +1,4 @@
-"""What is run for the alarms: rigs that stand still, drift or creep, and rigs of which cameras are bumped."""
+"""Experiments on alarms: rigs that stand still, drift or creep, and rigs with bumped cameras."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
 
 GATE = {"rotation": math.radians(0.1), "position": 1.0, "focal_length": 3.0, "principal_point": 1.0}
 SWEPT = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
-"""Of the sizes of `GATE`; the last is those themselves."""
+"""Multiples of the sizes in `GATE`; the last is 1."""
 BEFORE, AFTER = 300, 300
-"""Snapshots before and after a bump: at 60 a second."""
+"""Snapshots before and after a bump, at 60 per second."""
 LONG = 6000
-"""Snapshots of an item without a bump."""
+"""Snapshots in an item without a bump."""
 SHAKE = 0.15
-"""Pixels by which all that a camera sees is shifted alike, in each snapshot otherwise: half as much again as a blob's
-noise."""
+"""Pixels, standard deviation of a shift that all points of an image share and that changes with every snapshot: 1.5
+times a blob's noise."""
 HARDER = {"shaking": Conditions(shake=SHAKE), "noisy": Conditions(noisy=0.3), "lens": Conditions(lens=0.05)}
-"""What a word in an experiment's name stands for."""
+"""Conditions that a word in an experiment's name stands for."""
 KNOCK = 3.0
-"""Times `GATE` that a camera goes in each step of a knock."""
+"""Multiple of `GATE` by which a camera moves in each step of a knock."""
 CREEP = math.radians(0.1) / 36000
-"""Rad a snapshot: 0.1 degree in ten minutes."""
+"""Rad per snapshot: 0.1 degree in ten minutes."""
 
 
 @dataclass(frozen=True)
 class Item:
-    """Something to run."""
+    """One work item."""
 
     name: str
     seed: int
 
     @property
     def key(self) -> str:
-        """What it is found by among what is done."""
+        """Identify the item among the finished ones."""
         return f"{self.name} {self.seed}"
 
 
 def without_bumps(item: Item) -> dict[str, Any]:
-    """Follow a rig that stands still, or wanders, or whose cameras shake."""
+    """Follow a rig that stands still or drifts, or whose cameras shake."""
     shake = SHAKE if item.name.endswith("shaking") else 0.0
     followed = Followed(stream_of(item.seed, RIGS[item.seed % len(RIGS)], item.name.endswith("drifting"), shake=shake))
     for number in range(LONG):
@@ -60,7 +60,7 @@ def without_bumps(item: Item) -> dict[str, Any]:
 
 
 def drawn(seed: int, number: int, size: float = 1.0) -> tuple[str, Bump]:
-    """A rig, and a bump of one of its cameras."""
+    """Draw a rig, and a bump of one of its cameras."""
     generator = np.random.default_rng((seed, number))
     name = RIGS[seed % len(RIGS)]
     kind = tuple(GATE)[seed // len(RIGS) % len(GATE)]
@@ -69,7 +69,7 @@ def drawn(seed: int, number: int, size: float = 1.0) -> tuple[str, Bump]:
 
 
 def judged(told: list[tuple[int, Change]], numbers: list[int], bumps: tuple[Bump, ...]) -> dict[str, Any]:
-    """Compare what was told with what happened."""
+    """Compare the reported changes with the true bumps."""
     bumped, at = {bump.camera: bump for bump in bumps}, min(bump.snapshot for bump in bumps)
     first = [(number, c) for number, c in told if not c.decided]
     found: dict[int, int] = {}
@@ -88,7 +88,7 @@ def judged(told: list[tuple[int, Change]], numbers: list[int], bumps: tuple[Bump
 
 
 def bumped(item: Item) -> dict[str, Any]:
-    """Follow a rig of which one camera, or two at once, are bumped."""
+    """Follow a rig in which one camera, or two at once, are bumped."""
     size = SWEPT[item.seed % (len(SWEPT) - 1)] if item.name.endswith("sweep") else 1.0
     name, bump = drawn(item.seed, 0, size)
     bumps: tuple[Bump, ...] = (bump,)
@@ -107,7 +107,7 @@ def bumped(item: Item) -> dict[str, Any]:
 
 
 def half_degree(item: Item) -> dict[str, Any]:
-    """Turn a camera by half a degree; compare with a filter that is told."""
+    """Turn a camera by half a degree; compare with a filter that knows of the bump."""
     name, bump = drawn(item.seed, 0)
     bump = Bump(bump.snapshot, bump.camera, "rotation", math.radians(0.5))
     stream = stream_of(item.seed, name, bumps=(bump,))
@@ -137,10 +137,10 @@ def half_degree(item: Item) -> dict[str, Any]:
     return {
         "rig": name,
         "held_out": errors,
-        "refused": refused,  # by the filter that was told
+        "refused": refused,  # by the filter that knows of the bump
         "asked_ok": sure,
         "wrong_ok": wrong,
-        "wrong_at_once": at_once,  # at the first snapshot after the bump: two must agree for an alarm
+        "wrong_at_once": at_once,  # at the first snapshot after the bump; an alarm needs two that agree
         **judged(followed.told, followed.numbers, (bump,)),
     }
 
@@ -165,7 +165,7 @@ def creeping(item: Item) -> dict[str, Any]:
 
 
 def whole_rig(item: Item) -> dict[str, Any]:
-    """Carry the rig as a whole: no image shows it against the object's motion."""
+    """Move the whole rig: images cannot distinguish this from a motion of the object."""
     stream = stream_of(item.seed, RIGS[item.seed % len(RIGS)])
     followed = Followed(stream)
     for number in range(BEFORE + AFTER):
@@ -178,14 +178,14 @@ def whole_rig(item: Item) -> dict[str, Any]:
 
 
 def kept(item: Item) -> dict[str, Any]:
-    """Follow blobs without labels among false ones."""
+    """Follow unlabelled blobs among false ones."""
     bumps: tuple[Bump, ...] = ()
     name, bump = drawn(item.seed, 0)
     count = LONG // 10
     if item.name.endswith("bump"):
         bumps, count = (bump,), bump.snapshot + AFTER
     steps = bumps
-    if "knock" in item.name:  # it lasts for two to nine snapshots, one step each
+    if "knock" in item.name:  # lasts two to nine snapshots, one step each
         bump = replace(bump, size=KNOCK * bump.size)
         bumps, steps = (bump,), tuple(replace(bump, snapshot=bump.snapshot + n) for n in range(2 + item.seed % 8))
     drift = DriftRate() if item.name.endswith("drifting") else DriftRate(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -226,7 +226,7 @@ RUNS = {
 
 
 def run(item: Item) -> dict[str, Any]:
-    """Do one item."""
+    """Run one item."""
     torch.set_num_threads(1)
     began = time.process_time()
     found = RUNS[item.name](item)

@@ -1,4 +1,4 @@
-"""What was found of the alarms, counted, as tables and as a plot."""
+"""Count the results on alarms, and show them as tables and as a plot."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from scripts.benchmarks.followed_streams import RIGS
 from scripts.output import BLUE, GREEN, GREY, RED, figure, markdown
 
 GOAL = 1_730_000
-"""Snapshots of eight hours."""
+"""Snapshots in eight hours."""
 
 
 def summarized(entries: list[dict[str, Any]]) -> dict[str, Any]:
-    """Count."""
+    """Count the results of each experiment."""
     groups: dict[str, list[dict[str, Any]]] = {}
     for entry in entries:
         groups.setdefault(entry["name"], []).append(entry)
@@ -51,7 +51,7 @@ def summarized(entries: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _ratio(pairs: list[list[float]]) -> float:
-    """RMS of the first by that of the second."""
+    """RMS of the first values divided by that of the second."""
     squares = np.square(pairs).sum(0)
     return math.sqrt(squares[0] / squares[1])
 
@@ -74,7 +74,7 @@ def _bumps(group: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def tables(result: dict[str, Any]) -> dict[str, str]:
-    """Markdown, by the marker in the page."""
+    """Make the tables, by the names of their markers in the page."""
     found: dict[str, Any] = result["found"]
     quiet = [name for name, group in found.items() if "snapshots" in group and "bumps" not in group]
     rows = []
@@ -83,7 +83,7 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
         parts |= {f"{name}, {kind.replace('_', ' ')}": part for kind, part in group.get("by_kind", {}).items()}
         rows += [[label, *_cells(part)] for label, part in parts.items() if "bumps" in part]
     head = [
-        "bumps", "number", "found within 1 s", "median delay", "others blamed", "right kind", "kind not told",
+        "bumps", "number", "found within 1 s", "median delay", "other cameras blamed", "right kind", "kind undecided",
         "time within 3 snapshots",
     ]  # fmt: skip
     return {
@@ -103,7 +103,7 @@ def _cells(part: dict[str, Any]) -> list[str]:
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
-    """Delay against size and against the number of cameras; false alarms against what was run."""
+    """Draw the delay over the size of a bump and over the number of cameras, and false alarms over snapshots."""
     found = result["found"]
     with figure(path, panels=3, size=(11.0, 3.4)) as (by_size, by_cameras, false):
         sweep = found.get("monitor sweep", {}).get("by_size", {})

@@ -1,4 +1,4 @@
-"""Frames of discs whose centres are known, one thing varied at a time, and how well a centre can be known at all."""
+"""Frames of discs with known centres, with one property varied at a time, and the Cramér-Rao bound of a centre."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class Cell:
     radius: float = 3.0  # px
     blur: float = 0.7  # px
     noise: float = 2.0  # grey levels
-    contrast: float = 150.0  # grey levels above the background; more than the scale has left is clipped
+    contrast: float = 150.0  # grey levels above the background; clipped at full scale
     squeeze: float = 1.0  # ratio of the axes
     angle: float = 0.0  # rad, of the longer axis
     clutter: str = ""
 
     @property
     def known(self) -> Known:
-        """What the finders are told."""
+        """Properties that the finders are given."""
         radius = self.radius * float(np.sqrt(self.squeeze))
         return Known(radius, min(self.contrast, FULL - BACKGROUND), self.noise, BACKGROUND)
 
@@ -55,14 +55,14 @@ CELLS = (
 
 @dataclass(frozen=True)
 class View:
-    """One frame and the truth about it."""
+    """One frame and its ground truth."""
 
     frame: NDArray[np.uint8]  # (H, W)
     uv: Array  # (M, 2) centres, px
 
 
 def view(cell: Cell, shape: tuple[int, int], rng: np.random.Generator) -> View:
-    """Draw one frame: discs on a lattice, each at its own place within a pixel, clutter between and below them."""
+    """Draw one frame: discs on a lattice with random subpixel offsets, clutter between and below them."""
     pitch = 40 if cell.radius < 8 else 52
     uv = scattered(shape, pitch, rng)
     background = np.full(shape, BACKGROUND)
@@ -91,9 +91,9 @@ def view(cell: Cell, shape: tuple[int, int], rng: np.random.Generator) -> View:
 
 
 def bound(cell: Cell, rng: np.random.Generator, places: int = 12) -> float:
-    """Cramer-Rao bound of a centre, RMS of each axis in px: nothing else unknown, no clutter, rounding as noise.
+    """Cramér-Rao bound of a centre, RMS of each axis in px: nothing else unknown, no clutter, rounding as noise.
 
-    Pixels that are clipped say nothing.
+    Clipped pixels carry no information.
     """
     side, step = 2 * int(cell.radius + 8) + 1, 0.01
     variances = []
@@ -113,7 +113,7 @@ def bound(cell: Cell, rng: np.random.Generator, places: int = 12) -> float:
 
 
 def rig_frames(shape: tuple[int, int], cameras: int = 10, blobs: int = 10) -> dict[str, NDArray[np.uint8]]:
-    """Frames of a rig: 8 fiducials of radius 3 to 5 px and 2 false blobs in each, or the first ones of these."""
+    """Draw a rig's frames: 8 fiducials of radius 3 to 5 px and 2 false blobs in each, or the first `blobs` of these."""
     rng = np.random.default_rng(1)
     background = np.linspace(15, 40, shape[1])[None, :]
     frames = {}

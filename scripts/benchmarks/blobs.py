@@ -1,4 +1,4 @@
-"""Blob centres: imgcal beside other finders, and beside what the noise allows."""
+"""Blob centres: imgcal compared with other finders and with the Cramér-Rao bound."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from scripts.timing import side_by_side
 from tests.imgcal.detection.discs import nearest
 
 OURS = "imgcal"
-GATE = 1.0  # px, a centre that is farther from the truth is false
+GATE = 1.0  # px; a centre farther from the truth is false
 EQUAL = 2.0  # standard errors
 PACKAGES = ("opencv-contrib-python-headless", "scikit-image", "photutils", "trackpy")
 
 
 def measure(effort: Effort) -> dict[str, Any]:
-    """Run every finder over the same frames of every cell, then time them on one frame."""
+    """Run every finder on the same frames of every cell, then time them on one frame."""
     cv2.setNumThreads(1)
     shape, frames = effort.pick((480, 640), (120, 160)), effort.pick(4, 1)
     cells = effort.pick(CELLS, CELLS[:1] + CELLS[-1:])
@@ -44,7 +44,7 @@ def measure(effort: Effort) -> dict[str, Any]:
 
 
 def accuracy(cell: Cell, shape: tuple[int, int], frames: int, seed: int) -> dict[str, Any]:
-    """Recall, false blobs and errors of each finder in one cell, and who is nearest to imgcal."""
+    """Recall, false blobs and errors of each finder in one cell, and the best peer."""
     rng = np.random.default_rng(seed)
     views = [view(cell, shape, rng) for _ in range(frames)]
     errors = {}
@@ -60,7 +60,7 @@ def accuracy(cell: Cell, shape: tuple[int, int], frames: int, seed: int) -> dict
 
 
 def errors_of(found: Iterable[NDArray[np.float64]], views: Sequence[View]) -> tuple[NDArray[np.float64], int]:
-    """Errors (M, 2) px of all true centres, NaN where none was found; and the number of false ones."""
+    """Errors (M, 2) px of all true centres, NaN for missed ones; and the number of false centres."""
     errors, false = [], 0
     for centres, one in zip(found, views, strict=True):
         rows, distance = nearest(centres, one.uv)
@@ -73,7 +73,7 @@ def errors_of(found: Iterable[NDArray[np.float64]], views: Sequence[View]) -> tu
 
 
 def score(errors: NDArray[np.float64], uv: NDArray[np.float64]) -> dict[str, float]:
-    """Recall; RMS of each axis and its standard error; largest mean of an axis; amplitude over the phase in a pixel."""
+    """Recall; RMS per axis and its standard error; largest mean of an axis; amplitude over the subpixel phase."""
     hit = np.isfinite(errors).all(1)
     if hit.sum() < 3:
         return {"recall": float(hit.mean())}
@@ -90,9 +90,9 @@ def score(errors: NDArray[np.float64], uv: NDArray[np.float64]) -> dict[str, flo
 
 
 def best_peer(errors: Mapping[str, NDArray[np.float64]]) -> dict[str, Any]:
-    """The most exact peer of those that find nearly everything, and how imgcal compares on the discs that both found.
+    """Find the most accurate peer that finds nearly everything, and compare it with imgcal on discs that both found.
 
-    `gap` is the difference of the mean squared errors, peer minus imgcal, in its standard errors.
+    `gap` is the difference of the mean squared errors, peer minus imgcal, in units of its standard error.
     """
     ours = errors[OURS]
     rivals = {}
@@ -122,7 +122,7 @@ def times(effort: Effort) -> dict[str, dict[str, float]]:
 
 
 def rig_times(effort: Effort) -> dict[str, Any]:
-    """Time ten frames in memory to blobs with one and two threads; OpenCV's components of the same for reference."""
+    """Time blob detection in ten frames in memory with one and two threads; OpenCV's components for reference."""
     shape, sample = effort.pick((1088, 2048), (240, 320)), open_capture(data_path("samples", "O10"))
     drawn = rig_frames(shape)
     scenes: dict[str, Mapping[str, Frame | None]] = {
@@ -148,7 +148,7 @@ def rig_times(effort: Effort) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, str]:
-    """Errors, findings and biases of every cell, and times."""
+    """Make the tables of errors, recall and bias of every cell, and of times."""
     names = list(FINDERS)
     cells = result["cells"]
     return {
@@ -158,7 +158,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
             [[cell["cell"], f"{cell['bound']:.4f}", *_row(cell, names, _rms)] for cell in cells],
         ),
         "blobs finding": markdown(
-            ["recall % / false a frame", *names], [[cell["cell"], *_row(cell, names, _found)] for cell in cells]
+            ["recall % / false per frame", *names], [[cell["cell"], *_row(cell, names, _found)] for cell in cells]
         ),
         "blobs bias": markdown(
             ["bias / phase (px)", *names], [[cell["cell"], *_row(cell, names, _bias)] for cell in cells]
@@ -178,7 +178,7 @@ def _best(cells: Sequence[Mapping[str, Any]]) -> str:
             verdict = "equal" if abs(peer["gap"]) < EQUAL else "ahead" if peer["gap"] > 0 else "**behind**"
             row += [peer["name"], f"{peer['ratio']:.2f}", verdict]
         rows.append(row)
-    head = ["", "limit (px)", "imgcal RMS (px)", "over limit", "best peer", "its RMS over imgcal's", "imgcal is"]
+    head = ["", "limit (px)", "imgcal RMS (px)", "RMS / limit", "best peer", "its RMS / imgcal's", "imgcal is"]
     return markdown(head, rows)
 
 
@@ -212,7 +212,7 @@ def _time(taken: Mapping[str, Mapping[str, float]]) -> str:
         one = taken[name]
         ratio = one["p50"] / taken[OURS]["p50"]
         rows.append([name, f"{one['p50']:.2f}", f"{one['p99']:.2f}", f"{ratio:,.1f}", str(one["blobs"])])
-    return markdown(["", "ms p50", "p99", "times imgcal's", "found (of 10)"], rows)
+    return markdown(["", "ms p50", "p99", "relative to imgcal", "found (of 10)"], rows)
 
 
 def _rig(taken: Mapping[str, Any]) -> str:
@@ -227,7 +227,7 @@ SHOWN = {
 
 
 def draw(result: Mapping[str, Any], path: Path) -> None:
-    """Draw errors over the limit, a row for each cell."""
+    """Draw errors relative to the bound, one row per cell."""
     cells = result["cells"]
     with figure(path, size=(8.0, 0.6 + 0.28 * max(len(cells), 6))) as (axes,):
         for name, colour in SHOWN.items():
@@ -242,5 +242,5 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
         axes.set_xscale("log")
         axes.set_yticks(range(len(cells)), [cell["cell"] for cell in cells], fontsize=8)
         axes.invert_yaxis()
-        axes.set_xlabel("RMS error over the Cramer-Rao bound")
+        axes.set_xlabel("RMS error over the Cramér-Rao bound")
         axes.legend(fontsize=8)

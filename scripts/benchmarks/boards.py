@@ -1,7 +1,7 @@
-"""Real captures of printed boards: held-out errors with and without the bend, and beside other calibrations.
+"""Real captures of printed boards: held-out errors with and without the bend, compared with other calibrations.
 
 Run as `python -m scripts.benchmarks.boards`; writes docs/benchmarks/boards.json. Needs IMGCAL_CAPTURES. Rigs are fitted
-on odd snapshots and scored on even ones, unless said otherwise: poses by plain least squares, RMS over all points.
+on odd snapshots and scored on even ones unless noted: poses by plain least squares, RMS over all points.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from imgcal.types import Board, CalibrationObject, CameraRig, Detections
 from scripts.output import ROOT, command, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "boards.json"
-MRCAL_SIGMA = 0.3  # px, of a corner of weight one
+MRCAL_SIGMA = 0.3  # px, sigma of a corner of weight one
 PLAIN = EstimationOptions(threshold=1e6)
 
 
 def held_out(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> dict[str, float]:
-    """Fit poses alone by least squares: errors (px) of all points."""
+    """Fit only the poses by least squares; return the errors (px) of all points."""
     observations, poses = accepted_observations(associate(detections, rig, obj), rig, obj)
     even = replace(observations, sigma=torch.ones_like(observations.sigma))
     fixed = torch.zeros(rig.num_cameras, rig.num_parameters, dtype=torch.float64)
@@ -110,13 +110,13 @@ def webcams(folder: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Options:
-    """Where the figures go."""
+    """Measure real captures of printed boards."""
 
     out: Path = RESULT
 
 
 def main() -> None:
-    """Measure, and write the figures.
+    """Measure, and write the results.
 
     Raises:
         InputError: no captures.

@@ -1,7 +1,7 @@
-"""How long do `imgcal.calibrate` from labels and live updates take, beside another checkout of imgcal?
+"""How long do `imgcal.calibrate` from labels and live updates take, compared with another checkout of imgcal?
 
-Run as `python -m scripts.benchmarks.calibration_speed [--beside FOLDER]`. Both run in turn, a tenth of a second each,
-on one thread where nothing else is said; what counts is CPU time, which other processes disturb least.
+Run as `python -m scripts.benchmarks.calibration_speed [--beside FOLDER]`. Both run in turn, for a tenth of a second
+each, on one thread unless noted. CPU time is reported, because other processes affect it least.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ RESULT = ROOT / "docs" / "benchmarks" / "calibration_speed.json"
 PAGE = ROOT / "docs" / "benchmarks" / "tables.md"
 WORKER = Path(__file__).with_name("calibration_speed_worker.py")
 NOISE = 0.07  # px
-STREAM = 40  # snapshots of a live stream, which goes there and back
+STREAM = 40  # snapshots of a live stream, which is played forwards and backwards
 HERE, THERE = "this checkout", "the other"
-AT_ONCE = 0.1  # seconds that one of both runs before it is the other's turn
+AT_ONCE = 0.1  # seconds per turn
 
 TITLES = {
     "calibrate1": "calibrate, 1 labelled snapshot, O10",
@@ -49,7 +49,7 @@ TITLES = {
 
 
 def write_cases(folder: Path) -> None:
-    """Write what the worker reads."""
+    """Write the worker's input files."""
     for snapshots in (1, 20, 100):
         truth = object_before_a_ring(snapshots, 1)[-1]
         columns = _columns(blobs(truth, 1, clutter=0.0, labelled=True))
@@ -62,7 +62,7 @@ def write_cases(folder: Path) -> None:
 
 def _write(folder: Path, name: str, case: tuple[str, str, int], columns: Mapping[str, np.ndarray]) -> None:
     rig, obj = folder / f"{case[0]}.yaml", ROOT / "data" / "objects" / f"{case[1]}.csv"
-    save_rig(replace(load_rig(case[0]), volume=None), rig)  # which an older checkout does not know
+    save_rig(replace(load_rig(case[0]), volume=None), rig)  # older checkouts cannot read a volume
     (folder / f"{name}.json").write_text(json.dumps({"rig": str(rig), "object": str(obj), "window": case[2]}))
     np.savez(folder / f"{name}.npz", **columns)  # type: ignore[arg-type]
 
@@ -73,7 +73,7 @@ def _columns(table: Detections) -> dict[str, np.ndarray]:
 
 
 def carried(rig_name: str, object_name: str) -> dict[str, np.ndarray]:
-    """Carry an object smoothly before a rig that is not what the factory says: unlabelled blobs, as columns."""
+    """Move an object smoothly in front of a drifted rig: unlabelled blobs, as columns."""
     rig, obj, draw = load_rig(rig_name), load_object(object_name), np.random.default_rng(3)
     rig = rig.to(torch.float64)
     step = torch.zeros(rig.num_cameras, 15, dtype=torch.float64)
@@ -104,10 +104,10 @@ def carried(rig_name: str, object_name: str) -> dict[str, np.ndarray]:
 
 
 class Worker:
-    """imgcal of a checkout, in a process of its own."""
+    """A separate process that runs the imgcal of a checkout."""
 
     def __init__(self, checkout: Path, folder: Path, threads: int) -> None:
-        """Start it: from here on it answers `run`."""
+        """Start the process."""
         surely = {"PYTHONPATH": str(checkout)} | {f"{name}_NUM_THREADS": str(threads) for name in ("OMP", "NUMBA")}
         self._process = subprocess.Popen(
             [sys.executable, "-P", str(WORKER), str(folder), str(threads)],
@@ -121,12 +121,12 @@ class Worker:
         return list(json.loads(self._process.stdout.readline()))
 
     def end(self) -> None:
-        """Let it end."""
+        """End the process."""
         self._process.communicate()
 
 
 def measure(checkouts: Mapping[str, Path], rounds: int, cases: tuple[str, ...]) -> dict[str, Any]:
-    """CPU times (ms) by case and checkout: median, and the best."""
+    """Measure CPU times (ms) by case and checkout: median and best."""
     with tempfile.TemporaryDirectory() as name:
         write_cases(Path(name))
         threads = {case: 2 if case.endswith(" on 2") else 1 for case in cases}
@@ -147,7 +147,7 @@ def measure(checkouts: Mapping[str, Path], rounds: int, cases: tuple[str, ...]) 
 
 
 def table(result: Mapping[str, Any]) -> str:
-    """Markdown."""
+    """Make the table, as Markdown."""
     rows = []
     for case, row in result["cases"].items():
         here, there = row[HERE], row.get(THERE)
@@ -164,14 +164,14 @@ class Options:
     """Time calibration and live updates."""
 
     beside: Path | None = None  #: another checkout to compare with
-    revision: str = ""  #: its name, for the result
+    revision: str = ""  #: name of that checkout, for the result
     rounds: int = 10
     cases: tuple[str, ...] = tuple(TITLES)
     out: Path | None = None  #: a result file; docs/benchmarks/calibration_speed.json rewrites its table in the page
 
 
 def main() -> None:
-    """Measure, write, print."""
+    """Measure, write and print."""
     options = tyro.cli(Options, description=__doc__)
     before = surroundings() | {"threads": 1}
     checkouts = {HERE: ROOT} | ({} if options.beside is None else {THERE: options.beside.resolve()})

@@ -1,7 +1,7 @@
-"""Runs the cases of `calibration_speed` on whatever imgcal is found first: that of another checkout, for one.
+"""Run the cases of `calibration_speed` with the first imgcal on the path, perhaps that of another checkout.
 
-Needs nothing but the names in `imgcal.__all__`. Reads lines `CASE SECONDS` from standard input, runs the case for about
-as long, and writes a line with the CPU time (ms) of each call, as JSON.
+Needs only the names in `imgcal.__all__`. Reads lines `CASE SECONDS` from standard input, runs the case for about that
+time, and writes a line with the CPU time (ms) of each call, as JSON.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from imgcal import Detections, PipelineOptions, calibrate, load_object, load_rig
 
 
 class Case:
-    """One calibration again and again, or one live stream there and back."""
+    """A repeated calibration, or a live stream that is played forwards and backwards."""
 
     def __init__(self, folder: Path, name: str) -> None:
         """Read `NAME.json`, rig, object and window (0 = a calibration of all snapshots), and `NAME.npz`, the blobs."""
@@ -37,11 +37,11 @@ class Case:
             self._call = _follow(rig, obj, given["window"], stream)
         else:
             self._call = lambda: calibrate(blobs, rig, obj)
-        for _ in range(3 + 2 * given["window"]):  # compilation; the window is full
+        for _ in range(3 + 2 * given["window"]):  # compile, and fill the window
             self._call()
 
     def run(self, seconds: float) -> list[float]:
-        """Call for about so long, once at least: CPU time of each call, ms."""
+        """Repeat calls for about this time, at least once; return the CPU time of each call, ms."""
         taken: list[float] = []
         while not taken or sum(taken) < 1e3 * seconds:
             began = time.process_time()
@@ -53,7 +53,7 @@ class Case:
 def _follow(
     rig: imgcal.CameraRig, obj: imgcal.CalibrationObject, window: int, stream: Iterator[Detections]
 ) -> Callable[[], object]:
-    """An update of a running rig that is known by its last snapshots; other checkouts may have no horizon."""
+    """Make an update of a running rig from its last snapshots; other checkouts may not have a horizon."""
     if hasattr(imgcal, "Recalibrator"):
         live = imgcal.Recalibrator(rig, obj, PipelineOptions(blind_cameras=True), window=window)
         return lambda: live.update(next(stream))
@@ -68,7 +68,7 @@ def _there_and_back(parts: list[Detections]) -> Iterator[Detections]:
 
 
 def main() -> None:
-    """Answer until standard input ends."""
+    """Answer requests until standard input ends."""
     torch.set_num_threads(int(sys.argv[2]))
     folder, cases = Path(sys.argv[1]), dict[str, Case]()
     for line in sys.stdin:

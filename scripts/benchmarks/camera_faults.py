@@ -1,4 +1,4 @@
-"""Captures with known truth, and what can go wrong with one camera of them."""
+"""Captures with known ground truth, and faults of one of their cameras."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def blobs(
     truth: Truth, seed: int = 0, clutter: float = 0.3, missed: float = 0.02,
     crowded: tuple[int, float] | None = None, labelled: bool = False,
 ) -> Detections:  # fmt: skip
-    """Find blobs: noise, a few false ones a frame (`crowded`: a camera and how many there), some fiducials missed."""
+    """Simulate blobs: noise, a few false ones per frame (`crowded`: a camera and its number), some missed fiducials."""
     draw = np.random.default_rng(seed)
     found = true_detections(truth)
     found = found.select(draw.random(len(found)) >= missed)
@@ -65,14 +65,14 @@ def blobs(
 
 
 def joined(*tables: Detections) -> Detections:
-    """Put tables of the same cameras and snapshots together."""
+    """Concatenate tables of the same cameras and snapshots."""
     columns = [f.name for f in fields(Detections) if not f.name.endswith("_names")]
     together: dict[str, Any] = {name: np.concatenate([getattr(t, name) for t in tables]) for name in columns}
     return replace(tables[0], **together)
 
 
 def mirrored(table: Detections, rig: CameraRig, camera: int, how: str) -> Detections:
-    """Flip (u, v, both) or turn the image of one camera; what leaves it is lost."""
+    """Flip (u, v, both) or rotate the image of one camera; points that leave the image are lost."""
     width, height = rig.image_size[camera].tolist()
     flips: dict[str, Callable[..., tuple[np.ndarray, np.ndarray]]] = {
         "u": lambda u, v: (width - 1 - u, v),
@@ -86,13 +86,13 @@ def mirrored(table: Detections, rig: CameraRig, camera: int, how: str) -> Detect
 
 
 def swapped(table: Detections, first: int, second: int) -> Detections:
-    """Exchange two cameras."""
+    """Swap two cameras."""
     camera = table.camera
     return replace(table, camera=np.where(camera == first, second, np.where(camera == second, first, camera)))
 
 
 def late(table: Detections, camera: int) -> Detections:
-    """Let one camera be one snapshot behind."""
+    """Delay one camera by one snapshot."""
     count = len(table.snapshot_names)
     snapshot = np.where(table.camera == camera, (table.snapshot + 1) % count, table.snapshot)
     return replace(table, snapshot=snapshot)
@@ -129,7 +129,7 @@ def shifted(rig: CameraRig, camera: int, millimetres: float, axis: int = 0) -> C
 
 
 def changed_from(truth: Truth, obj: CalibrationObject, camera: int, first: int, change: Change) -> Truth:
-    """Change one camera from a snapshot on; the rig of the truth is that before."""
+    """Change one camera from a snapshot on; the true rig is the one before the change."""
     after = with_camera(truth, obj, camera, change)
     later = torch.arange(len(truth.uv)) >= first
     uv = torch.where(later[:, None, None, None], after.uv, truth.uv)
@@ -143,7 +143,7 @@ def _visible(truth: Truth) -> Tensor:
 
 
 def with_lens_errors(truth: Truth, seed: int = 0, size: float = 0.15) -> Truth:
-    """Look through lenses that the camera model does not know: smooth errors over each image, px."""
+    """Add lens errors that the camera model cannot express: smooth over each image, px."""
     draw, where = np.random.default_rng(seed), truth.uv / truth.rig.image_size.double()[:, None]
     shape = (truth.uv.shape[1], 1, 2)
     slope, phase = (torch.from_numpy(draw.uniform(low, high, shape)) for low, high in ((2, 5), (0, 6)))
@@ -151,7 +151,7 @@ def with_lens_errors(truth: Truth, seed: int = 0, size: float = 0.15) -> Truth:
 
 
 def from_one_end_to_the_other(truth: Truth) -> Truth:
-    """Take the same snapshots in the order of one coordinate: place and time go together."""
+    """Sort the snapshots by one coordinate, so that position and time are correlated."""
     order = truth.rig_from_object.translation[:, 0].argsort()
     visible = None if truth.visible is None else truth.visible[order]
     return replace(truth, uv=truth.uv[order], visible=visible, rig_from_object=truth.rig_from_object[order])

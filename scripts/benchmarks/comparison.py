@@ -1,11 +1,11 @@
-"""Compare benchmarks with the committed ones, cell by cell, and fail where imgcal has become slower than its peers.
+"""Compare benchmarks with the committed ones, cell by cell; fail if imgcal has become slower relative to its peers.
 
-Usage: scripts/benchmark --compare [benchmark ...], which measures first; of results that lie in a folder already:
+Usage: scripts/benchmark --compare [benchmark ...], which measures first; for existing results:
 python -m scripts.benchmarks.comparison out/compare
 
-Two runs never meet the same machine. So each time of imgcal is divided by that of the peers in its own table and run:
-what a cell reports is by how much that ratio has grown. A table without peers takes the peers of its file, a file
-without any takes those of all files. Sizes (megabytes) are compared as they are.
+The machine's speed differs between runs. Each time of imgcal is therefore divided by that of the peers in the same
+table and run, and a cell reports the growth of this ratio. A table without peers uses the peers of its file, a file
+without any those of all files. Sizes (megabytes) are compared directly.
 """
 
 from __future__ import annotations
@@ -24,51 +24,51 @@ from scripts.output import ROOT, command, markdown, read_json
 
 COMMITTED = ROOT / "docs" / "benchmarks"
 LIMIT = 1.15
-"""Growth of a cell that fails: what a busy machine makes of the same code stays below."""
+"""Growth from which a cell fails; the same code stays below it on a busy machine."""
 PEERS = (
     "clearing", "cv2", "hungarian", "kornia", "mrcal", "nearest projection", "numpy", "opencv", "photutils", "pyceres",
     "pycolmap", "python", "rig votes", "scipy", "skimage", "threshold", "trackpy", "warp",
 )  # fmt: skip
-"""What names of peers contain; a name with "imgcal" is none."""
+"""Substrings of the names of peers; a name with "imgcal" is not a peer."""
 MEDIANS = ("p50", "ms_p50")
 SIZES = ("megabytes", "memory_mb")
 LABELS = ("name", "n", "kind", "count", "points", "side", "fiducials", "cell")
-"""What tells rows of a list apart."""
+"""Keys that identify the rows of a list."""
 
 Key = tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Cells:
-    """Figures of one result, by their place in it."""
+    """Numbers of one result, by their keys."""
 
     ms: Mapping[Key, float]
     megabytes: Mapping[Key, float]
 
     @property
     def ours(self) -> list[Key]:
-        """Times that are imgcal's."""
+        """Keys of imgcal's times."""
         return [key for key in self.ms if not is_peer(key)]
 
 
 @dataclass(frozen=True)
 class Change:
-    """What has become of one cell."""
+    """Change of one cell."""
 
     benchmark: str
     cell: str
     before: float
     after: float
-    growth: float  # of the ratio to the peers; inf = it is measured no more
+    growth: float  # of the ratio to the peers; inf = no longer measured
 
 
 def is_peer(key: Key) -> bool:
-    """Tell whether a figure is that of a peer."""
+    """Tell whether a number belongs to a peer."""
     return any(peer in part.lower() for part in key for peer in PEERS if "imgcal" not in part.lower())
 
 
 def cells_of(result: Mapping[str, Any]) -> Cells:
-    """Find all medians and sizes of a result."""
+    """Collect all medians and sizes of a result."""
     ms, megabytes = {}, {}
     for key, value in _leaves(result, ()):
         if key[-1] in MEDIANS:
@@ -97,9 +97,9 @@ def _label(row: Any, number: int) -> str:
 
 
 def compare(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping[str, Any]]) -> list[Change]:
-    """Compare results of the same benchmarks, by name: what has become of each cell of imgcal, the worst first.
+    """Compare results of the same benchmarks, by name; return the change of each cell of imgcal, the worst first.
 
-    Cells that only one of the peers' runs has (a peer that is not installed) make no ratio.
+    Peers' cells that are in only one of the runs (if a peer is not installed) are not used.
     """
     old, new = ({name: cells_of(result) for name, result in results.items()} for results in (before, after))
     slower = {
@@ -126,7 +126,7 @@ def compare(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
 
 
 def _table(key: Key) -> Key:
-    """What stands beside each other: figures of one row of a table, or of rows of one list."""
+    """Key of the group that a cell is compared in: a row of a table, or the rows of a list."""
     names = [
         number for number, part in enumerate(key) if part in ("methods", "rows", "time", "rig", "finders", "start-up")
     ]
@@ -140,13 +140,13 @@ def _ratio(after: float, before: float) -> float:
 
 
 def _typical(ratios: Sequence[float]) -> float:
-    """Geometric mean, 1 of none."""
+    """Geometric mean; 1 for no values."""
     known = [math.log(ratio) for ratio in ratios if 0 < ratio < math.inf]
     return math.exp(sum(known) / len(known)) if known else 1.0
 
 
 def table(changes: Sequence[Change], limit: float) -> str:
-    """Table of the cells that fail, and of the ten that have grown most."""
+    """Make a table of the cells that fail, and of the ten with the largest growth."""
     shown = [change for number, change in enumerate(changes) if number < 10 or change.growth > limit]
     rows = [
         (change.benchmark, change.cell, f"{change.before:.4g}", _figure(change.after), _grown(change.growth, limit))
@@ -168,7 +168,7 @@ def results_in(folder: Path, names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Read results of benchmarks.
 
     Raises:
-        InputError: one is not there.
+        InputError: one is missing.
     """
     for name in names:
         if not (folder / f"{name}.json").is_file():
@@ -177,7 +177,7 @@ def results_in(folder: Path, names: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def report(measured: Path, names: Sequence[str], committed: Path = COMMITTED, limit: float = LIMIT) -> int:
-    """Print what has become of the cells; return the number of those that fail."""
+    """Print the changes of the cells; return the number of those that fail."""
     changes = compare(results_in(committed, names), results_in(measured, names))
     failed = sum(change.growth > limit for change in changes)
     print(table(changes, limit))
@@ -187,12 +187,12 @@ def report(measured: Path, names: Sequence[str], committed: Path = COMMITTED, li
 
 @dataclass(frozen=True)
 class Options:
-    """Compare results of benchmarks with the committed ones; fail where imgcal has lost against its peers."""
+    """Compare results of benchmarks with the committed ones; fail if imgcal is slower relative to its peers."""
 
     measured: Annotated[Path, tyro.conf.Positional]
     """Folder of the results of a run: NAME.json."""
     names: tuple[str, ...] = ()
-    """Benchmarks to compare; all that lie in both folders if none is named."""
+    """Benchmarks to compare; default: all that are in both folders."""
     committed: Path = COMMITTED
     """Folder of the results to compare with."""
     limit: float = LIMIT
@@ -200,7 +200,7 @@ class Options:
 
 
 def main() -> int:
-    """Compare as the command line says.
+    """Compare results according to the command line.
 
     Raises:
         InputError: there is nothing to compare.
@@ -209,7 +209,7 @@ def main() -> int:
     suite = [path.stem for path in sorted(options.measured.glob("*.json"))]
     names = options.names or [name for name in suite if (options.committed / f"{name}.json").is_file()]
     if not names:
-        raise InputError(f"{options.measured}: found no result of a benchmark that {options.committed} has, too")
+        raise InputError(f"{options.measured}: found no result of a benchmark that is also in {options.committed}")
     return report(options.measured, names, options.committed, options.limit)
 
 

@@ -1,4 +1,4 @@
-"""How long does the first `imgcal calibrate` on a machine compile? What `scripts/demo` runs, from an empty cache.
+"""How long does the first `imgcal calibrate` on a machine compile? Runs that of `scripts/demo` with an empty cache.
 
 Run as `python -m scripts.benchmarks.compilation`.
 """
@@ -31,17 +31,17 @@ def calibrate(helped: bool) -> dict[str, Any]:
     """Calibrate the sample in this process, with its NUMBA_CACHE_DIR.
 
     Returns:
-        Functions compiled here, CPU seconds of that in all and by module, those of all, of the helper, and seconds.
+        Functions compiled here, CPU seconds for that (total and by module), of everything, of the helper; seconds.
     """
     from numba.core import event
 
-    compiling.is_useful = lambda: helped  # however busy the machine is
+    compiling.is_useful = lambda: helped  # regardless of the machine's load
     times: list[list[float]] = []
     count = 0
     by_module: dict[str, float] = {}
 
     class Clock(event.Listener):
-        """CPU time of each compilation, without those that it waits for."""
+        """CPU time of each compilation, without nested ones."""
 
         def on_start(self, happening: event.Event) -> None:
             nonlocal count
@@ -74,7 +74,7 @@ def calibrate(helped: bool) -> dict[str, Any]:
 
 
 def measure() -> dict[str, Any]:
-    """Calibrate alone and helped, each from an empty cache, and once more from the full one; processes of their own."""
+    """Calibrate alone and with the helper, in new processes, each with an empty cache and again with the full one."""
     rows = {}
     for name, helped in WAYS.items():
         with tempfile.TemporaryDirectory() as cache:
@@ -94,7 +94,7 @@ def _in_a_process(helped: bool, cache: str) -> dict[str, Any]:
 
 
 def table(result: Mapping[str, Any]) -> str:
-    """Markdown."""
+    """Make the table, as Markdown."""
     head = ["", "functions compiled", "compiling, CPU s", "command, CPU s", "helper, CPU s", "command, s"]
     keys = ("compiling_cpu_s", "cpu_s", "helper_cpu_s", "seconds")
     rows = [[name, str(row["functions"]), *(f"{row[key]:.1f}" for key in keys)] for name, row in result["rows"].items()]
@@ -109,7 +109,7 @@ class Options:
 
 
 def main() -> None:
-    """Measure, write, print."""
+    """Measure, write and print."""
     options = tyro.cli(Options, description=__doc__)
     before = surroundings()
     write_json(options.out, before | measure())

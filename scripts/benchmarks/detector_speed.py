@@ -1,9 +1,9 @@
-"""How long do the detectors `matched` and `learned` take for one snapshot of ten cameras, and with what?
+"""How long do the detectors `matched` and `learned` take for one snapshot of ten cameras, by stage?
 
-Run as `python -m scripts.benchmarks.detector_speed [--threads 1 2]`: full frames (O10, asymmetric8) with a pose that is
-a degree off, as `imgcal calibrate` has them: blobs, the detector, identity. CPU time is that of all threads together,
-which other processes disturb least. Two threads are worth something on idle cores only: elsewhere torch's wait for each
-other, and that takes CPU time, too.
+Run as `python -m scripts.benchmarks.detector_speed [--threads 1 2]`: full frames (O10, asymmetric8) and a pose with an
+error of a degree, as in `imgcal calibrate`: blobs, the detector, data association. CPU time is the sum over all
+threads; other processes affect it least. Two threads help only on idle cores: elsewhere torch's threads wait for each
+other, which takes CPU time too.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from scripts.results.infrared import NEARLY, Case, cases
 
 RESULT = ROOT / "docs" / "benchmarks" / "detector_speed.json"
 PAGE = ROOT / "docs" / "benchmarks" / "tables.md"
-ERROR = 0.3  # px, as calibrate takes it
+ERROR = 0.3  # px, as in `calibrate`
 BLOBS, REST, IDENTITY = "blobs", "rest", "identity"
 STAGES: Mapping[str, tuple[tuple[Any, str], ...]] = {
     "maps": (
@@ -49,32 +49,32 @@ STAGES: Mapping[str, tuple[tuple[Any, str], ...]] = {
     "marker fits": ((refinement, "_measured"), (learned_proposer._View, "_fitted")),
     "rig fits": ((refinement, "_fit"), (learned_proposer._View, "fit")),
 }
-"""What is timed as which stage, by who has it; none of them is called within another."""
+"""Functions that are timed, by stage and owner; none of them calls another."""
 COLUMNS = (BLOBS, *STAGES, REST, IDENTITY, "all")
-Clocks = dict[str, tuple[float, float]]  # ms of CPU and by the clock, by stage
+Clocks = dict[str, tuple[float, float]]  # ms of CPU time and wall time, by stage
 
 
 @dataclass(frozen=True)
 class Options:
     """Time the detectors."""
 
-    threads: tuple[int, ...] = (1,)  #: cores that may be used: measured one after the other; idle ones, if several
+    threads: tuple[int, ...] = (1,)  #: numbers of cores, measured one after the other; several must be idle
     levels: tuple[str, ...] = ("clean", "combined")  #: of difficulty
-    snapshots: int = 2  #: of each level
+    snapshots: int = 2  #: per level
     rounds: int = 5
     out: Path | None = None  #: a result file; docs/benchmarks/detector_speed.json rewrites its table in the page
-    again: bool = False  #: measure nothing: make the table of the JSON that is there
+    again: bool = False  #: measure nothing: rewrite the table from the existing JSON
 
 
 class Stopwatch:
-    """CPU time and time by the clock of the stages of one snapshot."""
+    """CPU time and wall time of the stages of one snapshot."""
 
     def __init__(self) -> None:
         self.taken: Clocks = {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add what happens within."""
+        """Add the time spent in the `with` block to a stage."""
         cpu, clock = time.process_time(), time.perf_counter()
         yield
         before = self.taken.get(name, (0.0, 0.0))
@@ -82,7 +82,7 @@ class Stopwatch:
         self.taken[name] = before[0] + 1e3 * cpu, before[1] + 1e3 * clock
 
     def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Make a function that is timed."""
+        """Wrap a function so that it is timed."""
 
         def call(*arguments: Any, **options: Any) -> Any:
             with self.stage(name):
@@ -92,7 +92,7 @@ class Stopwatch:
 
 
 def timed(proposer: Proposer, case: Case, seed: int) -> Clocks:
-    """Take the times of one snapshot: blobs, the detector's stages, identity."""
+    """Time one snapshot: blobs, the detector's stages, data association."""
     watch, snapshot = Stopwatch(), case.believed(NEARLY, seed)
     with watch.stage(BLOBS):
         detect_snapshot(dict(snapshot.frames), DetectionOptions())
@@ -100,7 +100,7 @@ def timed(proposer: Proposer, case: Case, seed: int) -> Clocks:
         for name, places in STAGES.items():
             for owner, attribute in places:
                 function = watch.timed(name, getattr(owner, attribute))
-                # A class method is bound already.
+                # A class method is already bound.
                 made = staticmethod(function) if isinstance(vars(owner)[attribute], classmethod) else function
                 stack.enter_context(patch.object(owner, attribute, made))
         with watch.stage("detector"):
@@ -115,7 +115,7 @@ def timed(proposer: Proposer, case: Case, seed: int) -> Clocks:
 
 
 def measure(options: Options) -> dict[str, Any]:
-    """Median CPU time and time by the clock (ms) of every stage, by threads, level and detector."""
+    """Measure median CPU time and wall time (ms) of every stage, by threads, level and detector."""
     keep_memory()
     rig, obj = load_rig("O10"), load_object("asymmetric8")
     shots = {level: list(cases(rig, obj, DIFFICULTIES[level], options.snapshots)) for level in options.levels}
@@ -131,7 +131,7 @@ def measure(options: Options) -> dict[str, Any]:
 
 
 def summary(proposer: Proposer, shots: list[Case], rounds: int) -> dict[str, dict[str, float]]:
-    """Median times of the stages; those of the first round, which compiles, do not count."""
+    """Median times of the stages, without the first round, which compiles."""
     runs = [timed(proposer, case, seed) for _ in range(rounds + 1) for seed, case in enumerate(shots)][len(shots) :]
     medians = {name: np.median([run[name] for run in runs], axis=0) for name in COLUMNS if name in runs[0]}
     return {name: {"cpu_ms": float(cpu), "clock_ms": float(clock)} for name, (cpu, clock) in medians.items()}
@@ -139,7 +139,7 @@ def summary(proposer: Proposer, shots: list[Case], rounds: int) -> dict[str, dic
 
 @contextmanager
 def of_threads(count: int) -> Iterator[None]:
-    """Let this process have so many cores, and torch as many threads."""
+    """Limit this process to `count` cores, and torch to as many threads."""
     threads, cores = torch.get_num_threads(), os.sched_getaffinity(0)
     torch.set_num_threads(count)
     for task in _tasks():
@@ -153,19 +153,19 @@ def of_threads(count: int) -> Iterator[None]:
 
 
 def _tasks() -> list[int]:
-    """The threads of this process: each has cores of its own."""
+    """Threads of this process: each has its own set of cores."""
     return [int(entry.name) for entry in Path("/proc/self/task").iterdir()]
 
 
 def table(result: Mapping[str, Any]) -> str:
-    """Markdown."""
+    """Make the table, as Markdown."""
     rows = [
         [f"{name}, {level}, {threads}", *(_cell(row.get(column)) for column in COLUMNS)]
         for threads, levels in result["by_threads"].items()
         for level, said in levels.items()
         for name, row in said.items()
     ]
-    return markdown(["ms of CPU / by the clock; threads", *COLUMNS], rows)
+    return markdown(["ms CPU / wall; threads", *COLUMNS], rows)
 
 
 def _cell(taken: Mapping[str, float] | None) -> str:
@@ -173,7 +173,7 @@ def _cell(taken: Mapping[str, float] | None) -> str:
 
 
 def main() -> None:
-    """Measure, write, print."""
+    """Measure, write and print."""
     options = tyro.cli(Options, description=__doc__)
     out = RESULT if options.again else options.out
     result = read_json(RESULT) if options.again else surroundings() | measure(options)

@@ -1,4 +1,4 @@
-"""How much a benchmark does."""
+"""How much a benchmark measures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Effort:
-    """A full run, or a smoke run that shows within seconds whether everything works."""
+    """A full run, or a smoke run that checks within seconds that everything works."""
 
     smoke: bool = False
 

@@ -1,4 +1,4 @@
-"""Frames in memory to a calibrated rig, one snapshot after another; how the cost grows with everything."""
+"""From frames in memory to a calibrated rig, snapshot by snapshot, and how the cost grows."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ from scripts.output import markdown
 from scripts.timing import side_by_side, timing_of
 
 RATE, LATER = 60.0, 1e6
-"""Snapshots a second, and when those that are counted begin, s: after all others."""
+"""Snapshots per second, and start time (s) of the endurance run, after all others."""
 OURS, QUICK, EXACT = "imgcal", "OpenCV, 1 threshold", "OpenCV, 10 thresholds"
 SCIPY = f"{EXACT}, then SciPy for the rig"
-RADIUS = (6.0, 24.0)  # px, of markers of 6 mm, generously
-JUDGED = 20  # results of each whose accuracy is measured
-NOISE = 0.05  # px, what SciPy is told of the centres' error
+RADIUS = (6.0, 24.0)  # px, a generous range for markers of 6 mm
+JUDGED = 20  # results per method whose accuracy is measured
+NOISE = 0.05  # px, sigma of the centres that SciPy is given
 
 
 @dataclass(frozen=True)
 class Stream:
-    """An object that moves smoothly, there and back, before a rig that is not what the factory says."""
+    """An object that moves smoothly forth and back in front of a drifted rig."""
 
     factory: CameraRig
     obj: CalibrationObject
@@ -52,13 +52,13 @@ class Stream:
     unseen: Truth  # the same rig, other poses
 
     def order(self) -> Iterator[int]:
-        """Go through the snapshots there and back without end."""
+        """Yield the snapshots forwards and backwards, endlessly."""
         last = max(len(self.frames) - 1, 1)
         return (last - abs(last - s % (2 * last)) for s in count())
 
 
 def measure(effort: Effort) -> dict[str, Any]:
-    """Run the stream through imgcal and its peers; then grow."""
+    """Run the stream through imgcal and its peers, then measure the growth of the cost."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     stream = make_stream(effort.pick(20, 3))
@@ -81,7 +81,7 @@ def measure(effort: Effort) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, str]:
-    """Frames to a rig beside the peers, endurance, growth."""
+    """Make the tables: from frames to a rig compared with peers, endurance, growth."""
     rows = [
         (
             f"**{name}**" if name == OURS else name,
@@ -114,7 +114,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
 
 
 def make_stream(snapshots: int) -> Stream:
-    """Render ten frames of 2048 x 1088 a snapshot: markers of 6 mm, reflections, false blobs, noise, 8 bit."""
+    """Render ten frames of 2048 x 1088 per snapshot: markers of 6 mm, reflections, false blobs, noise, 8 bit."""
     rig, obj, generator = read_rig("O10"), load_object("asymmetric8"), torch.Generator().manual_seed(2)
     start = simulate_truth(rig, obj, 1 + JUDGED, generator, PhysicalDrift())
     pose, times = start.rig_from_object[0], torch.arange(snapshots, dtype=torch.float64)[:, None]
@@ -129,15 +129,15 @@ def make_stream(snapshots: int) -> Stream:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a snapshot gave; None = refused."""
+    """Result of a snapshot; None = refused."""
 
     rig: CameraRig | None
-    rms: float = 0.0  # px, RMS length of the residuals that it was made from
+    rms: float = 0.0  # px, RMS length of its own residuals
 
 
 @dataclass(frozen=True)
 class Ours:
-    """imgcal in the running state."""
+    """imgcal in steady state."""
 
     stream: Stream
     keeper: RigKeeper
@@ -151,7 +151,7 @@ class Ours:
 
 
 class Classical:
-    """The peers in the running state, which are told the labels of the first snapshot."""
+    """The peers in steady state; they are given the labels of the first snapshot."""
 
     def __init__(self, stream: Stream, pool: ThreadPoolExecutor, thresholds: int, joint: bool) -> None:
         self.stream, self.pool, self.joint = stream, pool, joint
@@ -175,7 +175,7 @@ class Classical:
         return Outcome(_rig(opencv_live.answer(self.views), self.stream.factory), rms)
 
     def _task(self, seen: Sequence[tuple[NDArray[np.int64], NDArray[np.float64]]]) -> RigTask:
-        """State the rig's MAP problem; the start pose is that of the first camera."""
+        """Formulate the rig's MAP problem, with the first camera's pose as the start."""
         rig, first = self.stream.factory, self.views[0]
         prior = rig.prior
         assert prior is not None
@@ -203,7 +203,7 @@ class Classical:
 
 
 def _first_view(stream: Stream, camera: int) -> opencv_live.View:
-    """Factory intrinsics, and the pose that explains the first snapshot with them."""
+    """Factory intrinsics, and the pose that fits the first snapshot with them."""
     rig, points = stream.factory, stream.obj.points.numpy()
     matrix = np.diag([*rig.focal_length[camera].tolist(), 1.0])
     matrix[:2, 2] = rig.principal_point[camera].numpy()
@@ -228,7 +228,7 @@ def _rig(answer: RigAnswer, like: CameraRig) -> CameraRig:
 
 
 def misfit(rig: CameraRig, obj: CalibrationObject, uv: Tensor, seen: NDArray[np.bool_] | None = None) -> float:
-    """RE (px) on image points (S, C, N, 2): the rig is held, only the object's poses are fitted."""
+    """RE (px) on image points (S, C, N, 2) with a fixed rig; only the object's poses are fitted."""
     shown = torch.ones(uv.shape[:-1], dtype=torch.bool) if seen is None else torch.from_numpy(seen)
     observations = Observations(uv, torch.full_like(uv[..., 0], NOISE), shown)
     held = torch.zeros(rig.num_cameras, 15, dtype=uv.dtype)
@@ -238,7 +238,7 @@ def misfit(rig: CameraRig, obj: CalibrationObject, uv: Tensor, seen: NDArray[np.
 def _compared(
     stream: Stream, methods: Mapping[str, Callable[[int], Outcome]], seconds: float, judged: int
 ) -> dict[str, Any]:
-    """Judge some results of each method, then time all of them side by side."""
+    """Score some results of each method, then time all methods in turn."""
     rows: dict[str, Any] = {}
     orders = {name: stream.order() for name in methods}
     for name, update in methods.items():
@@ -257,7 +257,7 @@ def _compared(
 
 
 def _endurance(stream: Stream, keeper: RigKeeper, snapshots: int, every: int) -> dict[str, Any]:
-    """Run many snapshots in a row, and look at the memory now and then."""
+    """Run many snapshots in a row, and record the memory from time to time."""
     order, seconds, memory, refused = stream.order(), [], [_resident()], 0
     for number in range(snapshots):
         frames = stream.frames[next(order)]
@@ -277,6 +277,6 @@ def _endurance(stream: Stream, keeper: RigKeeper, snapshots: int, every: int) ->
 
 
 def _resident() -> float | None:
-    """Resident memory of this process, MB; None where the system does not say."""
+    """Resident memory of this process, MB; None if the system does not report it."""
     path = Path("/proc/self/statm")
     return int(path.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6 if path.is_file() else None

@@ -1,4 +1,4 @@
-"""How the cost of a calibration grows with cameras, fiducials, snapshots and the size of the images."""
+"""How the cost of a calibration grows with cameras, fiducials, snapshots and image size."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ AXES = {
 
 @dataclass(frozen=True)
 class Scene:
-    """What a drifted rig sees."""
+    """A drifted rig and its observations of an object."""
 
     rig: CameraRig  # factory
     obj: CalibrationObject
@@ -61,7 +61,7 @@ class Scene:
 
 
 def measure(effort: Effort) -> dict[str, Any]:
-    """Measure all five; every point takes about the same time."""
+    """Measure all five axes; every point takes about the same time."""
     seconds = effort.pick(1.0, 0.02)
     o10, few = read_rig("O10"), load_object("asymmetric8")
     cameras = effort.pick((2, 4, 8, 16, 32, 64, 128, 256, 512, 1024), (2, 4))
@@ -81,7 +81,7 @@ def measure(effort: Effort) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, str]:
-    """One table a quantity: ms, and by what power the time grows."""
+    """Make one table per axis: times in ms, and the exponent of their growth."""
     made = {}
     for axis, stages in AXES.items():
         rows = [(str(row.get("size", row["n"])), *(_ms(row.get(stage)) for stage in stages)) for row in result[axis]]
@@ -107,21 +107,21 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
 
 
 def cloud(fiducials: int) -> CalibrationObject:
-    """Put fiducials anywhere in a cube."""
+    """Place fiducials at random in a cube."""
     generator = torch.Generator().manual_seed(fiducials)
     points = (torch.rand(fiducials, 3, generator=generator, dtype=torch.float64) - 0.5) * WIDTH
     return CalibrationObject(points, torch.rand(fiducials, 3, generator=generator, dtype=torch.float64))
 
 
 def lattice(rows: int, columns: int) -> CalibrationObject:
-    """Put fiducials on a plane, in a square lattice."""
+    """Place fiducials in a plane, in a square lattice."""
     places = torch.cartesian_prod(torch.arange(rows), torch.arange(columns), torch.zeros(1, dtype=torch.int64)).double()
     points = (places - places.mean(0)) * (WIDTH / (max(rows, columns) - 1))
     return CalibrationObject(points, torch.ones_like(points))
 
 
 def make_scene(rig: CameraRig, obj: CalibrationObject, snapshots: int = 1) -> Scene:
-    """Disturb the rig and let it see the object; centres have noise."""
+    """Let the rig drift, and simulate noisy observations of the object."""
     truth = simulate_truth(rig, obj, snapshots, torch.Generator().manual_seed(0), DRIFT)
     found = true_detections(truth)
     noise = NOISE * np.random.default_rng(0).standard_normal(found.uv.shape)
@@ -129,7 +129,7 @@ def make_scene(rig: CameraRig, obj: CalibrationObject, snapshots: int = 1) -> Sc
 
 
 def of_one_snapshot(scene: Scene, seconds: float, stages: Sequence[str] = AXES["cameras"]) -> dict[str, float]:
-    """Time stages after detection, and the same by OpenCV: medians, ms."""
+    """Time the stages after detection, and the same with OpenCV: medians, ms."""
     rig, obj, pose = scene.rig, scene.obj, scene.truth.rig_from_object[0]
     std = (rig.prior or RigPrior()).std(rig)
     blank = replace(scene.detections, fiducial=np.full(len(scene.detections), -1))
@@ -157,7 +157,7 @@ def cameras_by_opencv(scene: Scene) -> None:
 
 
 def view_of(scene: Scene, camera: int) -> opencv_live.View:
-    """The factory camera, and where it is as the factory says."""
+    """A camera's factory intrinsics and pose."""
     rig = scene.rig
     matrix = np.diag([*rig.focal_length[camera].tolist(), 1.0])
     matrix[:2, 2] = rig.principal_point[camera].numpy()
@@ -167,7 +167,7 @@ def view_of(scene: Scene, camera: int) -> opencv_live.View:
 
 
 def of_snapshots(scene: Scene, seconds: float) -> dict[str, float]:
-    """Time `calibrate` by stage, and OpenCV: ms, once where it takes long."""
+    """Time the stages of `calibrate`, and OpenCV, in ms; slow ones only once."""
     blank = replace(scene.detections, fiducial=np.full(len(scene.detections), -1))
     runs: list[Mapping[str, float]] = []
     begin = time.perf_counter()
@@ -178,12 +178,12 @@ def of_snapshots(scene: Scene, seconds: float) -> dict[str, float]:
 
 
 def _views_by_opencv(scene: Scene) -> float:
-    """Calibrate the first camera from all snapshots, its lens too where there are enough; seconds."""
+    """Calibrate the first camera from all snapshots, with its lens if there are enough; seconds."""
     count, points = len(scene.truth.uv), scene.obj.points.numpy().astype(np.float32)
     start = view_of(scene, 0)
     flags = opencv_live.FLAGS if count < 3 else cv2.CALIB_USE_INTRINSIC_GUESS
     uv = [one.numpy().astype(np.float32) for one in scene.truth.uv[:, 0]]
-    run: Any = cv2.calibrateCamera  # its stubs know half of what it takes
+    run: Any = cv2.calibrateCamera  # its stubs lack half of its arguments
     begin = time.perf_counter()
     run([points] * count, uv, _size(scene.rig), start.matrix.copy(), start.distortion.copy(), flags=flags)
     return time.perf_counter() - begin
@@ -210,7 +210,7 @@ def of_frames(width: int, height: int, seconds: float) -> dict[str, float]:
 
 
 def wide(rig: CameraRig, width: int, height: int) -> CameraRig:
-    """Give all cameras images of another size, with the same angle of view across."""
+    """Give all cameras images of another size, with the same horizontal field of view."""
     old = rig.image_size.to(rig.focal_length)
     size = torch.tensor([width, height])
     scale = (width / old[:, :1]).expand(-1, 2)
@@ -225,7 +225,7 @@ def wide(rig: CameraRig, width: int, height: int) -> CameraRig:
 
 
 def _frames(scene: Scene) -> dict[str, NDArray[Any]]:
-    """Render camera by camera: large images of all at once would take gigabytes."""
+    """Render camera by camera; large images of all cameras at once would take gigabytes."""
     generator = torch.Generator().manual_seed(1)
     frames: dict[str, NDArray[Any]] = {}
     model = FrameModel(clutter=replace(ClutterModel(), occluded=0.0))
@@ -244,7 +244,7 @@ def _ms(value: float | None) -> str:
 
 
 def _power(rows: list[dict[str, Any]], stage: str) -> str:
-    """Slope of the upper half of a curve, log over log."""
+    """Slope of the upper half of a curve in log-log scale."""
     points = np.log([(row["n"], row[stage]) for row in rows if row.get(stage) is not None])
     upper = points[len(points) // 2 :] if len(points) > 3 else points
     return f"{np.polyfit(upper[:, 0], upper[:, 1], 1)[0]:.2f}" if len(upper) > 1 else ""

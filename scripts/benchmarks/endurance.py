@@ -2,9 +2,9 @@
 
 Usage: python -m scripts.benchmarks.endurance [--hours 24] [--rate 1] [--steady 20000] [--seconds S] [--out FILE]
 
-Two parts, of blobs of a simulated rig: a day in which the process is killed (SIGKILL) every few simulated minutes and
-goes on from its files, and one process that is left alone, for its memory and its latency. Both have the same mishaps.
-With --seconds each part ends after so long, however far it is; how far is in the result.
+Two parts, both with blobs of a simulated rig and the same faults: a day in which the process is killed (SIGKILL) every
+few simulated minutes and resumes from its files; and one undisturbed process, to measure its memory and latency. With
+--seconds each part ends after that time; the result says how far it came.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import numpy as np
 import torch
 
 from imgcal.estimation import EstimationOptions, estimate
-from imgcal.online import RigKeeper  # imported here, for all that are forked
+from imgcal.online import RigKeeper  # imported before processes are forked
 from imgcal.types import Observations
 from imgcal.watch import STATE, SourceReader, Timing, Watch
 from scripts.benchmarks.endurance_world import EPOCH, SLOWED, Replay, World
@@ -37,12 +37,12 @@ from scripts.output import ROOT, fill, surroundings, write_json
 
 RESULT, PAGE = ROOT / "docs" / "benchmarks" / "endurance.json", ROOT / "docs" / "watch.md"
 RECORDED_EVERY = 20  # snapshots
-WARMING = 300  # snapshots before anything is measured
-ALLOWED_PX = 0.5  # of a camera that is said to be ok, in the image, where the object is
+WARMING = 300  # snapshots before measurements begin
+ALLOWED_PX = 0.5  # error in the image, at the object, of a camera that is reported as ok
 
 
 def live(world: World, folder: Path, first: int, last: int, place: mmap.mmap) -> None:
-    """Watch from a snapshot on, as `imgcal watch` does, and write down how it goes."""
+    """Watch from a snapshot on, as `imgcal watch` does, and log each step."""
     path = folder / STATE
     keeper = RigKeeper.restore(path) if path.is_file() else RigKeeper(world.factory, world.obj)
     intake = SourceReader(Replay(world, first, last, place), world.factory, Timing())
@@ -82,12 +82,12 @@ def live(world: World, folder: Path, first: int, last: int, place: mmap.mmap) ->
 
 
 def _resident() -> int:
-    """Memory of this process in bytes."""
+    """Resident memory of this process in bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE
 
 
 def forked(world: World, folder: Path, first: int, last: int, kill_at: int | None, ends: float) -> int:
-    """Watch in a process of its own, killed at a snapshot or a moment; returns the snapshot that it came to."""
+    """Watch in a forked process that is killed at a snapshot or a time; return the last snapshot that it reached."""
     place = mmap.mmap(-1, 8)
     place[:8] = struct.pack("q", first)
     process = os.fork()
@@ -115,9 +115,9 @@ def forked(world: World, folder: Path, first: int, last: int, kill_at: int | Non
 
 
 def warm_up(world: World, folder: Path) -> None:
-    """Watch a little in this process: those that are forked have what is compiled, and do not read it at each start."""
+    """Watch briefly in this process, so that forked processes inherit the compiled code instead of loading it."""
     live(world, folder, 0, min(WARMING, world.snapshots), mmap.mmap(-1, 8))
-    live(world, folder, 0, 1, mmap.mmap(-1, 8))  # from its file
+    live(world, folder, 0, 1, mmap.mmap(-1, 8))  # resume from its file
 
 
 def records(folder: Path) -> list[dict[str, Any]]:
@@ -131,7 +131,7 @@ def records(folder: Path) -> list[dict[str, Any]]:
 
 
 def errors(world: World, step: Any, number: int) -> np.ndarray:
-    """RMS error (px) of each camera where the object is, its pose fitted to the rig that was told: (C,)."""
+    """RMS error (px) of each camera at the object, whose pose is fitted to the reported rig: (C,)."""
     rig, found = world.rig(number), world.factory.retract(torch.tensor(step, dtype=torch.float64))
     pose = world.stream.pose_at(number / world.rate / SLOWED)
     seen = rig.expand(1).project(pose.apply(world.obj.points), world.obj.radius)
@@ -168,7 +168,7 @@ def killed_day(world: World, folder: Path, minutes: float, seconds: float) -> di
                     worst = max(worst, float(fits[camera]))
     last: dict[int, dict[str, Any]] = {}
     longest = run = 0
-    for entry in found:  # records with the object there that taught nothing since the one before
+    for entry in found:  # with the object in view, but nothing learned since the previous record
         before = last.get(entry["pid"])
         last[entry["pid"]] = entry
         idle = before is not None and entry["learnt"] == before["learnt"]
@@ -202,12 +202,12 @@ def _is_of(event: dict[str, Any], bump: Bump, world: World) -> bool:
     from datetime import datetime
 
     since = (datetime.fromisoformat(event["since"]).timestamp() - EPOCH) * world.rate
-    near = bump.snapshot - 5 <= since <= bump.snapshot + 1800 * world.rate  # the camera or the object may be out
+    near = bump.snapshot - 5 <= since <= bump.snapshot + 1800 * world.rate  # the camera or the object may be away
     return near and event["camera"] == world.factory.camera_names[bump.camera]
 
 
 def steady_life(world: World, folder: Path, seconds: float) -> dict[str, Any]:
-    """Part two: one process, its memory and its time."""
+    """Part two: memory and latency of one process."""
     started = time.perf_counter()
     forked(world, folder, 0, world.snapshots, None, started + seconds)
     found = records(folder)
@@ -224,26 +224,26 @@ def steady_life(world: World, folder: Path, seconds: float) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """The page's table."""
+    """Make the table of the page."""
     day, steady = result["killed_day"], result["steady"]
     rows = [
         ("simulated", f"{day['simulated_hours']:.3g} h at {day['snapshots_per_second']:g} snapshots/s"),
-        ("killed and started again", f"{day['kills']} times"),
+        ("killed and restarted", f"{day['kills']} times"),
         ("snapshots, with the object, learnt from",
          f"{day['snapshots']:,}, {day['with_object']:,}, {day['learnt']:,}"),
-        ("exposures late, twice, of a clock astray, unreadable",
+        ("exposures late, duplicated, with a wrong clock, unreadable",
          f"{day['late']:,}, {day['duplicate']:,}, {day['astray']:,}, {day['unreadable']:,}"),
-        ("bumps of 0.3 degrees, told with the right camera", f"{day['bumps']}, {day['bumps_told']}"),
-        ("moves told of cameras that stood still", f"{day['moved_events_of_nothing']}"),
-        ("dirty or defocused cameras told, and slipped clocks, of which there are none",
+        ("bumps of 0.3 degrees, reported with the right camera", f"{day['bumps']}, {day['bumps_told']}"),
+        ("moves reported of steady cameras", f"{day['moved_events_of_nothing']}"),
+        ("false reports of dirty or defocused cameras, and of clock slips",
          f"{day['image_events_of_nothing']}, {day['clock_slips_of_nothing']}"),
-        ("cameras said to be ok, and more than 0.5 px wrong",
+        ("cameras reported as ok, with errors above 0.5 px",
          f"{day['wrong_while_ok']} of {day['cameras_checked_while_ok']:,}"),
-        ("error of cameras said to be ok, median, 99 %",
+        ("error of cameras reported as ok, median, 99 %",
          f"{day['error_px_median']:.3f} px, {day['error_px_p99']:.3f} px"),
         ("longest time without learning while the object was there", f"{day['longest_without_learning']} snapshots"),
-        ("one process, left alone", f"{steady['snapshots']:,} snapshots"),
-        ("its memory, last tenth against the second", f"{100 * steady['resident_growth']:+.2f} %"),
+        ("one undisturbed process", f"{steady['snapshots']:,} snapshots"),
+        ("its memory, last tenth relative to the second", f"{100 * steady['resident_growth']:+.2f} %"),
         ("its update (CPU), 99 %, second tenth and last",
          f"{steady['update_cpu_ms_p99_by_tenth'][1]:.1f} ms, {steady['update_cpu_ms_p99_by_tenth'][-1]:.1f} ms"),
     ]  # fmt: skip
@@ -253,11 +253,11 @@ def table(result: dict[str, Any]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--hours", type=float, default=24.0)
-    parser.add_argument("--rate", type=float, default=1.0, help="snapshots a (simulated) second")
-    parser.add_argument("--minutes", type=float, default=5.0, help="simulated, between two kills")
+    parser.add_argument("--rate", type=float, default=1.0, help="snapshots per simulated second")
+    parser.add_argument("--minutes", type=float, default=5.0, help="simulated minutes between kills")
     parser.add_argument("--bumps", type=int, default=12)
-    parser.add_argument("--steady", type=int, default=20_000, help="snapshots of the process that is left alone")
-    parser.add_argument("--seconds", type=float, default=math.inf, help="for each of the two parts, at most")
+    parser.add_argument("--steady", type=int, default=20_000, help="snapshots of the undisturbed process")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="time limit of each part")
     parser.add_argument("--out", type=Path, default=RESULT)
     given = parser.parse_args()
     words = " ".join(f"--{name} {value:g}" for name, value in vars(given).items() if name != "out")

@@ -1,4 +1,4 @@
-"""What the cameras of a day of endurance see at any moment, and the mishaps on the way: `World`, and it as a source."""
+"""`World`: views and faults of the cameras at every moment of a day of endurance; and a source that replays it."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from imgcal.watch import CameraBlobs, Exposure, Item, Unreadable
 from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
 
 EPOCH = 1.7e9  # s
-SLOWED = 60.0  # the object moves from snapshot to snapshot as at 60 a second
+SLOWED = 60.0  # the object moves between snapshots as if there were 60 per second
 NOISE = 0.1  # px
 LATE, TWICE, GARBAGE, WRONG_TIME = 0.01, 0.005, 0.005, 0.002  # shares of exposures
 BUMP_DEG = 0.3
-TELLING = 120  # snapshots that a bump is given to be told
-SEEN = 60  # snapshots of the object that a bumped camera has given before it is to be known
+TELLING = 120  # snapshots within which a bump must be reported
+SEEN = 60  # views of the object by a bumped camera before it must be known
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Snapshots during which something is the case."""
+    """An interval of snapshots."""
 
     first: int
     last: int  # excluded
@@ -38,7 +38,7 @@ class Stretch:
 
 
 class World:
-    """What the cameras see at any moment: the same after every restart."""
+    """Views of the cameras at any moment, reproducible after every restart."""
 
     def __init__(self, snapshots: int, rate: float, bumps: int, seed: int = 0) -> None:
         self.rate, self.snapshots = rate, snapshots
@@ -59,7 +59,7 @@ class World:
         self.out = [_stretches(draw, snapshots, 1200 * rate, 60 * rate) for _ in self.factory.camera_names]
 
     def until(self, snapshots: int) -> World:
-        """The same, not as long; bumps shortly before its end could not be told any more, and are none of it."""
+        """Shorten the world; bumps so close to its end that they could not be reported are dropped."""
         shorter = copy.copy(self)
         shorter.snapshots = snapshots
         told_by = snapshots - TELLING if snapshots < self.snapshots else snapshots
@@ -70,7 +70,7 @@ class World:
         return self._rigs[sum(bump.snapshot <= number for bump in self.all_bumps)]
 
     def has_shown(self, number: int, camera: int) -> bool:
-        """Tell whether a camera has seen enough since its last bump for that to be known."""
+        """Tell whether a camera has seen enough since its last bump to reveal it."""
         last = max((b.snapshot for b in self.all_bumps if b.camera == camera and b.snapshot <= number), default=None)
         if last is None:
             return True
@@ -81,7 +81,7 @@ class World:
         return any(stretch.holds(number) for stretch in self.absent)
 
     def exposures(self, number: int) -> list[tuple[int, Item]]:
-        """What is sent, each with the snapshot with which it comes."""
+        """Items sent for a snapshot, each with the snapshot with which it arrives."""
         noise, rig = np.random.default_rng([7, number]), self.rig(number)
         pose = self.stream.pose_at(number / self.rate / SLOWED)
         image = rig.expand(1).project_values(pose.apply(self.obj.points), self.obj.radius)
@@ -109,7 +109,7 @@ class World:
 
 
 def _stretches(draw: random.Random, snapshots: int, between: float, length: float) -> list[Stretch]:
-    """Stretches of random lengths, with random pauses."""
+    """Draw intervals of random length, with random pauses."""
     found, at = [], draw.expovariate(1 / between)
     while at < snapshots:
         last = at + max(draw.expovariate(1 / length), 1)
@@ -119,7 +119,7 @@ def _stretches(draw: random.Random, snapshots: int, between: float, length: floa
 
 
 def _garbage(noise: np.random.Generator, name: str, time: float) -> Item:
-    """What is no exposure of this rig, or one that shows nothing but noise."""
+    """Make an item that is not an exposure of this rig, or one that shows only noise."""
     kind = int(noise.integers(5))
     if kind == 0:
         return Unreadable("junk", name)
@@ -133,7 +133,7 @@ def _garbage(noise: np.random.Generator, name: str, time: float) -> Item:
 
 
 class Replay:
-    """The world as a source, from a snapshot on; tells how far it is where a killed process leaves it."""
+    """The world as a source, from a snapshot on; records its progress where it survives a killed process."""
 
     live = False
 

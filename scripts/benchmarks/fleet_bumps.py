@@ -1,9 +1,9 @@
-"""Which bumps does a fleet find? Recall against how many standard deviations of what can be seen a bump is.
+"""Which bumps does a fleet find? Recall over the size of a bump in standard deviations of its observable part.
 
-A bump b of a camera shifts what its images say by M b, M being the precision of what is seen: the drift's spread and
-the noise together. b is sqrt(b' M b) standard deviations: the most that any statistic can make of it. Who knew camera,
-kind and direction, and asked for five standard deviations, would find it with the probability of the Neyman-Pearson
-test. Run as `python -m scripts.benchmarks.fleet_bumps`: two minutes.
+A bump b of a camera shifts the estimate from its images by M b, where M is the precision of the observed drift, from
+its spread and the noise together. The size of b is sqrt(b' M b) standard deviations, the most that any statistic can
+reach. A test that knew camera, kind and direction, with a threshold of five standard deviations, would find it with the
+probability of the Neyman-Pearson test. Run as `python -m scripts.benchmarks.fleet_bumps`: two minutes.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ from scripts.benchmarks.fleet_prior import NOISE, SNAPSHOTS, TRUE, recalibrated,
 from scripts.output import ROOT, command, fill, markdown, read_json, surroundings, write_json
 
 RESULT, PAGE = ROOT / "docs" / "benchmarks" / "fleet_bumps.json", ROOT / "docs" / "fleet.md"
-SIZES = (4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 12.0, 15.0)  # standard deviations of what can be seen
+SIZES = (4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 12.0, 15.0)  # observable standard deviations
 SPREADS = (6.0, 8.0, 10.0, 15.0, 30.0)  # of rotation, as in `fleet_prior`
 THRESHOLD = 5.0
-PARTS = [range(PARAMETERS)[part] for part in PARAMETER_KINDS.values()]  # of a camera's parameters, by kind of value
+PARTS = [range(PARAMETERS)[part] for part in PARAMETER_KINDS.values()]  # indices of a camera's parameters, by kind
 
 
 @dataclass(frozen=True)
 class Options:
-    """Bump cameras of simulated devices, and look who is named."""
+    """Bump cameras of simulated devices, and count which are found."""
 
-    devices: int = 200  #: that are recalibrated, for what their images say
-    draws: int = 500  #: bumps of each size
+    devices: int = 200  #: devices that are recalibrated, for their information
+    draws: int = 500  #: bumps per size
     steady: int = 20_000  #: devices without a bump
     rig: str = "T4"
     seed: int = 0
     out: Path = RESULT
     page: Path = PAGE
-    again: bool = False  #: measure nothing: make the tables of the JSON that is there
+    again: bool = False  #: measure nothing: rewrite the tables from the existing JSON
 
 
 def seen(drift: DriftInformation, offset: Tensor, generator: torch.Generator) -> DriftInformation:
-    """What the images of devices (D) say of offsets (D, P): the information as it is, a score with its noise."""
+    """Information of devices (D) with offsets (D, P): the same information matrices, and noisy scores."""
     values, vectors = torch.linalg.eigh(drift.information)
     noise = torch.randn(offset.shape, generator=generator, dtype=torch.float64)
     root = vectors * values.clamp_min(0).sqrt()[:, None, :]
@@ -55,7 +55,7 @@ def seen(drift: DriftInformation, offset: Tensor, generator: torch.Generator) ->
 
 
 def visible_sigmas(drift: DriftInformation, bump: Tensor, variance: Tensor) -> Tensor:
-    """Standard deviations (D) that bumps (D, P) are, of what can be seen: the drift's variance (P) and the noise."""
+    """Sizes (D) of bumps (D, P) in standard deviations of drift (with variance P) and noise together."""
     std = variance.sqrt()
     inner = std[:, None] * drift.information * std + torch.eye(len(std), dtype=torch.float64)
     scaled = bump / std
@@ -64,13 +64,13 @@ def visible_sigmas(drift: DriftInformation, bump: Tensor, variance: Tensor) -> T
 
 
 def bound(sigmas: Tensor, threshold: float = THRESHOLD) -> Any:
-    """Probability that the most powerful test at a threshold (two sides) finds a bump of so many sigmas."""
+    """Probability that the most powerful two-sided test at a threshold finds a bump of this many sigmas."""
     found = sigmas.numpy()
     return stats.norm.sf(threshold - found) + stats.norm.cdf(-threshold - found)
 
 
 def direction(count: int, cameras: int, kind: int | None, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Cameras (count), and random directions (count, P) within a kind of value of each, in true spreads."""
+    """Draw cameras (count), and for each a random direction (count, P) within a kind of value, in true spreads."""
     camera = torch.randint(cameras, (count,), generator=generator)
     kinds = torch.randint(len(KINDS), (count,), generator=generator) if kind is None else torch.full((count,), kind)
     found = torch.zeros(count, cameras, PARAMETERS, dtype=torch.float64)
@@ -82,7 +82,7 @@ def direction(count: int, cameras: int, kind: int | None, generator: torch.Gener
 
 
 def measure(options: Options) -> dict[str, Any]:
-    """Recalibrate devices, then draw what they would see of drifts and bumps."""
+    """Recalibrate devices, then simulate the effect of drifts and bumps on their information."""
     factory, obj = read_rig(options.rig), load_object("asymmetric8")
     fleet = simulate(factory, obj, options.devices, SNAPSHOTS, 0.0, options.seed)
     information, _ = recalibrated(fleet, factory, obj, RigPrior())
@@ -119,22 +119,22 @@ def measure(options: Options) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, str]:
-    """Markdown by the name of its markers."""
+    """Make the tables, by the names of their markers."""
 
     def row(one: Mapping[str, Any], first: str) -> list[str]:
         share = 100 * one["found"] / one["draws"]
         return [first, f"{one['sigmas']:.1f}", f"{share:.1f} %", f"{100 * one['bound']:.1f} %", str(one["wrong"])]
 
-    head = ["standard deviations of what can be seen (median)", "found", "most powerful test, told where to look",
-            "others named"]  # fmt: skip
-    visible = [row(one, f"{one['size']:g} of what can be seen, any kind") for one in result["visible"]]
+    head = ["observable size, sigmas (median)", "found", "most powerful test, camera and direction known",
+            "other cameras named"]  # fmt: skip
+    visible = [row(one, f"{one['size']:g} observable sigmas, any kind") for one in result["visible"]]
     spreads = [row(one, f"{one['size']:g} spreads of rotation") for one in result["spreads"]]
     steady = f"Without a bump: {result['false']} of {result['steady_cameras']:,} cameras named."
     return {"bumps seen": markdown(["bump", *head], [*visible, *spreads]) + f"\n\n{steady}"}
 
 
 def main() -> None:
-    """Measure, keep, and put the table into the page."""
+    """Measure, write the JSON, and rewrite the table in the page."""
     options = tyro.cli(Options, description=__doc__)
     result = read_json(options.out) if options.again else surroundings() | measure(options)
     if not options.again:

@@ -1,6 +1,6 @@
-"""Does a fleet teach the prior that its devices were made with? Simulated devices, some of them bumped.
+"""Does a fleet recover the prior of its devices? Simulated devices, some of them bumped.
 
-Run as `python -m scripts.benchmarks.fleet_prior`: a quarter of an hour on a core.
+Run as `python -m scripts.benchmarks.fleet_prior`: a quarter of an hour on one core.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ class Options:
     """Learn a fleet's prior and compare it with the truth."""
 
     devices: int = 5000
-    recalibrated: int = 1000  #: further devices, seen once, on which priors are compared
-    bumped: float = 0.02  #: share of devices one of whose cameras was turned
+    recalibrated: int = 1000  #: further devices with a single snapshot, to compare priors
+    bumped: float = 0.02  #: share of devices with a rotated camera
     rig: str = "T4"
     seed: int = 0
     out: Path = RESULT
     page: Path = PAGE
-    again: bool = False  #: measure nothing: make the table of the JSON that is there
+    again: bool = False  #: measure nothing: rewrite the tables from the existing JSON
 
 
 @dataclass(frozen=True)
 class Fleet:
-    """Devices and what they saw."""
+    """Devices and their observations."""
 
-    offset: Tensor  # (D, C, 15) true, from the factory
+    offset: Tensor  # (D, C, 15) true offsets from the factory values
     observations: Observations  # (D, S, C, N)
     bumped: Tensor  # (D, C) size of the bump in spreads, 0 = none
 
@@ -55,7 +55,7 @@ class Fleet:
 def simulate(
     factory: CameraRig, obj: CalibrationObject, devices: int, snapshots: int, share: float, seed: int
 ) -> Fleet:
-    """Drift, bump and look."""
+    """Simulate drift, bumps and observations."""
     generator = torch.Generator().manual_seed(seed)
     drift = PhysicalDrift(
         math.degrees(TRUE.rotation), TRUE.position, TRUE.focal_length, TRUE.principal_point, TRUE.distortion
@@ -81,7 +81,7 @@ def simulate(
 def recalibrated(
     fleet: Fleet, factory: CameraRig, obj: CalibrationObject, prior: RigPrior
 ) -> tuple[DriftInformation, Tensor]:
-    """Estimate all devices with a prior: what their images say, and the offsets (D, C, 15)."""
+    """Estimate all devices with a prior: the information from their images, and the offsets (D, C, 15)."""
     parts, offsets = [], []
     for first in range(0, len(fleet.offset), AT_ONCE):
         rows = slice(first, first + AT_ONCE)
@@ -93,7 +93,7 @@ def recalibrated(
 
 
 def found_bumps(learnt: LearntPrior, fleet: Fleet, names: tuple[str, ...]) -> dict[str, Any]:
-    """Precision, and recall by the size of the bump."""
+    """Precision, and recall by the size of a bump."""
     named = torch.zeros_like(fleet.bumped, dtype=torch.bool)
     for outlier in learnt.outliers:
         named[outlier.device, names.index(outlier.camera)] = True
@@ -107,7 +107,7 @@ def found_bumps(learnt: LearntPrior, fleet: Fleet, names: tuple[str, ...]) -> di
 
 
 def compared(learnt: RigPrior, factory: CameraRig, obj: CalibrationObject, options: Options) -> dict[str, Any]:
-    """Error of devices that are seen once, by prior: measured, and as the Cramer-Rao bound says."""
+    """Error of devices with a single snapshot, by prior: measured, and the Cramér-Rao bound."""
     fleet = simulate(factory, obj, options.recalibrated, 1, 0.0, options.seed + 1)
     priors = {"learnt": learnt} | {
         name: RigPrior(**{kind: factor * getattr(TRUE, kind) for kind in KINDS}) for name, factor in FACTORS.items()
@@ -123,18 +123,18 @@ def compared(learnt: RigPrior, factory: CameraRig, obj: CalibrationObject, optio
 
 
 def _expected(information: DriftInformation, prior: RigPrior, factory: CameraRig) -> Tensor:
-    """Mean squared error in units of the true spreads (D) of an estimate with a prior that may be wrong."""
+    """Mean squared error (D), in units of the true spreads, of an estimate with a prior that may be wrong."""
     true = TRUE.std(factory).flatten()
     unit = RigPrior(1.0, 1.0, 1.0, 1.0, 1.0).std(factory).flatten()
     data = information.information * (true / unit)[:, None] * (true / unit)
     precision = torch.diag((true / prior.std(factory).flatten()).square())
     gain = torch.linalg.inv(data + precision)
-    covariance = gain @ (data + precision @ precision) @ gain  # noise, and the true drift by the wrong prior's pull
+    covariance = gain @ (data + precision @ precision) @ gain  # noise, and bias by the wrong prior
     return covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
 
 
 def measure(options: Options) -> dict[str, Any]:
-    """Learn, and compare."""
+    """Learn the prior, and compare it."""
     factory, obj = read_rig(options.rig), load_object("asymmetric8")
     fleet = simulate(factory, obj, options.devices, SNAPSHOTS, options.bumped, options.seed)
     information, _ = recalibrated(fleet, factory, obj, RigPrior())
@@ -151,7 +151,7 @@ def measure(options: Options) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, str]:
-    """Markdown by the name of its markers."""
+    """Make the tables, by the names of their markers."""
     spreads = [
         [kind.replace("_", " "), f"{row['true']:g}", f"{row['learnt']:.4g} ± {row['sigma']:.1g}",
          f"{100 * (row['learnt'] / row['true'] - 1):+.2f} %"]
@@ -172,12 +172,12 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
     return {
         "spreads": markdown(["kind", "true", "learnt", "off by"], spreads),
         "bumps": markdown(["camera turned by", "found"], found),
-        "priors": markdown(["prior", "RMS error, measured, over that with the true prior", "by the bound"], errors),
+        "priors": markdown(["prior", "RMS error / error with the true prior", "predicted by the bound"], errors),
     }
 
 
 def main() -> None:
-    """Measure, keep, and put the tables into the page."""
+    """Measure, write the JSON, and rewrite the tables in the page."""
     options = tyro.cli(Options, description=__doc__)
     result = read_json(options.out) if options.again else surroundings() | measure(options)
     if not options.again:

@@ -1,7 +1,7 @@
-"""What does a fleet cost: captures a second, the engine's share, nodes that die, bytes, the driver's memory.
+"""What does a fleet cost? Captures per second, engine overhead, nodes that die, bytes, the driver's memory.
 
-Run as `python -m scripts.benchmarks.fleet_speed`; `--only overhead` measures one part anew, keeps the others. Work is
-told in CPU seconds, so that what else a machine does matters less; rates by the clock stand beside them with the load.
+Run as `python -m scripts.benchmarks.fleet_speed`; `--only overhead` repeats one part and keeps the others. Work is
+reported in CPU seconds, since other load on the machine affects these less, with rates in wall time and the load.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ DRIFT = PhysicalDrift(0.17, 1.5, 0.004, 3.0, 0.005)
 KINDS = {"blobs, T4, 3 snapshots": ("T4", 3), "blobs, O10, 5 snapshots": ("O10", 5)}
 FRAMES = "frames, T4, 3 snapshots"
 SHARES = {"blobs, O10, 5 snapshots": 3, FRAMES: 4}
-"""Of the captures: these take longer."""
-PLANNED, USE = 1_000_000, 0.7  # captures a day, share of the cores that is planned with
-TARGETS = {"blobs": 5.0, "frames": 1.0}  # % of the work
+"""Divisors of the number of captures, for slower kinds."""
+PLANNED, USE = 1_000_000, 0.7  # captures per day, planned utilization of the cores
+TARGETS = {"blobs": 5.0, "frames": 1.0}  # overhead in % of the work
 
 
 @dataclass(frozen=True)
 class Options:
     """Measure fleets."""
 
-    captures: int = 64  #: of blobs, in each measurement
+    captures: int = 64  #: captures of blobs in each measurement
     rounds: int = 2
-    rows: int = 1_000_000  #: of the manifest that shows the driver's memory
-    only: tuple[str, ...] = ()  #: parts to measure anew: overhead, nodes, death, bytes, memory
+    rows: int = 1_000_000  #: rows of the manifest for the driver's memory
+    only: tuple[str, ...] = ()  #: parts to measure again: overhead, nodes, death, bytes, memory
     out: Path = RESULT
-    again: bool = False  #: measure nothing: make the tables of the JSON that is there
+    again: bool = False  #: measure nothing: rewrite the tables from the existing JSON
 
 
 def write_blobs(path: Path, rig: str, snapshots: int, seed: int) -> None:
-    """A table of unlabelled blobs of a drifted rig."""
+    """Write a table of unlabelled blobs of a drifted rig."""
     generator = torch.Generator().manual_seed(seed)
     truth = simulate_truth(read_rig(rig), load_object("asymmetric8"), snapshots, generator, DRIFT)
     seen = true_detections(truth)
@@ -61,7 +61,7 @@ def write_blobs(path: Path, rig: str, snapshots: int, seed: int) -> None:
 
 
 def fleet_of(folder: Path, kind: str, captures: int) -> Manifest:
-    """A manifest of devices that share eight captures; every row is work of its own."""
+    """Make a manifest of devices that share eight captures; every row is processed separately."""
     rig, rows = "T4", []
     if kind == FRAMES:
         out = folder / "frames"
@@ -83,7 +83,7 @@ def fleet_of(folder: Path, kind: str, captures: int) -> Manifest:
 
 
 def cpu_seconds() -> dict[str, float]:
-    """CPU time of this process and of all that descend from it, by what they are."""
+    """CPU time of this process and its descendants, by kind of process."""
     processes: dict[int, tuple[int, str, float]] = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -107,12 +107,12 @@ def cpu_seconds() -> dict[str, float]:
 
 
 def overhead(folder: Path, options: Options) -> dict[str, Any]:
-    """What the engine adds to the work itself, by kind of capture: medians over rounds."""
+    """Measure the engine's overhead by kind of capture: medians over rounds."""
     found: dict[str, Any] = {}
     with Engine(cores=1) as engine:
         recalibrate_fleet(fleet_of(folder, FRAMES, 2), Dataset(Path(tempfile.mkdtemp(dir=folder))), engine)
         idle, seconds = cpu_seconds(), 20.0
-        time.sleep(seconds)  # what Ray's own threads and processes take of each second, work or no work
+        time.sleep(seconds)  # CPU time of Ray's own threads and processes when idle
         now = cpu_seconds()
         idle = {name: (now[name] - idle[name]) / seconds for name in ("driver", "engine")}
         for kind in (*KINDS, FRAMES):
@@ -120,7 +120,7 @@ def overhead(folder: Path, options: Options) -> dict[str, Any]:
             batch = 32 if kind != FRAMES else 8
             manifest = fleet_of(folder, kind, captures)
             rounds = []
-            for number in range(options.rounds + 1):  # the first one loads and compiles
+            for number in range(options.rounds + 1):  # the first round loads and compiles code
                 dataset = Dataset(Path(tempfile.mkdtemp(dir=folder)))
                 began, before = time.perf_counter(), cpu_seconds()
                 count = recalibrate_fleet(manifest, dataset, engine, batch=batch)
@@ -143,7 +143,7 @@ def overhead(folder: Path, options: Options) -> dict[str, Any]:
 
 
 def plain_loop(manifest: Manifest) -> float:
-    """CPU seconds of a capture in a loop of this process."""
+    """CPU seconds per capture in a loop in this process."""
     items = [item for batch in manifest.batches(1000) for item in batch]
     torch.set_num_threads(1)
     process(items[0], Settings())
@@ -154,14 +154,14 @@ def plain_loop(manifest: Manifest) -> float:
 
 
 def bytes_moved(folder: Path) -> dict[str, Any]:
-    """Bytes of a capture: what is read, what goes to a worker by name, what comes back."""
+    """Bytes per capture: read, sent to a worker, and sent back."""
     found = {}
     for kind in (*KINDS, FRAMES):
         items = next(fleet_of(folder, kind, 32).batches(32))
         path = Path(items[0].capture)
         files = [file for file in path.rglob("*") if file.is_file() and "truth" not in file.parts]
         read = sum(file.stat().st_size for file in files) if path.is_dir() else path.stat().st_size
-        rows = [process(item, Settings()) for item in items[: 1 if kind == FRAMES else 8]]  # no two alike
+        rows = [process(item, Settings()) for item in items[: 1 if kind == FRAMES else 8]]  # all different
         dataset = Dataset(Path(tempfile.mkdtemp(dir=folder)))
         with dataset.written() as writer:
             writer.add([row for row in rows if row is not None])
@@ -175,7 +175,7 @@ def bytes_moved(folder: Path) -> dict[str, Any]:
 
 
 def rates(folder: Path, options: Options) -> dict[str, Any]:
-    """Captures a second by the clock, and CPU seconds of a capture, with cores and with simulated nodes."""
+    """Measure captures per second of wall time, and CPU seconds per capture, with cores and with simulated nodes."""
     from ray.cluster_utils import Cluster
 
     captures = max(8, options.captures // 2)
@@ -208,7 +208,7 @@ def rates(folder: Path, options: Options) -> dict[str, Any]:
 
 
 def death(seconds: float = 0.5, batches: int = 60) -> dict[str, Any]:
-    """Node seconds that are lost when one of two nodes is switched off; work is sleep, so that load matters little."""
+    """Node seconds lost when one of two nodes is switched off; the work is sleep, so load has little effect."""
     from ray.cluster_utils import Cluster
 
     def sleeping(items: Sequence[int]) -> list[int]:
@@ -220,7 +220,7 @@ def death(seconds: float = 0.5, batches: int = 60) -> dict[str, Any]:
     done, died = 0, 0.0
     try:
         with Engine(cluster.address) as engine:
-            list(engine.run(sleeping, [[n] for n in range(8)]))  # processes have started
+            list(engine.run(sleeping, [[n] for n in range(8)]))  # start the processes
             began = time.perf_counter()
             for outcome in engine.run(sleeping, [[n] for n in range(batches)]):
                 assert isinstance(outcome, Done), outcome
@@ -236,7 +236,7 @@ def death(seconds: float = 0.5, batches: int = 60) -> dict[str, Any]:
 
 
 def stubbed(items: Sequence[Item], settings: Settings, known: Any) -> list[dict[str, Any]]:
-    """Rows without work: the driver's memory and time are what is looked at."""
+    """Make rows without work, to measure the driver's memory and time."""
     return [failed_row(item, "refused", "stub") | {"key": _key(item.row)} for item in items]
 
 
@@ -245,7 +245,7 @@ def _key(row: int) -> str:
 
 
 def memory(folder: Path, rows: int) -> dict[str, Any]:
-    """The driver's own memory over a manifest of very many rows that point at the same few files; no work is done."""
+    """Driver's own memory for a manifest of very many rows that share a few files, without any work."""
     path = folder / "many.csv"
     with path.open("w", encoding="utf-8") as file:
         file.write("capture,device,time\n")
@@ -272,7 +272,7 @@ def memory(folder: Path, rows: int) -> dict[str, Any]:
 
 
 def driver(folder: Path, rows: int = 2048) -> dict[str, float]:
-    """CPU seconds of the driver for a capture: rows as large as real ones, made without work."""
+    """CPU seconds of the driver per capture, with rows of realistic size made without work."""
     found: dict[str, float] = {}
     real = fleet_run._process
     with Engine(cores=1) as engine:
@@ -307,10 +307,10 @@ PARTS: dict[str, Callable[[Path, Options], Any]] = {
 
 
 def engine_share(result: Mapping[str, Any]) -> dict[str, Any]:
-    """What was measured of each kind of capture, with what the engine adds in percent: of the work, of a plain loop.
+    """Add the engine's overhead in percent of the work, and of a plain loop, to the results of each kind of capture.
 
-    Workers' CPU time beyond that of the captures, the driver's (measured by itself, over thousands of rows: it is less
-    than what Ray takes of every second anyway), and the scheduler's.
+    The overhead is the workers' CPU time beyond that of the captures, the driver's, and the scheduler's. The driver's
+    is measured separately over thousands of rows, since it is less than Ray's idle CPU time.
     """
     found = {}
     for kind, row in result["overhead"].items():
@@ -321,7 +321,7 @@ def engine_share(result: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def tables(result: dict[str, Any]) -> dict[str, str]:
-    """Markdown by the name of its markers."""
+    """Make the tables, by the names of their markers."""
     result = result | {"overhead": engine_share(result)}
     makers = {"overhead": _overhead, "nodes": _rates, "bytes": _bytes, "memory": _memory, "death": _death}
     names = {"nodes": "rates"}
@@ -335,7 +335,7 @@ def _plan(result: dict[str, Any]) -> str:
     seconds = {kind: row["work"] * (1 + max(row["percent"], 0.0) / 100) for kind, row in result.items()}
     cores = ", ".join(f"{PLANNED / 86_400 * value / USE:.2g} for {kind}" for kind, value in seconds.items())
     rate = PLANNED / 86_400
-    return f"A million captures a day are {rate:.1f} a second. Cores that they need, {100 * USE:.0f} % busy: {cores}."
+    return f"A million captures per day are {rate:.1f} per second. Cores needed at {100 * USE:.0f} % load: {cores}."
 
 
 def _overhead(result: dict[str, Any]) -> str:
@@ -346,10 +346,10 @@ def _overhead(result: dict[str, Any]) -> str:
     ]  # fmt: skip
     head = [
         "capture", "captures", "plain loop, CPU ms", "work in a worker, CPU ms", "driver, CPU ms",
-        "engine adds to the work", "to the plain loop", "target",
+        "engine overhead on the work", "on the plain loop", "target",
     ]  # fmt: skip
     idle = 1e3 * max(row["idle_per_s"] for row in result.values())
-    return f"{markdown(head, rows)}\n\nWork or no work, Ray takes {idle:.0f} CPU ms of every second on a machine."
+    return f"{markdown(head, rows)}\n\nEven when idle, Ray takes {idle:.0f} CPU ms per second on a machine."
 
 
 def _rates(result: dict[str, Any]) -> str:
@@ -357,7 +357,7 @@ def _rates(result: dict[str, Any]) -> str:
         [who, f"{row['rate']:.2g}", f"{1e3 * row['cpu_seconds']:.3g}", f"{row['load']:.0f}"]
         for who, row in result.items()
     ]
-    return markdown(["who", "captures a second", "CPU ms a capture", "load average"], rows)
+    return markdown(["engine", "captures per second", "CPU ms per capture", "load average"], rows)
 
 
 def _bytes(result: dict[str, Any]) -> str:
@@ -365,28 +365,28 @@ def _bytes(result: dict[str, Any]) -> str:
         [kind, *(f"{row[name] / 1e3:.3g}" for name in ("read", "to_worker", "from_worker", "stored"))]
         for kind, row in result.items()
     ]
-    return markdown(["kB a capture", "read", "to a worker", "back", "kept (Parquet)"], rows)
+    return markdown(["kB per capture", "read", "to a worker", "back", "kept (Parquet)"], rows)
 
 
 def _memory(result: dict[str, Any]) -> str:
     curve = result["curve_mb"]
     shown = [*curve[: -1 : max(1, len(curve) // 6)], curve[-1]]
     cells = ["driver, MB", *(f"{mb:.0f}" for _, mb in shown)]
-    told = f"{result['driver_cpu_us']:.0f} CPU microseconds of the driver a row."
+    told = f"{result['driver_cpu_us']:.0f} CPU microseconds of the driver per row."
     return f"{markdown(['rows done', *(f'{rows:,}' for rows, _ in shown)], [cells])}\n\n{told}"
 
 
 def _death(result: dict[str, Any]) -> str:
     return (
-        f"{result['lost_node_seconds']:.1f} node seconds, with batches of {result['batch_seconds']:g} s; every one of "
-        f"{result['done']} results came, once."
+        f"{result['lost_node_seconds']:.1f} node seconds, with batches of {result['batch_seconds']:g} s; all "
+        f"{result['done']} results arrived exactly once."
     )
 
 
 def main() -> None:
-    """Measure what is asked for, keep, and rewrite the page."""
+    """Measure the requested parts, write the JSON, and rewrite the page."""
     options = tyro.cli(Options, description=__doc__)
-    os.environ.setdefault("RAY_worker_niceness", "0")  # of simulated nodes, too
+    os.environ.setdefault("RAY_worker_niceness", "0")  # for simulated nodes too
     result = read_json(options.out) if options.out.is_file() else {}
     if not options.again:
         with tempfile.TemporaryDirectory() as folder:

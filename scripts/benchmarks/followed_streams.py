@@ -1,4 +1,4 @@
-"""Simulated streams that a monitor follows, and how far what it believes is from the truth."""
+"""Simulated streams that a monitor follows, and the errors of its belief."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
 
 RIGS = ("T4", "O6", "U7", "O10")
 BLOCK = 100
-"""Snapshots that are simulated at once."""
+"""Snapshots per simulated block."""
 SURELY = 26.9
-"""Chi-squared, ten degrees of freedom: what 3 sigma are of a single value."""
+"""Chi-squared with ten degrees of freedom that corresponds to 3 sigma of a single value."""
 
 
 class Followed:
-    """A stream, and the monitor that follows it by labelled fiducials."""
+    """A stream, and the monitor that follows its labelled fiducials."""
 
     def __init__(self, stream: Stream, drift: DriftRate | None = None) -> None:
         self.stream, self.monitor = stream, RigMonitor(RigFilter(stream.factory, stream.obj, drift))
         self.pose: RigidTransform | None = None
-        self.told: list[tuple[int, Change]] = []  # number of the snapshot in the stream
-        self.numbers: list[int] = []  # of the stream, of each snapshot of the filter
+        self.told: list[tuple[int, Change]] = []  # (number of the snapshot in the stream, change)
+        self.numbers: list[int] = []  # stream number of each snapshot of the filter
         self.last = 0
-        self._ahead: Observations | None = None  # snapshots (S,) that are simulated already ...
-        self._rigs, self._labels = stream.rig.expand(1), list[int]()  # ... their true rigs, and how many labels
+        self._ahead: Observations | None = None  # snapshots (S,) that are already simulated ...
+        self._rigs, self._labels = stream.rig.expand(1), list[int]()  # ... their true rigs, and numbers of labels
         self._first = self._row = 0
 
     def step(self, number: int) -> Observations | None:
-        """Learn from a snapshot, each being asked for in turn; None = the object is not seen."""
+        """Learn from a snapshot; call for each in order. Returns None if the object is not visible."""
         row = number - self._first
         if self._ahead is None or row >= len(self._ahead.uv):
             self._first, row = number, 0
@@ -61,21 +61,21 @@ class Followed:
 
     @property
     def truth(self) -> CameraRig:
-        """The rig as it was at the last snapshot that was asked for."""
+        """True rig at the last snapshot."""
         return self._rigs[self._row]
 
 
 def stream_of(
     seed: int, name: str, drifting: bool = False, bumps: tuple[Bump, ...] = (), shake: float = 0.0, **more: Any
 ) -> Stream:
-    """A labelled stream of a shipped rig and object."""
+    """Make a labelled stream of a shipped rig and object."""
     drift = DriftRate() if drifting else DriftRate(0.0, 0.0, 0.0, 0.0, 0.0)
     factory, obj = imgcal.load_rig(name), imgcal.load_object("asymmetric8")
     return Stream(factory, obj, seed, Conditions(shake=shake, drift=drift, labelled=True), bumps, **more)
 
 
 def held_out(rig: CameraRig, truth: CameraRig, stream: Stream) -> float:
-    """RMS residual (px) of exact points in poses that the filter has not seen, the poses being fitted."""
+    """RMS residual (px) of exact points in unseen poses, with fitted poses."""
     poses = RigidTransform.cat([stream.pose_at(1000.0 + 0.37 * number) for number in range(30)])
     image = truth.expand(30).project(poses.apply(stream.obj.points), stream.obj.radius)
     exact = Observations(image.uv, torch.full(image.uv.shape[:-1], 0.1, dtype=torch.float64), image.visible)
@@ -85,7 +85,7 @@ def held_out(rig: CameraRig, truth: CameraRig, stream: Stream) -> float:
 
 
 def distance(belief: RigBelief, truth: CameraRig) -> Tensor:
-    """Chi-squared (C,) of ten parameters of each camera, laid upon the truth."""
+    """Chi-squared (C,) of ten parameters of each camera, after alignment with the truth."""
     gauge = Gauge(torch.full((truth.num_cameras,), 1 / truth.num_cameras, dtype=torch.float64))
     error, jacobian = gauge.difference(belief.rig, truth)[:, :10], gauge.jacobian(truth)
     covariance = jacobian @ belief.covariance() @ jacobian.mT

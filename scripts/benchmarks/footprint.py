@@ -1,4 +1,4 @@
-"""What a user meets first: seconds until a command answers, memory of a calibration, megabytes that are installed."""
+"""A user's first impression: start-up time of commands, memory of a calibration, installed megabytes."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ COMMANDS = {
 CALIBRATE = "imgcal calibrate, the sample capture"
 MEMORY = (CALIBRATE, "imgcal calibrate --help", "python, import torch", "python alone")
 LARGEST = 8
-"""Packages that are named in the table of what is installed."""
+"""Packages with their own row in the table of installed sizes."""
 
 
 def measure(effort: Effort) -> dict[str, Any]:
-    """Run commands in turn, each in a process of its own, and add up what is installed."""
+    """Run commands in turn, each in a new process, and add up the installed sizes."""
     rounds = effort.pick(7, 1)
     chosen = COMMANDS if effort.pick(1, 0) else {name: COMMANDS[name] for name in ("imgcal --help", "python alone")}
     seconds: dict[str, list[float]] = {name: [] for name in chosen}
-    for name in chosen:  # once without counting: files that the system has not in memory yet
+    for name in chosen:  # one uncounted run, to load files into the page cache
         _run(chosen[name])
     for _ in range(rounds):
         for name, command in chosen.items():
@@ -56,7 +56,7 @@ def measure(effort: Effort) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, str]:
-    """Start-up, memory, and the largest of what is installed."""
+    """Make the tables of start-up, memory, and the largest installed packages."""
     start = [
         (
             name,
@@ -81,7 +81,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
 
 
 def draw(result: Mapping[str, Any], path: Path) -> None:
-    """Bars of the start-up."""
+    """Draw start-up times as bars."""
     with figure(path, size=(7.0, 2.6)) as (axes,):
         rows = list(reversed(result["start-up"].items()))
         colours = [BLUE if "imgcal" in name else GREY for name, _ in rows]
@@ -95,18 +95,18 @@ files = [(os.POSIX_SPAWN_DUP2, null, 1), (os.POSIX_SPAWN_DUP2, null, 2)]
 _, _, usage = os.wait4(os.posix_spawn(sys.argv[1], sys.argv[1:], os.environ, file_actions=files), 0)
 print(__import__("time").perf_counter() - begin, usage.ru_maxrss)
 """
-"""Starts a command: from this process, the system would count this one's memory as the command's."""
+"""Starts a command; if this process did, the system would count its memory as the command's."""
 
 
 def _run(command: Sequence[str]) -> tuple[float, float]:
-    """Run a command without its output: wall time in seconds, and the most memory that it had, in MB."""
+    """Run a command, discarding its output: wall time in seconds, and peak memory in MB."""
     launched = subprocess.run([*PYTHON, LAUNCHER, *command], cwd=ROOT, capture_output=True, text=True, check=True)
     seconds, most = launched.stdout.split()
     return float(seconds), float(most) / (1024**2 if sys.platform == "darwin" else 1024)
 
 
 def installed() -> dict[str, Any]:
-    """Megabytes of imgcal's own files, of each package that a core install needs, and of all of it."""
+    """Megabytes of imgcal's own files, of each package in a core install, and in total."""
     packages = {name: {"megabytes": _megabytes(found)} for name, found in sorted(needed("imgcal").items())}
     own = sum(_folder(ROOT / part) for part in ("imgcal", "renderers", "data"))
     total = own + sum(part["megabytes"] for part in packages.values())
@@ -114,7 +114,7 @@ def installed() -> dict[str, Any]:
 
 
 def needed(name: str) -> dict[str, Distribution]:
-    """Packages that a package needs, and what they need, extras left out; those that are not installed, too."""
+    """Collect a package's dependencies, recursively, without extras."""
     found: dict[str, Distribution] = {}
     waiting = list(_requirements(distribution(name)))
     while waiting:
@@ -123,7 +123,7 @@ def needed(name: str) -> dict[str, Distribution]:
             continue
         try:
             found[one] = distribution(one)
-        except PackageNotFoundError:  # of another system
+        except PackageNotFoundError:  # for another system
             continue
         waiting += _requirements(found[one])
     return found

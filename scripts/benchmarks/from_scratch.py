@@ -1,6 +1,6 @@
-"""How good is a start without a factory calibration? Beside one with it, COLMAP's mapper and OpenCV's multi-view.
+"""How good is a calibration from scratch? Compares it with one from a factory calibration, COLMAP and OpenCV.
 
-Run as `python -m scripts.benchmarks.from_scratch`. Captures of IMGCAL_CAPTURES take part where that is set.
+Run as `python -m scripts.benchmarks.from_scratch`. Captures of IMGCAL_CAPTURES are included if it is set.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ FACTORY, LABELS, BLOBS = "imgcal from the factory", "imgcal from scratch", "imgc
 COLMAP, OPENCV = "COLMAP incremental mapping", "OpenCV calibrateMultiview"
 SLOW = (BLOBS, OPENCV)
 GATE = 1.1
-"""Geometric mean of the errors from scratch, in parts of those from the factory calibration."""
+"""Limit of the geometric mean of the errors from scratch, relative to those from the factory calibration."""
 WRONG = 2.0
-"""Times the error from the factory calibration, above which an answer is wrong."""
+"""Multiple of the error from the factory calibration above which a result is wrong."""
 OPENCV_SNAPSHOTS = 40
-"""That OpenCV is given: its time grows faster than they do."""
-COARSE = 0.02  # mm: what is called wrong is at least so far off
+"""Snapshots for OpenCV: its time grows faster than linearly."""
+COARSE = 0.02  # mm, least error of a wrong result
 
 Solver = Callable[[Case], CameraRig]
 
 
 def solvers() -> dict[str, Solver]:
-    """Everybody who takes part."""
+    """All methods."""
 
     def by_peer(solve: Callable[..., RigAnswer], snapshots: int | None) -> Solver:
         def run(case: Case) -> CameraRig:
@@ -79,7 +79,7 @@ def solvers() -> dict[str, Solver]:
 
 
 def judge(case: Case, solve: Solver) -> dict[str, Any]:
-    """Let one method calibrate one case."""
+    """Calibrate one case with one method, and score the result."""
     began = time.perf_counter()
     try:
         rig = solve(case)
@@ -97,7 +97,7 @@ def judge(case: Case, solve: Solver) -> dict[str, Any]:
 
 
 def measure(rigs: range, snapshots: int, slow_ones: int = 1, peers: bool = True) -> list[dict[str, Any]]:
-    """Run all methods on rigs of these numbers, those of `SLOW` on every so-manieth."""
+    """Run all methods on rigs with these numbers, those of `SLOW` only on every `slow_ones`-th."""
     rows = []
     for number in rigs:
         case = make_case(number, snapshots)
@@ -112,7 +112,7 @@ def measure(rigs: range, snapshots: int, slow_ones: int = 1, peers: bool = True)
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Put the answers of each method beside those from the factory calibration."""
+    """Compare the results of each method with those from the factory calibration."""
     found = {}
     for name in rows[0]["methods"]:
         tried = [row["methods"] for row in rows if name in row["methods"]]
@@ -134,7 +134,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 
 def on_captures(folder: Path) -> dict[str, Any]:
-    """Real frames: half of the views to calibrate from, the others to score; or why not."""
+    """Real frames: calibrate from half of the views and score on the others, or say why this failed."""
     found = {}
     for name, run in (("dot-grid-10x10", _dot_grid), ("cavity-two-cameras", _cavity), ("three-cameras-dots", _dots)):
         try:
@@ -164,12 +164,12 @@ def _rms(blobs: Detections, rig: CameraRig, obj: CalibrationObject) -> float:
 
 
 def _cavity(folder: Path) -> dict[str, Any]:
-    """Two cameras and one moment, the object among thousands of particles."""
+    """Two cameras and one snapshot, the object among thousands of particles."""
     return _from_frames(folder, {"cam3": (1280, 1024), "cam4": (1280, 1024)})
 
 
 def _dots(folder: Path) -> dict[str, Any]:
-    """Three cameras and one moment, through the walls of a tank."""
+    """Three cameras and one snapshot, through the walls of a tank."""
     return _from_frames(folder, {f"cam{number}": (1280, 1024) for number in (1, 2, 3)})
 
 
@@ -181,7 +181,7 @@ def _from_frames(folder: Path, sizes: Mapping[str, tuple[int, int]]) -> dict[str
 
 
 def _cameras(sizes: Mapping[str, tuple[int, int]], focal: float) -> CameraRig:
-    """Cameras of which a rough focal length (px) is known."""
+    """Make cameras with approximately known focal length (px)."""
     count, like, size = len(sizes), torch.float64, torch.tensor(list(sizes.values()))
     lens = (torch.full((count, 2), focal, dtype=like), (size - 1).to(like) / 2, torch.zeros(count, 5, dtype=like))
     places, spread = RigidTransform.identity(count, dtype=like), RigPrior(0.15, 0.02 * float(size.max()), 0.1, 1.0, 1e6)
@@ -197,7 +197,7 @@ def _series(folder: Path, rig: CameraRig) -> dict[str, list[Any]]:
 
 
 def tables(result: Mapping[str, Any]) -> str:
-    """Markdown: simulated rigs, then real frames."""
+    """Make the text of the page: simulated rigs, then real frames."""
     head = [
         "",
         "rigs",
@@ -205,8 +205,8 @@ def tables(result: Mapping[str, Any]) -> str:
         "wrong",
         "refused or gave up",
         "error, mm",
-        "in parts of the factory's",
-        "the same, 95 %",
+        "error / with factory",
+        "the same, 95 % quantile",
         "s",
     ]
     rows = []
@@ -220,9 +220,7 @@ def tables(result: Mapping[str, Any]) -> str:
     for name, row in result.get("captures", {}).items():
         said = row.get("reason") or row.get("held_out_rms_px") or f"{row['rms_px']:.2f} px"
         if isinstance(said, Mapping):
-            said = (
-                ", ".join(f"{method} {rms:.3f} px" for method, rms in said.items()) + " (RMS, views that took no part)"
-            )
+            said = ", ".join(f"{method} {rms:.3f} px" for method, rms in said.items()) + " (RMS, held-out views)"
         lines.append(f"\n{name}: {row['outcome']}: {said}.")
     return "\n".join(lines)
 
@@ -232,15 +230,15 @@ class Options:
     """Calibrate simulated rigs, and real frames, without a factory calibration."""
 
     rigs: int = 20
-    first: int = 20  #: number of the first rig; rigs 0 to 19 are those that settings were chosen on
+    first: int = 20  #: number of the first rig; rigs 0 to 19 were used to choose settings
     snapshots: int = 300
-    peers: bool = True  #: measure COLMAP and OpenCV, too
-    slow_ones: int = 1  #: OpenCV, and blobs without labels, on every so-manieth rig only
-    out: Path = RESULT  #: the table in docs/benchmarks/tables.md is rewritten with this one alone
+    peers: bool = True  #: also measure COLMAP and OpenCV
+    slow_ones: int = 1  #: run OpenCV, and blobs without labels, only on every n-th rig
+    out: Path = RESULT  #: only this path also rewrites the table in docs/benchmarks/tables.md
 
 
 def main() -> None:
-    """Measure, write, print.
+    """Measure, write and print.
 
     Raises:
         InputError: no rigs.

@@ -1,4 +1,4 @@
-"""Rigs without a factory calibration, an object carried through their volumes, and how wrong an answer is."""
+"""Rigs without a factory calibration, an object carried through their volumes, and errors of results."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from imgcal.synthesis import (
 from imgcal.types import CalibrationObject, CameraRig, ConvexVolume, Detections, RigPrior
 
 NOISE = 0.1  # px, each axis
-FOCAL_ERROR = 0.15  # relative: largest error of what the cameras' focal lengths are said to be
-FALSE_BLOBS = 0.5  # in each image on average
+FOCAL_ERROR = 0.15  # relative, largest error of the given focal lengths
+FALSE_BLOBS = 0.5  # per image, on average
 HIDDEN = 0.03  # share of the markers
 DRIFT = PhysicalDrift(distortion=0.005)
-HELD_OUT = 1000  # points, even in the volume
+HELD_OUT = 1000  # points, uniform in the volume
 LENSES = ((1280, 1024, 65.0), (2048, 1088, 56.0), (1920, 1200, 75.0))
 SHAPES: tuple[Shape, ...] = ("ring", "dome", "row")
 
 
 @dataclass(frozen=True)
 class Case:
-    """One rig and what it saw."""
+    """One rig and its observations."""
 
     name: str
     truth: Truth
-    factory: CameraRig  # from which the true rig has drifted; its prior says how far
-    volume: ConvexVolume  # where it is used, in the true rig's frame
-    cameras: CameraRig  # what a start from scratch is given: rough focal lengths, no places
+    factory: CameraRig  # the true rig has drifted from this by its prior
+    volume: ConvexVolume  # working volume, in the true rig's frame
+    cameras: CameraRig  # input from scratch: rough focal lengths, no extrinsics
     obj: CalibrationObject
     labelled: Detections
-    blobs: Detections  # the same without labels, and false blobs among them
+    blobs: Detections  # the same without labels, with false blobs
 
 
 def make_case(number: int, snapshots: int) -> Case:
@@ -69,7 +69,7 @@ def make_case(number: int, snapshots: int) -> Case:
     obj = load_object("wand4") if number % 2 == 0 else load_object("asymmetric8")
     obj = obj if number % 2 == 0 else replace(obj, points=2 * obj.points, radius=None)
     drifted = DRIFT.apply(rig, generator)
-    drifted.distortion[:, 4] = 0.0  # not every tool has a third radial coefficient
+    drifted.distortion[:, 4] = 0.0  # some tools have no third radial coefficient
     truth = simulate_volume(drifted, obj, snapshots, generator, None, hand=HandHeld(speed=800.0, rate=5.0))
     labelled = _seen(true_detections(truth), rng)
     focal = drifted.focal_length * torch.from_numpy(1 + rng.uniform(-FOCAL_ERROR, FOCAL_ERROR, (cameras, 1)))
@@ -89,13 +89,13 @@ DRIFT_PRIOR = RigPrior(DRIFT.focal_length, DRIFT.principal_point, DRIFT.distorti
 
 
 def _seen(exact: Detections, rng: np.random.Generator) -> Detections:
-    """Hide some markers, and measure the others with noise."""
+    """Hide some markers, and add noise to the others."""
     seen = exact.select(rng.random(len(exact)) >= HIDDEN)
     return replace(seen, uv=seen.uv + NOISE * rng.normal(size=seen.uv.shape), sigma=np.full(len(seen), NOISE))
 
 
 def _as_blobs(labelled: Detections, rig: CameraRig, rng: np.random.Generator) -> Detections:
-    """Take the labels away, and add blobs that are no markers, anywhere."""
+    """Remove the labels, and add false blobs at random."""
     snapshots, cameras = len(labelled.snapshot_names), len(labelled.camera_names)
     count = int(rng.poisson(FALSE_BLOBS * snapshots * cameras))
     camera = rng.integers(0, cameras, count)
@@ -113,15 +113,15 @@ def _as_blobs(labelled: Detections, rig: CameraRig, rng: np.random.Generator) ->
 
 
 def point_errors(found: CameraRig, truth: CameraRig, volume: ConvexVolume, scaled: bool = False) -> np.ndarray:
-    """Distances (mm) of points in the volume, triangulated by a rig from their true pixels, from where they are.
+    """Errors (mm) of points in the volume that a rig triangulates from their true pixels.
 
-    The whole rig is laid upon the truth first, by the best rigid motion.
+    The rig is first aligned with the truth, by the best rigid motion.
 
     Args:
-        found: the rig to be judged; it need not be in the true rig's frame.
+        found: the rig to score, in any frame.
         truth: the true rig.
-        volume: where, in the true rig's frame.
-        scaled: forgive an error of the scale, too.
+        volume: of the points, in the true rig's frame.
+        scaled: also ignore an error of the scale.
     """
     points = sample_volume(volume, HELD_OUT, torch.Generator().manual_seed(7))
     projection = truth.project(points)
@@ -140,7 +140,7 @@ def point_errors(found: CameraRig, truth: CameraRig, volume: ConvexVolume, scale
 
 
 def _laid(source: np.ndarray, destination: np.ndarray, scaled: bool) -> np.ndarray:
-    """Move points (P, 3) as near as possible to others.
+    """Align points (P, 3) with others.
 
     Source: Umeyama 1991.
     """

@@ -1,6 +1,6 @@
-"""Does the estimate know how wrong it is? Errors over stated sigmas, and what happens to captures that are not as said.
+"""Are predicted errors right? Errors over stated sigmas, and outcomes of captures that violate their description.
 
-Run as `python -m scripts.benchmarks.honesty`; `--captures 20` for a look. Writes docs/benchmarks/honesty.json and the
+Run as `python -m scripts.benchmarks.honesty`; try `--captures 20` first. Writes docs/benchmarks/honesty.json and the
 tables of docs/benchmarks/tables.md that are made from it.
 """
 
@@ -34,20 +34,20 @@ SNAPSHOTS = (1, 5, 20, 100)
 TOLERANCES = (0.0, 0.2)  # mm
 NOISE = 0.05  # px, each axis
 PRIOR = RigPrior(focal_length=0.01, principal_point=5.0, distortion=0.005, rotation=0.0087, position=2.0)
-WRONG = 3.0  # times the stated error in pixels: a result that is worse is wrong
+WRONG = 3.0  # multiple of the stated error in pixels beyond which a result is wrong
 RESULT = ROOT / "docs" / "benchmarks" / "honesty.json"
 PAGE = ROOT / "docs" / "benchmarks" / "tables.md"
 OPTIONS = PipelineOptions(blind_cameras=True)
-ANYWHERE = 30.0  # mm, tolerance of a fiducial of which nothing is known
+ANYWHERE = 30.0  # mm, tolerance of a fiducial at an unknown position
 RATIOS = ("ratio", "told")
 
 
 def judged(case: Case, attack: Attack, captures: int, seed: int) -> dict[str, Any]:
-    """Calibrate captures; returns counts of what came out, and errors over sigmas for each kind of value.
+    """Calibrate captures; return counts of the outcomes, and errors over sigmas for each kind of value.
 
-    An outcome is `refused`, `right`, or wrong: its error in pixels, over held-out points of the working volume, more
-    than `WRONG` times what it states; wrong and `said` if it names a displaced fiducial, a camera that moved, a prior
-    that was too narrow or a covariance that was widened; else `silent`.
+    An outcome is `refused`, `right`, or wrong: its error in pixels, over held-out points of the working volume, is more
+    than `WRONG` times the stated one. A wrong outcome is `said` if it names a displaced fiducial, a camera that moved,
+    a prior that was too narrow or a covariance that was widened; otherwise `silent`.
     """
     generator, random = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
     prior = case.rig.prior or RigPrior()
@@ -110,12 +110,12 @@ def _normalize(found: Calibration, truth: CameraRig, squares: dict[str, list[flo
 
 
 def recovered(task: tuple[str, int, int]) -> dict[str, Any]:
-    """Bend one fiducial of the wand in 50 snapshots of a room: is it found, and is the rig as good as if it were known?
+    """Bend one fiducial of the wand in 50 snapshots of a room. Is it found, and is the rig as good as with the truth?
 
     Returns:
-        Counts: `named` alone and right, `within` 3 sigma of the truth, `refused`; `ratio` of the errors (px, RMS over
-        captures) to those with the true object, and `told`, the same of an estimate that is told which fiducial it is:
-        what the place of one fiducial costs anybody who has to find it.
+        Counts: `named` alone and correctly, `within` 3 sigma of the truth, `refused`. `ratio` of the errors (px, RMS
+        over captures) to those with the true object; `told`, the same for an estimate that knows which fiducial it is:
+        the unavoidable cost of estimating the position of one fiducial.
     """
     name, captures, seed = task
     generator, random = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
@@ -172,7 +172,7 @@ def effort(repeats: int = 15) -> dict[str, float]:
 
 
 def _row(task: tuple[str, str, int, float, str, int, int]) -> dict[str, Any]:
-    """Run one row: a work item."""
+    """Run one row, which is a work item."""
     rig, obj, snapshots, tolerance, attack, captures, seed = task
     given = load_object(obj)
     if tolerance:
@@ -192,7 +192,7 @@ def _row(task: tuple[str, str, int, float, str, int, int]) -> dict[str, Any]:
 
 
 def _told(row: dict[str, Any]) -> dict[str, Any]:
-    """Say on standard error that a row is done, and how long a capture of it took."""
+    """Report on standard error that a row is done, and the time per capture."""
     took = row.pop("ms")
     print(*(f"{value}" for value in row.values()), f"{took:.0f} ms", file=sys.stderr, flush=True)
     return row
@@ -200,19 +200,19 @@ def _told(row: dict[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Options:
-    """Measure how honest calibrations are."""
+    """Measure whether calibrations predict their own errors."""
 
-    captures: int = 200  #: for each row of sigmas; a quarter as many of 100 snapshots
-    attacked: int = 50  #: for each row of attacks
+    captures: int = 200  #: captures per row of sigmas; a quarter as many with 100 snapshots
+    attacked: int = 50  #: captures per row of attacks
     rigs: tuple[str, ...] = tuple(RIGS)
-    address: str | None = None  #: running Ray cluster that does the rows; none = this machine
-    cores: int | None = None  #: of this machine; 1 = this process alone; none = all
-    wand_only: bool = False  #: measure the bent wand anew, and keep the rest of what is in OUT
+    address: str | None = None  #: running Ray cluster to run on; None = this machine
+    cores: int | None = None  #: of this machine; 1 = this process alone; None = all
+    wand_only: bool = False  #: only repeat the bent wand, and keep the rest of OUT
     out: Path = RESULT
 
 
 def main() -> None:
-    """Measure, write, print."""
+    """Measure, write and print."""
     options = tyro.cli(Options, description=__doc__)
     began, before = time.monotonic(), surroundings()
     tasks = [
@@ -248,7 +248,7 @@ def main() -> None:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, str]:
-    """Markdown tables by the name of their markers."""
+    """Make the tables, by the names of their markers."""
     honest: list[list[Any]] = []
     attacked: dict[str, dict[int, Counter[str]]] = {}
     for row in result["rows"]:
@@ -277,13 +277,13 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
     return {
         "honesty wand": markdown(
             [
-                "one fiducial of the wand off by",
+                "displacement of one fiducial",
                 "captures",
                 "named",
                 "within 3 sigma",
                 "refused",
                 "error / known object",
-                "the same, told which fiducial",
+                "the same, fiducial known",
             ],
             wands,
         ),

@@ -1,4 +1,4 @@
-"""Captures that are not what they are said to be: bent objects, damaged blobs, rigs that have drifted too far."""
+"""Captures that violate their description: bent objects, damaged blobs, rigs that have drifted too far."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ Damage = Callable[[np.random.Generator, CameraRig, CalibrationObject, Detections
 
 @dataclass(frozen=True)
 class Attack:
-    """A kind of capture that is not what it is said to be."""
+    """A kind of capture that violates its description."""
 
-    bend: Bend | None = None  # the fiducials (N, 3) as they truly are
-    damage: Damage | None = None  # what happens to the blobs
-    drift: float = 1.0  # times the prior
+    bend: Bend | None = None  # makes the true fiducials (N, 3)
+    damage: Damage | None = None  # changes the blobs
+    drift: float = 1.0  # multiple of the prior
 
 
 def scaled(factor: float) -> Attack:
-    """An object of another scale than its file says."""
+    """Make an object whose scale differs from its file."""
     return Attack(lambda points, _: points.mean(0) + factor * (points - points.mean(0)))
 
 
 def stretched(factor: float) -> Attack:
-    """An object that is longer along its longest axis than its file says."""
+    """Make an object that is longer along its longest axis than in its file."""
 
     def bend(points: Tensor, _: np.random.Generator) -> Tensor:
         axis = int((points.amax(0) - points.amin(0)).argmax())
@@ -41,7 +41,7 @@ def stretched(factor: float) -> Attack:
 
 
 def one_off(size: float) -> Bend:
-    """One fiducial somewhere else, in a random direction within the plane of flat objects."""
+    """Displace one fiducial in a random direction, within the plane for flat objects."""
 
     def bend(points: Tensor, random: np.random.Generator) -> Tensor:
         direction = random.normal(size=3) * (np.ptp(points.numpy(), axis=0) > 0)
@@ -52,7 +52,7 @@ def one_off(size: float) -> Bend:
 
 
 def all_off(size: float) -> Attack:
-    """All fiducials off by a standard deviation (mm), with an object file that claims to be exact."""
+    """Displace all fiducials randomly (sigma in mm), while the object file claims to be exact."""
     return Attack(lambda points, random: points + torch.from_numpy(size * random.normal(size=points.shape)))
 
 
@@ -82,7 +82,7 @@ def _exchanged(random: np.random.Generator, rig: CameraRig, obj: CalibrationObje
 
 
 def _bumped(random: np.random.Generator, rig: CameraRig, obj: CalibrationObject, table: Detections) -> Detections:
-    """Shift what one camera sees from some moment on, as a turn of 0.5 degrees does."""
+    """Shift the blobs of one camera from some snapshot on, like a rotation by 0.5 degrees."""
     camera, count = random.integers(rig.num_cameras), len(table.snapshot_names)
     shift = (
         float(rig.focal_length[camera].mean())
@@ -119,4 +119,4 @@ BENT: dict[str, Bend] = {
     "5 mm": one_off(5.0),
     "stem 5 % longer": lambda points, _: points * torch.tensor([[1.0], [1.0], [1.0], [1.05]], dtype=points.dtype),
 }
-"""Objects whose true shape is to be found."""
+"""Bends of the wand whose true shape should be found."""

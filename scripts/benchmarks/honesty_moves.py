@@ -1,4 +1,4 @@
-"""Are cameras that move, or that are not what they are said to be, named, and steady ones left alone?
+"""Are cameras that move or have a wrong image identified, without false reports of steady ones?
 
 Run as `python -m scripts.benchmarks.honesty_moves`.
 """
@@ -26,10 +26,10 @@ from scripts.output import ROOT, WORK, command, fill, markdown, read_json, surro
 RESULT = ROOT / "docs" / "benchmarks" / "honesty_moves.json"
 PAGE = ROOT / "docs" / "benchmarks" / "tables.md"
 CAMERA = 3
-SNAPSHOTS = 20  # of a capture in which something is wrong
-LENGTHS = (5, 8, 12, 20, 35, 60, 100)  # of steady ones
+SNAPSHOTS = 20  # of a capture with a fault
+LENGTHS = (5, 8, 12, 20, 35, 60, 100)  # snapshots of steady captures
 DEGREES = (0.02, 0.05, 0.1, 1.0)
-SHARES = (0.5, 0.9)  # of the capture, before the camera is turned
+SHARES = (0.5, 0.9)  # share of the capture before the camera is rotated
 IMAGES = ("u", "v", "both", "turned", "lens", "late", "swapped")
 
 SCENES: dict[str, Callable[[int, int], faults.Scene]] = {
@@ -41,7 +41,7 @@ STEADY = ("noise as stated", "heavy tails", "10 % outliers", "noise misstated", 
 
 
 def steady(kind: str, fault: str, seed: int) -> bool:
-    """Tell whether a camera is said to have moved in a capture in which none has; labels given."""
+    """Tell whether a camera is reported as moved in a capture without motion; labels are given."""
     draw = np.random.default_rng(seed)
     rig, obj, truth = SCENES[kind](int(draw.choice(LENGTHS)), seed)
     if fault.startswith("lens errors"):
@@ -59,7 +59,7 @@ def steady(kind: str, fault: str, seed: int) -> bool:
 
 
 def bumped(kind: str, degrees: float, share: float, seed: int) -> str:
-    """Say what becomes of a capture in which a camera is turned: found, otherwise refused, or accepted."""
+    """Outcome of a capture in which a camera is rotated: found, refused for another reason, or accepted."""
     first = round(SNAPSHOTS * share)
     rig, obj, truth = SCENES[kind](SNAPSHOTS, seed)
     truth = faults.changed_from(truth, obj, CAMERA, first, lambda r: faults.turned(r, CAMERA, degrees, seed % 2))
@@ -74,7 +74,7 @@ def bumped(kind: str, degrees: float, share: float, seed: int) -> str:
 
 
 def wrong_image(kind: str, how: str, seed: int) -> str:
-    """Say what becomes of a capture with a camera whose image is not what it is said to be."""
+    """Outcome of a capture with a camera whose image is wrong."""
     rig, obj, truth = SCENES[kind](8, seed)
     if how == "lens":
         truth = faults.with_camera(truth, obj, CAMERA, lambda r: faults.longer_lens(r, CAMERA))
@@ -98,7 +98,7 @@ def measure(captures: int, steady_captures: int, mapped: Mapper = map) -> dict[s
     """Run everything: `captures` of each fault in a camera, `steady_captures` of each kind of steady ones."""
     items: list[tuple[Any, ...]] = []
     for fault in STEADY:
-        # Where place and time go together is a matter of a volume; poses before a ring are drawn each for itself.
+        # A correlation of position and time needs a volume; poses in front of a ring are drawn independently.
         kinds = list(SCENES)[:1] if fault.endswith("one way") else list(SCENES)
         items += [("steady", kinds[seed % len(kinds)], fault, seed) for seed in range(steady_captures)]
     for kind in SCENES:
@@ -124,7 +124,7 @@ def _outcome(item: tuple[Any, ...]) -> bool | str:
 
 
 def _name(item: tuple[Any, ...]) -> str:
-    """Row of the table that a work item belongs to."""
+    """Table row of a work item."""
     what, kind, *rest = item
     if what == "steady":
         return str(rest[0])
@@ -138,7 +138,7 @@ def _counted(found: list[str]) -> dict[str, int]:
 def steady_table(result: Mapping[str, Any]) -> str:
     """Markdown."""
     return markdown(
-        ["steady captures", "number", "a camera said to have moved"],
+        ["steady captures", "number", "camera reported as moved"],
         [[name, str(row["captures"]), str(row["alarms"])] for name, row in result["steady"].items()],
     )
 
@@ -146,22 +146,22 @@ def steady_table(result: Mapping[str, Any]) -> str:
 def faults_table(result: Mapping[str, Any], part: str) -> str:
     """Markdown."""
     rows = [[name, *(str(row[key]) for key in ("found", "refused", "accepted"))] for name, row in result[part].items()]
-    return markdown(["capture", "named rightly", "refused otherwise", "accepted"], rows)
+    return markdown(["capture", "identified", "refused for another reason", "accepted"], rows)
 
 
 @dataclass(frozen=True)
 class Options:
-    """Count what is named, refused and accepted, over simulated captures."""
+    """Count simulated captures that are identified, refused and accepted."""
 
     captures: int = 10
     steady_captures: int = 300
-    address: str | None = None  #: running Ray cluster that does the captures; none = this machine
-    cores: int | None = None  #: of this machine; 1 = this process alone; none = all
-    out: Path = RESULT  #: the tables in docs/benchmarks/tables.md are rewritten with this one alone
+    address: str | None = None  #: running Ray cluster to run on; None = this machine
+    cores: int | None = None  #: of this machine; 1 = this process alone; None = all
+    out: Path = RESULT  #: only this path also rewrites the tables in docs/benchmarks/tables.md
 
 
 def main() -> None:
-    """Measure, write, print."""
+    """Measure, write and print."""
     options = tyro.cli(Options, description=__doc__)
     began, before, kept = (
         time.monotonic(),

@@ -1,4 +1,4 @@
-"""Is the predicted error of a rig the true one? Held-out points of simulated captures, true error over predicted.
+"""Does the predicted error of a rig match the true one? Ratios at held-out points of simulated captures.
 
 Run as `python -m scripts.benchmarks.honesty_prediction`.
 """
@@ -28,15 +28,15 @@ from scripts.output import ROOT, WORK, command, markdown, read_json, replaced, s
 RIGS = {"O10": "asymmetric8", "U7": "asymmetric8", "T4": "asymmetric8", "room10": "wand4"}
 SNAPSHOTS = (1, 5, 20)
 NOISE = 0.02  # px, each axis: of blobs
-HELD_OUT = 100  # points, even in the working volume, at which each calibration is judged
-GATE = (0.9, 1.1)  # of the ratios' RMS
+HELD_OUT = 100  # points, uniform in the working volume, at which each calibration is scored
+GATE = (0.9, 1.1)  # permitted RMS of the ratios
 RESULT = ROOT / "docs" / "benchmarks" / "honesty_prediction.json"
 PAGE = ROOT / "docs" / "benchmarks" / "tables.md"
 
 
 @dataclass(frozen=True)
 class Case:
-    """A kind of capture: the rig drifted as its prior says, the object off as its tolerance says, labels known."""
+    """A kind of capture: drift from the rig's prior, an object within its tolerances, known labels."""
 
     rig: CameraRig  # factory calibration, with its prior
     obj: CalibrationObject
@@ -44,7 +44,7 @@ class Case:
     noise: float = NOISE
 
     def draw(self, generator: torch.Generator) -> tuple[CameraRig, Detections]:
-        """Draw a true rig, and what it sees."""
+        """Draw a true rig and its detections."""
         rig, obj = self.rig, self.true_object(generator)
         prior_std = (rig.prior or RigPrior()).std(rig)
         true_rig = rig.retract(prior_std * torch.randn(prior_std.shape, generator=generator, dtype=prior_std.dtype))
@@ -60,7 +60,7 @@ class Case:
         return true_rig, replace(table, uv=table.uv + self.noise * noise, sigma=np.full(len(table), self.noise))
 
     def true_object(self, generator: torch.Generator) -> CalibrationObject:
-        """Draw an object from the tolerances of this one."""
+        """Draw a true object within the tolerances."""
         obj = self.obj
         if obj.exact:
             return obj
@@ -71,7 +71,7 @@ class Case:
 
 
 def judge(case: Case, captures: int, seed: int, options: PipelineOptions) -> dict[str, Any]:
-    """Calibrate captures, and compare true and predicted errors at points that took no part.
+    """Calibrate captures, and compare true and predicted errors at held-out points.
 
     Returns:
         For px and mm: RMS over captures and points of the true error over the predicted one (`ratio`), its standard
@@ -111,7 +111,7 @@ def _ratio(squares: np.ndarray) -> dict[str, float]:
 
 def _row(item: tuple[str, str, int, int, int]) -> dict[str, Any]:
     rig, obj, snapshots, captures, seed = item
-    options = PipelineOptions(blind_cameras=True)  # a wand in one snapshot is not in view of every camera
+    options = PipelineOptions(blind_cameras=True)  # in one snapshot, not every camera sees the wand
     return judge(Case(load_rig(rig), load_object(obj), snapshots), captures, seed, options)
 
 
@@ -122,7 +122,7 @@ def measure(
     seed: int = 1,
     mapped: Mapper = map,
 ) -> dict[str, Any]:
-    """Run all rigs and numbers of snapshots: rig -> snapshots -> what `judge` returns."""
+    """Run all rigs and numbers of snapshots: rig -> snapshots -> result of `judge`."""
     items = [
         (rig, obj, count, captures, seed + 1000 * number + count)
         for number, (rig, obj) in enumerate(rigs.items())
@@ -136,7 +136,7 @@ def measure(
 
 
 def table(result: Mapping[str, Any]) -> str:
-    """Markdown."""
+    """Make the table, as Markdown."""
     head = ["rig", "snapshots", "median predicted, px", "true / predicted", "median predicted, mm", "true / predicted"]
     rows = []
     for rig, sizes in result["rigs"].items():
@@ -153,13 +153,13 @@ class Options:
     captures: int = 200
     snapshots: tuple[int, ...] = SNAPSHOTS
     rigs: tuple[str, ...] = tuple(RIGS)
-    address: str | None = None  #: running Ray cluster that does the rows; none = this machine
-    cores: int | None = None  #: of this machine; 1 = this process alone; none = all
-    out: Path = RESULT  #: the table in docs/benchmarks/tables.md is rewritten with this one alone
+    address: str | None = None  #: running Ray cluster to run on; None = this machine
+    cores: int | None = None  #: of this machine; 1 = this process alone; None = all
+    out: Path = RESULT  #: only this path also rewrites the table in docs/benchmarks/tables.md
 
 
 def main() -> None:
-    """Measure, write, print.
+    """Measure, write and print.
 
     Raises:
         InputError: unknown rig.

@@ -1,4 +1,4 @@
-"""Which blob is which fiducial: wrong and refused snapshots against clutter, occlusion and factory error."""
+"""Which blob is which fiducial? Wrong and refused snapshots over clutter, occlusion and factory error."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from scripts.output import BLUE, GREEN, RED, figure, markdown
 T = TypeVar("T")
 Labels = NDArray[np.int64]
 NOISE = 0.1  # px
-LEAST_PEERS = 1  # snapshots of a case that peers are run on, at least
-LEAST_PRIOR = 0.01  # of a factory value, relative: nobody believes in none
+LEAST_PEERS = 1  # least number of snapshots per case for the peers
+LEAST_PRIOR = 0.01  # relative, least prior of a factory value, since zero would be unrealistic
 OURS, EACH, VOTE, ABSENT = "imgcal", "P3P + Hungarian", "the same, rig votes", "absent"
 OURS_KNOWN, NEAREST = "imgcal, pose known", "nearest projection + Hungarian"
 
@@ -37,11 +37,11 @@ class Case:
     """Snapshots of O10, from all over the hemisphere."""
 
     name: str
-    visible: int = 6  # fiducials in each camera, a random choice
-    false: int = 2  # blobs in each camera
-    near: bool = False  # false blobs lie in the pattern's bounding box enlarged by half, not anywhere
-    kappa: float = 0.05  # factory error, relative, of every value
-    stated: float | None = None  # what imgcal is told of it, where that is something else
+    visible: int = 6  # visible fiducials in each camera, chosen at random
+    false: int = 2  # false blobs in each camera
+    near: bool = False  # false blobs lie in the pattern's bounding box enlarged by half, not in the whole image
+    kappa: float = 0.05  # relative factory error of every value
+    stated: float | None = None  # relative prior that imgcal is given, if different
     object_name: str = "asymmetric8"
 
 
@@ -66,7 +66,7 @@ AXES = {  # of the plot: title, value on the axis, cases
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What one moment shows, and the truth."""
+    """Blobs of one snapshot, and the ground truth."""
 
     blobs: Detections
     truth: Labels  # (M,) fiducial of each blob, -1 = false
@@ -83,7 +83,7 @@ def measure(effort: Effort) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, str]:
-    """Decisions of a cold start, its time, and decisions where the pose is known."""
+    """Make the tables: decisions and times of a cold start, and decisions with a known pose."""
     cold, known = (OURS, VOTE, EACH), (OURS_KNOWN, NEAREST)
     rows = result["cases"]
     decided = [(name, *(_decided(row, method) for method in cold)) for name, row in rows.items()]
@@ -103,7 +103,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
 
 
 def draw(result: Mapping[str, Any], path: Path) -> None:
-    """Snapshots with a wrong label against what makes it hard, and visible blobs that get their label."""
+    """Draw snapshots with a wrong label, and visible blobs with a label, over the difficulty."""
     rows = result["cases"]
     with figure(path, panels=len(AXES), rows=2, size=(11.0, 4.6)) as panels:
         for column, (title, (value, cases)) in enumerate(AXES.items()):
@@ -138,7 +138,7 @@ def _ms(value: float) -> str:
 
 
 def _case(case: Case, snapshots: int, patience: float) -> dict[str, dict[str, float]]:
-    """Run everything on the same snapshots in turn; peers on as many as they manage within `patience` seconds."""
+    """Run all methods on the same snapshots in turn; peers on as many as they can process in `patience` seconds."""
     rig, obj, made = snapshots_of(case, snapshots)
     expected = case.kappa if case.stated is None else case.stated
     std = RelativeDrift(*[max(expected, LEAST_PRIOR)] * 2).std(rig)
@@ -168,14 +168,14 @@ def _ours(one: Snapshot, rig: CameraRig, obj: CalibrationObject, std: Tensor) ->
 
 @dataclass
 class Peers:
-    """What people write themselves."""
+    """Typical self-written solutions."""
 
     rig: CameraRig
     obj: CalibrationObject
     spent: float = 0.0  # s
 
     def decide(self, one: Snapshot) -> dict[str, tuple[Labels, float]]:
-        """Give labels and the time they took; both answers of P3P share what they find in each camera."""
+        """Return labels and times; both variants with P3P share their results per camera."""
         cameras, points = pinholes(self.rig), self.obj.points.numpy()
         uv = [one.blobs.uv[one.blobs.camera == c] for c in range(len(cameras))]
         count = [len(places) for places in uv]
@@ -196,7 +196,7 @@ class Peers:
 
 
 def snapshots_of(case: Case, count: int, seed: int = 0) -> tuple[CameraRig, CalibrationObject, list[Snapshot]]:
-    """Make the factory rig, the object, and what a freshly disturbed rig sees each time."""
+    """Make the factory rig, the object, and snapshots, each by another drifted rig."""
     rig, obj = read_rig("O10"), load_object(case.object_name)
     made = synthesize(rig, obj, count, torch.Generator().manual_seed(seed), drift=RelativeDrift(case.kappa, case.kappa))
     generator = np.random.default_rng(seed)
@@ -235,7 +235,7 @@ def _blobs(
 
 
 def pinholes(rig: CameraRig) -> list[p3p.Pinhole]:
-    """Cameras as OpenCV has them."""
+    """Convert cameras to OpenCV's parameters."""
     cameras = []
     for c in range(rig.num_cameras):
         matrix = np.diag([*rig.focal_length[c].tolist(), 1.0])
@@ -260,7 +260,7 @@ class Count:
         self.seconds: list[float] = []
 
     def add(self, seconds: float, labels: Labels, truth: Labels, obj: CalibrationObject) -> None:
-        """Judge labels under the symmetry element that suits them best: one for all cameras."""
+        """Score labels under the symmetry that fits them best, the same for all cameras."""
         named = labels >= 0
         moved = [np.append(motion.permutation, -1)[truth] for motion in obj.symmetries]
         right = max(int((named & (expected == labels)).sum()) for expected in moved)

@@ -1,10 +1,10 @@
-"""Are alarms about image quality right? Hours in which nothing happens, a real stream, and cameras that get worse.
+"""Are alarms about image quality right? Uneventful hours, a real stream, and cameras that get worse.
 
-`python -m scripts.benchmarks.image_quality` runs all parts, or `--only` some; the others stay as they were. `hour` and
-most faults use labelled blobs of the demo's world, 15 snapshots a second, whose size, sigma and visibility depend on
-distance, place, direction, motion and on arms in front of cameras. `demo` and `covered` run the demo itself through
-`RigKeeper`, `frames` its rendered frames through the detector; `stream` is the real stream of ten cameras in the folder
-of the captures, from frame 2400 on, which begins with a calibration of the frames before.
+`python -m scripts.benchmarks.image_quality` runs all parts, or `--only` some and keeps the others. `hour` and most
+faults use labelled blobs of the demo's world, 15 snapshots per second. Their size, sigma and visibility depend on
+distance, position, direction and motion, and on arms in front of cameras. `demo` and `covered` run the demo itself
+through `RigKeeper`, `frames` its rendered frames through the detector. `stream` is the real stream of ten cameras in
+the folder of the captures, from frame 2400 on, after a calibration of the frames before.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ from scripts.output import ROOT, command, read_json, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "image_quality.json"
 STREAM = "wand-ten-cameras-stream"
-RATE = 15.0  # snapshots a second, of the demo
+RATE = 15.0  # snapshots per second, as in the demo
 QUALITY = ("dirty", "defocused", "clean")
-CAMERA, SPOILT_AT = 3, 180.0  # which camera gets worse, and when (s)
-SLOW = 600.0  # s, in which the sigmas of a camera that gets dirty slowly become three times as large
+CAMERA, SPOILT_AT = 3, 180.0  # the camera that gets worse, and when (s)
+SLOW = 600.0  # s, in which the sigmas of a camera that gets dirty slowly triple
 EXPOSURE = 0.002  # s
-ARMS_EVERY, ARM_SECONDS = 20.0, 3.0  # s on average, of each camera: an arm is in front of it
-CHUNK = 900  # snapshots that are simulated at once
+ARMS_EVERY, ARM_SECONDS = 20.0, 3.0  # s, mean interval and duration of an arm in front of each camera
+CHUNK = 900  # snapshots per simulated block
 
 
 class World:
-    """What cameras see of the demo's object, with labels, size and sigma, and what happens to one of them.
+    """Labelled blobs of the demo's object, with size and sigma, and a fault of one camera.
 
     Args:
-        seed: of all that is random.
-        fault: what happens to `CAMERA`: none, faint, slowly, defocused, missing.
-        still: seconds from which on the object lies where it is.
-        spoilt_at: seconds from which on the camera gets worse.
+        seed: of all random values.
+        fault: fault of `CAMERA`: none, faint, slowly, defocused, missing.
+        still: seconds after which the object lies still.
+        spoilt_at: seconds after which the camera gets worse.
     """
 
     def __init__(self, seed: int, fault: str = "none", still: float = np.inf, spoilt_at: float = SPOILT_AT) -> None:
@@ -61,14 +61,14 @@ class World:
         self._spoilt_at = spoilt_at
         draw, cameras, fiducials = self._random, self.rig.num_cameras, self.obj.num_fiducials
         self._vignetting = draw.uniform(0.2, 0.7, cameras)
-        self._focus = draw.uniform(0.8, 1.3, cameras)  # m, where each camera is sharp
+        self._focus = draw.uniform(0.8, 1.3, cameras)  # m, focus distance of each camera
         self._lamps = np.exp(0.2 * draw.standard_normal(fiducials))
-        self._arms = np.full(cameras, -np.inf)  # s, until when an arm is there, and which fiducials it hides
+        self._arms = np.full(cameras, -np.inf)  # s, end of each arm's presence, and which fiducials it hides
         self._hidden = np.zeros((cameras, fiducials), dtype=bool)
         self._belief = RigBelief.of_prior(self.rig, self.obj)
 
     def states(self, seconds: float) -> Iterator[RigState]:
-        """Give what a keeper would say of each snapshot."""
+        """Yield the state that a keeper would return for each snapshot."""
         count = int(seconds * RATE)
         for first in range(0, count, CHUNK):
             times = np.arange(first, min(first + CHUNK, count)) / RATE
@@ -112,7 +112,7 @@ class World:
                 sigma[CAMERA] *= 1 + 2.0 * min(passed / SLOW, 1.0)
             elif self.fault == "defocused":
                 radius[CAMERA] *= 1.25
-            elif self.fault == "missing":  # a drop on the glass, a smear: they are seen here and there
+            elif self.fault == "missing":  # a drop or a smear on the glass: fiducials are seen in places only
                 seen[CAMERA] &= draw.random(seen.shape[1]) > 0.4
         camera, fiducial = np.nonzero(seen)
         noise = draw.standard_normal((3, len(camera)))
@@ -130,7 +130,7 @@ class World:
         return made_state(self._belief, blobs, 1.7e9 + time, number, pose, uv)
 
     def _covered_by_arms(self, time: float) -> NDArray[np.bool_]:
-        """Tell which fiducials (C, N) are hidden from which cameras by people."""
+        """Tell which fiducials are hidden from each camera by arms: (C, N) bool."""
         draw = self._random
         begins = (draw.random(len(self._arms)) < 1 / (RATE * ARMS_EVERY)) & (time > self._arms)
         self._arms[begins] = time + draw.exponential(ARM_SECONDS, begins.sum())
@@ -141,7 +141,7 @@ class World:
 def made_state(
     belief: RigBelief, blobs: Detections, time: float, number: int, pose: RigidTransform | None, uv: NDArray[Any]
 ) -> RigState:
-    """Make a state of labelled blobs, of a rig that is known."""
+    """Make a state from labelled blobs and a known rig."""
     rig, nothing = belief.rig, np.full(belief.rig.num_cameras, np.nan)
     return RigState(
         time=time, snapshot=number, belief=belief, factory=rig, cameras=dict.fromkeys(rig.camera_names, "ok"),
@@ -155,7 +155,7 @@ def _batched(pose: RigidTransform) -> RigidTransform:
 
 
 def labelled(seed: int, fault: str, seconds: float, still: float = np.inf) -> list[Event]:
-    """Follow the labelled world."""
+    """Follow the labelled world; return its events."""
     world, events = World(seed, fault, still), list[Event]()
     test = ImageQuality(world.rig.num_cameras)
     for state in world.states(seconds):
@@ -164,7 +164,7 @@ def labelled(seed: int, fault: str, seconds: float, still: float = np.inf) -> li
 
 
 def demo(seed: int, seconds: float, covered_at: float = np.inf, share: float = 1.0) -> list[Event]:
-    """Run the demo's rig at full rate through the keeper, without labels; cover a share of a camera's image."""
+    """Run the keeper on the unlabelled demo at full rate; cover a share of a camera's image."""
     factory, obj = imgcal.load_rig("O10").to(torch.float64), imgcal.load_object("asymmetric8")
     volume, events = viewing_volume(factory), list[Event]()
     true = AGED.apply(factory, torch.Generator().manual_seed(seed))
@@ -181,7 +181,7 @@ def demo(seed: int, seconds: float, covered_at: float = np.inf, share: float = 1
 
 
 def rendered(seed: int, seconds: float, width: int = 1024) -> list[Event]:
-    """Detect blobs in rendered frames of the demo's rig, one snapshot a second, labelled by the truth."""
+    """Detect blobs in rendered frames of the demo's rig, one snapshot per second, labelled by the ground truth."""
     rig, obj = imgcal.load_rig("O10").to(torch.float64), imgcal.load_object("asymmetric8")
     volume, events = viewing_volume(rig), list[Event]()
     simulated = SimulatedRig(rig, obj, volume.low, volume.high, seed)
@@ -197,14 +197,14 @@ def rendered(seed: int, seconds: float, width: int = 1024) -> list[Event]:
 
 
 def nearest_labels(blobs: Detections, uv: NDArray[Any], within: float = 2.0) -> Detections:
-    """Label each blob by the fiducial whose place (C, N, 2) is within so many pixels."""
+    """Label each blob with the fiducial whose position (C, N, 2) is within this many pixels."""
     distance = np.linalg.norm(uv[blobs.camera] - blobs.uv[:, None], axis=-1)
     label = distance.argmin(1)
     return replace(blobs, fiducial=np.where(distance.min(1) <= within, label, -1))
 
 
 def stream(captures: Path, step: int) -> list[Event]:
-    """Follow the real stream from frame 2400 on, beginning with a calibration of the frames before."""
+    """Follow the real stream from frame 2400 on, after a calibration of the frames before."""
     folder = captures / STREAM
     factory, obj = imgcal.load_rig(folder / "factory.yaml"), imgcal.load_object(folder / "object.csv")
     blobs = imgcal.load_detections(folder / "detections.csv.gz", factory, obj.num_fiducials)
@@ -219,7 +219,7 @@ def stream(captures: Path, step: int) -> list[Event]:
 
 
 def calibrated(factory: CameraRig, obj: CalibrationObject, blobs: Detections, every: int) -> CameraRig:
-    """Calibrate with every so many snapshots."""
+    """Calibrate from every `every`-th snapshot."""
     some = blobs.select(blobs.snapshot % every == 0)
     names = blobs.snapshot_names[::every]
     result = imgcal.calibrate(replace(some, snapshot=some.snapshot // every, snapshot_names=names), factory, obj)
@@ -227,7 +227,7 @@ def calibrated(factory: CameraRig, obj: CalibrationObject, blobs: Detections, ev
 
 
 def counted(events: list[Event]) -> dict[str, Any]:
-    """Count events of image quality, and give the time of the first one of each kind and camera."""
+    """Count events about image quality, and give the time of the first of each kind and camera."""
     found = [event for event in events if event.kind in QUALITY]
     return {
         "dirty": sum(event.kind == "dirty" for event in found),
@@ -237,7 +237,7 @@ def counted(events: list[Event]) -> dict[str, Any]:
 
 
 def delays(events: list[Event], kind: str, at: float) -> dict[str, Any]:
-    """Tell when a fault was reported, and what else was."""
+    """Delay until a fault was reported, and other reports."""
     name = imgcal.load_rig("O10").camera_names[CAMERA]
     right = [event for event in events if event.kind == kind and event.camera == name and event.time >= 1.7e9 + at]
     wrong = [event for event in events if event.kind in QUALITY and event.camera != name]
@@ -246,7 +246,7 @@ def delays(events: list[Event], kind: str, at: float) -> dict[str, Any]:
 
 
 def fault(name: str, kind: str, seconds: float = 240.0) -> Callable[[Options], dict[str, Any]]:
-    """Make a part in which a camera gets worse."""
+    """Make a part with a camera that gets worse."""
     return lambda options: {
         "runs": [delays(labelled(seed, name, SPOILT_AT + seconds), kind, SPOILT_AT) for seed in range(options.seeds)]
     }
@@ -254,12 +254,12 @@ def fault(name: str, kind: str, seconds: float = 240.0) -> Callable[[Options], d
 
 @dataclass(frozen=True)
 class Options:
-    """Which parts are run."""
+    """Measure alarms about image quality."""
 
     out: Path = RESULT  #: file of the result
     only: tuple[str, ...] = ()  #: parts; none = all
-    minutes: float = 60.0  #: of the labelled world in which nothing happens; the other worlds run a sixth of it
-    seeds: int = 1  #: of the labelled world
+    minutes: float = 60.0  #: duration of the uneventful labelled world; the other worlds run a sixth of it
+    seeds: int = 1  #: number of seeds of the labelled world
 
 
 PARTS: dict[str, Callable[[Options], dict[str, Any]]] = {
@@ -279,19 +279,19 @@ PARTS: dict[str, Callable[[Options], dict[str, Any]]] = {
     "defocused": fault("defocused", "defocused"),
 }
 QUIET = ("hour", "object put down", "demo", "frames", "stream, every frame", "stream, every third frame")
-"""Parts in which nothing happens."""
+"""Parts without a fault."""
 IN_TIME = {
     "covered": 5.0, "half covered": 60.0, "fiducials missing": 120.0, "blobs half as bright": 30.0,
     "slowly dirty": SLOW, "defocused": 30.0,
 }  # fmt: skip
-"""Seconds after which the others must have been reported."""
+"""Seconds within which the faults of the other parts must be reported."""
 
 
 def captures() -> Path:
     """Find the folder of the captures.
 
     Raises:
-        InputError: it is not named.
+        InputError: IMGCAL_CAPTURES is not set.
     """
     if "IMGCAL_CAPTURES" not in os.environ:
         raise InputError("IMGCAL_CAPTURES: found nothing, expected the folder of the captures")
@@ -299,7 +299,7 @@ def captures() -> Path:
 
 
 def main() -> None:
-    """Run, write, print."""
+    """Run the parts, then write and print the results."""
     options = tyro.cli(Options, description=__doc__)
     unknown = [name for name in options.only if name not in PARTS]
     if unknown:

@@ -1,8 +1,8 @@
-"""Which of kornia's operations are as good as imgcal's own? Equal values, gradients at the hard places, and time.
+"""Which of kornia's operations are as good as imgcal's own? Compares values, gradients at singular inputs, and time.
 
 Run as `python -m scripts.benchmarks.kornia_ops`; writes docs/benchmarks/kornia_ops.json and its table in the page. Both
-run in turn on one thread, and the best of many calls counts: other processes only ever make one slower. What is used of
-kornia, and what is not, has its reason in docs/method.md.
+run in turn on one thread, and the best of many calls counts, because other processes only make calls slower. For the
+reasons to use an operation of kornia or not, see docs/method.md.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Run = Callable[..., Tensor]
 
 @dataclass(frozen=True)
 class Pair:
-    """The same work twice, of the same tensors, by which it is differentiated."""
+    """The same operation twice, with the same tensors, for which gradients are taken."""
 
     name: str
     kornia: str
@@ -46,7 +46,7 @@ class Pair:
     ours: Run
     theirs: Run
     unit: str
-    special: tuple[Tensor, ...] = ()  # a hard place
+    special: tuple[Tensor, ...] = ()  # a singular input
     place: str = ""
 
 
@@ -80,13 +80,13 @@ def pairs() -> list[Pair]:
     intrinsics[:, [0, 1], [0, 1]], intrinsics[:, :2, 2] = rig.focal_length, rig.principal_point
 
     def likeness(images: Tensor) -> Tensor:
-        """Dense weights of each fiducial, as a soft-argmax takes them: (B, N, H, W), of sum 1."""
+        """Dense weights of each fiducial for a soft-argmax: (B, N, H, W), with sum 1."""
         hue = torch.nn.functional.normalize(images, dim=1).movedim(1, -1) @ torch.nn.functional.normalize(colours).mT
         weight = images.amax(1, keepdim=True) * torch.exp((hue.movedim(-1, 1) - 1) / 0.06**2)
         return weight / weight.sum((-2, -1), keepdim=True).clamp_min(1e-12)
 
     def gaussians(uv: Tensor) -> Tensor:
-        """Peaks of 1, summed in one channel."""
+        """Draw Gaussians of peak 1, summed in one channel."""
         std = torch.full((RIGS * 8, 2), 1.5)
         peak = 2 * math.pi * 1.5**2
         drawn = render_gaussian2d(uv.flatten(0, 1), std, (SIZE, SIZE), False)
@@ -175,7 +175,9 @@ def table(result: dict[str, Any]) -> str:
         difference = f"{row['largest_difference']:.1e} {row['unit'] if row['unit'] != '1' else ''}".strip()
         rows.append([row["work"], f"`{row['kornia']}`", difference, *times, hard])
     head = ("ours, ms", "kornia, ms", "ours with gradient, ms", "kornia with gradient, ms")
-    return markdown(("work", "kornia", "largest difference", *head, "gradient where it is hard: ours, kornia"), rows)
+    return markdown(
+        ("work", "kornia", "largest difference", *head, "gradient at the singular input: ours, kornia"), rows
+    )
 
 
 def _finite(run: Run, inputs: tuple[Tensor, ...]) -> bool:
@@ -189,11 +191,11 @@ class Options:
     """Compare kornia's operations with imgcal's own."""
 
     smoke: bool = False
-    """Next to nothing: whether it runs, not how fast; nothing is written."""
+    """Run a minimal version to check that it works; write nothing."""
 
 
 def main() -> None:
-    """Measure, write, print."""
+    """Measure, write and print."""
     options = tyro.cli(Options, description=__doc__)
     result = measure(Effort(options.smoke))
     if not options.smoke:

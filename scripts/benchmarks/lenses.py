@@ -1,9 +1,9 @@
-"""Does an estimate know how wrong it is, whatever the lens? Errors of simulated captures over their covariance.
+"""Are predicted errors right for every lens model? Errors of simulated captures relative to their covariance.
 
-Run as `python -m scripts.benchmarks.lenses`; writes docs/benchmarks/lenses.json and its table in the page. Four cameras
-of each model, and of all three in one rig, wide enough to show what the models differ in; factory values drift by their
-prior, and labels are given. The covariance is the inverse information: its mean normalized square error is one where
-the estimate reaches the Cramer-Rao bound.
+Run as `python -m scripts.benchmarks.lenses`; writes docs/benchmarks/lenses.json and its table in the page. Uses four
+cameras of each model, and of all three in one rig, with fields of view wide enough for the models to differ. Factory
+values drift by their prior, and labels are given. The covariance is the inverse information, so the mean normalized
+squared error is one where the estimate reaches the Cramér-Rao bound.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ LENSES = {
 }
 """Focal length (px) and coefficients, for images of 1280 x 1024 pixels."""
 MIXED = "mixed"
-REACH = (500.0, 400.0, 250.0)  # mm, of the object's places about the working distance
+REACH = (500.0, 400.0, 250.0)  # mm, range of the object's positions around the working distance
 
 
 def rig_of(kind: str) -> CameraRig:
-    """Four cameras with a kind of lens, or with all of them in turn."""
+    """Make four cameras with one kind of lens, or with all in turn."""
     rig, size = load_rig("T4"), torch.tensor([1280, 1024])
     names = [kind if kind != MIXED else list(LENSES)[camera % len(LENSES)] for camera in range(rig.num_cameras)]
     models = lens_label(names)
@@ -58,7 +58,7 @@ def rig_of(kind: str) -> CameraRig:
 
 
 def draw(factory: CameraRig, obj: CalibrationObject, generator: torch.Generator) -> tuple[CameraRig, Observations]:
-    """A rig that has drifted, and what it sees of an object that is held anywhere before it."""
+    """Draw a drifted rig, and its observations of an object at random poses in front of it."""
 
     def normal(*shape: int) -> Tensor:
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
@@ -89,7 +89,7 @@ def measure(effort: Effort) -> dict[str, Any]:
             error = relative_difference(found.rig, truth).flatten()
             covariance = relative_covariance(found)
             std = covariance.diagonal().clamp_min(0).sqrt()
-            known = std > 1e-12  # the first camera's place is exact, and a lens has its own coefficients only
+            known = std > 1e-12  # the first camera's pose is exact, and a lens has only its own coefficients
             scaled = (error / std.clamp_min(1e-30))[known]
             correlation = (covariance / (std[:, None] * std))[known][:, known]
             values, vectors = torch.linalg.eigh(correlation)
@@ -117,19 +117,19 @@ def table(result: dict[str, Any]) -> str:
         ]
         for row in result["rows"]
     ]
-    return markdown(("lens", "parameters", "converged", "joint NEES", "of the lens's coefficients alone"), rows)
+    return markdown(("lens", "parameters", "converged", "joint NEES", "NEES of the lens coefficients"), rows)
 
 
 @dataclass(frozen=True)
 class Options:
-    """Errors of estimates over their covariance, for each lens model."""
+    """Compare errors of estimates with their covariance, for each lens model."""
 
     smoke: bool = False
-    """Next to nothing: whether it runs; nothing is written."""
+    """Run a minimal version to check that it works; write nothing."""
 
 
 def main() -> None:
-    """Measure, write, print."""
+    """Measure, write and print."""
     options = tyro.cli(Options, description=__doc__)
     result = measure(Effort(options.smoke))
     if not options.smoke:

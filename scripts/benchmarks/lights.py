@@ -1,10 +1,10 @@
 """Markers without labels: how many captures are calibrated, refused and wrong, and how good the rigs are.
 
 Run as `python -m scripts.benchmarks.lights campaign|accuracy|stream`; each writes its part of
-docs/benchmarks/lights.json and goes on where it was stopped (out/work/lights.jsonl). Rig room10, factory values off by
-half a degree, 2 mm, 1 % and 5 px times the drift, blobs with a noise of 0.1 px, a quarter of them hidden, three false
-ones in each image, no labels. `accuracy` compares with the estimate that is told all labels, which is as good as the
-Cramer-Rao bound says, and times 2,000 lights. `stream` needs IMGCAL_CAPTURES.
+docs/benchmarks/lights.json and resumes where it was stopped (out/work/lights.jsonl). Rig room10; errors of the factory
+values: half a degree, 2 mm, 1 % and 5 px times the drift; blobs with a noise of 0.1 px, a quarter of them hidden, three
+false ones in each image, no labels. `accuracy` compares with an estimate that is given all labels and reaches the
+Cramér-Rao bound, and times 2,000 lights. `stream` needs IMGCAL_CAPTURES.
 """
 
 from __future__ import annotations
@@ -34,44 +34,44 @@ RESULT, DONE = ROOT / "docs" / "benchmarks" / "lights.json", WORK / "lights.json
 LIGHTS = CalibrationObject.unknown()
 NOISE, HIDDEN, FALSE = 0.1, 0.25, 3
 BODY = (500.0, 400.0, 1700.0)
-"""mm: the box in which the markers of a body are."""
+"""mm, box that contains the markers of a body."""
 COUNTS, DRIFTS, SEEDS = (5, 15, 40, 100), (0.3, 1.0, 2.0), 5
 MOMENTS = {5: 60, 15: 40, 40: 24, 100: 12}
 WRONG_MM, WRONG_TIMES = 2.0, 5.0
-"""A rig is wrong whose median error is larger than this, and than so many times what it claims."""
+"""A rig is wrong if its median error exceeds this, and this multiple of its stated error."""
 POINTS = 300
 STICKS = {"stick of two": (-250.0, 250.0), "stick of three": (-250.0, -80.0, 250.0)}
-"""mm, places of the markers along the stick."""
+"""mm, positions of the markers along the stick."""
 TARGETS = {"1 marker": (450, 2000), "40 markers": (50,), "stick of two": (150,), "stick of three": (150,)}
-"""Moments of the cases whose accuracy is measured."""
+"""Numbers of snapshots of the cases whose accuracy is measured."""
 PAIRS, LINES = ((0, 2), (0, 4)), ((0, 1, 2), (1, 3, 4))
-"""Markers of the recorded wand: two of them, and its two lines of three."""
+"""Subsets of the recorded wand's markers: two of them, and its two lines of three."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A capture with its truth."""
+    """A capture with its ground truth."""
 
     factory: CameraRig
     rig: CameraRig
-    detections: Detections  # in the order of moments
+    detections: Detections  # in the order of snapshots
     fiducial: NDArray[np.int64]  # (M,) marker of each blob, -1 = false
     uv: Tensor  # (S, C, N, 2) without noise
     visible: Tensor  # (S, C, N)
     points: Tensor  # (S, N, 3) mm
     poses: RigidTransform  # (S,) rig_from_object
-    obj: CalibrationObject = LIGHTS  # what is known of the target
+    obj: CalibrationObject = LIGHTS  # the target as it is given to imgcal
 
 
 def simulate(markers: int, moments: int, drift: float, seed: int, stick: Sequence[float] = ()) -> Scene:
     """Simulate a capture of a body in a room; one marker is a light that is carried around.
 
     Args:
-        markers: of the body, of which nothing is known.
-        moments: snapshots.
+        markers: number of markers on the body, whose positions are unknown.
+        moments: number of snapshots.
         drift: of the factory values.
-        seed: of everything random.
-        stick: mm, places of markers on a line, which are known; takes the body's place.
+        seed: of all random values.
+        stick: mm, known positions of markers on a line, which replaces the body.
     """
     generator, random = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
     physical = PhysicalDrift(0.5 * drift, 2.0 * drift, 0.01 * drift, 5.0 * drift, 0.005 * drift)
@@ -128,12 +128,12 @@ def triangulation_error(rig: CameraRig, scene: Scene) -> float:
 
 
 def with_labels(scene: Scene) -> imgcal.Estimate:
-    """Estimate the rig from the same blobs, told which of them belong together."""
+    """Estimate the rig from the same blobs with known correspondences."""
     right = np.flatnonzero(scene.fiducial >= 0)
     blobs, marker = scene.detections, scene.fiducial[right]
     is_stick, (moments, cameras, markers, _) = scene.obj is not LIGHTS, scene.uv.shape
     row, column = blobs.snapshot[right], marker
-    if not is_stick:  # each marker at each moment is a row
+    if not is_stick:  # each marker in each snapshot is a row
         row, column = row * markers + marker, np.zeros_like(marker)
     shape = (moments, cameras, markers) if is_stick else (moments * markers, cameras, 1)
     uv, seen = np.zeros((*shape, 2)), np.zeros(shape, dtype=bool)
@@ -151,12 +151,12 @@ def with_labels(scene: Scene) -> imgcal.Estimate:
 
 
 def error_to_bound(rig: CameraRig, truth: CameraRig, told: imgcal.Estimate) -> float:
-    """RMS of the rig's errors, relative to its first camera, each over its Cramer-Rao bound.
+    """RMS of the rig's errors, relative to its first camera, each divided by its Cramér-Rao bound.
 
     Args:
-        rig: to be judged.
+        rig: to score.
         truth: the true rig.
-        told: the estimate with the right labels, whose covariance is the bound.
+        told: the estimate with the true labels, whose covariance is the bound.
     """
     error = relative_difference(rig, truth).flatten()
     std = relative_covariance(told).diagonal().clamp_min(0).sqrt()
@@ -213,7 +213,7 @@ def examine(scene: Scene) -> dict[str, Any]:
 
 
 def campaign(seeds: int) -> Iterable[dict[str, Any]]:
-    """Captures of all kinds, easy ones first."""
+    """Yield results for captures of all kinds, easy ones first."""
     for seed in range(seeds):
         for markers in COUNTS:
             for drift in DRIFTS:
@@ -227,7 +227,7 @@ def campaign(seeds: int) -> Iterable[dict[str, Any]]:
 
 
 def accuracy(seeds: int) -> Iterable[dict[str, Any]]:
-    """The cases whose accuracy is compared with the estimate that is told the labels."""
+    """Yield results for the cases that are compared with the estimate from labels."""
     for seed in range(seeds):
         for target, counts in TARGETS.items():
             for moments in counts:
@@ -242,7 +242,7 @@ def run(case: dict[str, Any]) -> dict[str, Any]:
 
 
 def stream() -> dict[str, Any]:
-    """The recorded wand: fitted without labels on the first half, scored on the second with the whole wand."""
+    """Calibrate from the first half of the recorded wand without labels; score on the second with the whole wand."""
     reference, given = calibrated(), recording()
     labelled = reference.calibration.labelled_detections
     cases: dict[str, tuple[Detections, CalibrationObject]] = {}
@@ -268,22 +268,22 @@ def stream() -> dict[str, Any]:
 
 
 def only(labelled: Detections, markers: Sequence[int]) -> Detections:
-    """Leave the blobs of some markers, and all that belong to none, without their labels.
+    """Keep the blobs of some markers and all false ones, and remove their labels.
 
-    Those of the other markers are left out, for their distances are nearly those of these.
+    Blobs of the other markers are dropped, because their distances are too similar.
     """
     blobs = labelled.select(np.isin(labelled.fiducial, [*markers, -1]))
     return replace(blobs, fiducial=np.full(len(blobs), -1), flags=np.zeros_like(blobs.flags))
 
 
 def part_of(obj: CalibrationObject, markers: Sequence[int]) -> CalibrationObject:
-    """Make an object of some markers of another one."""
+    """Make an object from some markers of another one."""
     rows = list(markers)
     return CalibrationObject(obj.points[rows], obj.colours[rows], name="stick" if len(rows) > 1 else "light")
 
 
 def tables(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Count and take medians."""
+    """Count outcomes, and take medians."""
     result: dict[str, Any] = {}
     for row in rows:
         key = f"{row['target']} x {row['moments']}, drift {row['drift']:g}"
@@ -316,14 +316,14 @@ def rms(values: Sequence[float]) -> float:
 
 @dataclass(frozen=True)
 class Options:
-    """Captures of unknown markers, counted as calibrated, refused and wrong."""
+    """Count captures of unknown markers that are calibrated, refused and wrong."""
 
     part: tyro.conf.Positional[Literal["campaign", "accuracy", "stream"]]
-    seeds: int = SEEDS  #: captures of each kind
+    seeds: int = SEEDS  #: captures per kind
 
 
 def main() -> None:
-    """Measure, and write the figures."""
+    """Measure, and write the results."""
     options = tyro.cli(Options, description=__doc__)
     torch.set_num_threads(1)
     result = read_json(RESULT) if RESULT.is_file() else {}

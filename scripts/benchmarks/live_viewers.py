@@ -1,6 +1,6 @@
-"""Do those who look at the live page slow the loop? Updates of a keeper without viewers and with 20, turn by turn.
+"""Do viewers of the live page slow the loop? Times a keeper's updates with and without 20 viewers, in turn.
 
-Run as `python -m scripts.benchmarks.live_viewers`: two minutes. Each turn is paced like a camera; viewers are a process
+Run as `python -m scripts.benchmarks.live_viewers`: two minutes. Updates come at a camera's rate; viewers are a process
 of their own, and one of them never reads.
 """
 
@@ -43,18 +43,18 @@ sys.stdin.read()
 
 @dataclass(frozen=True)
 class Options:
-    """How much is measured."""
+    """Measure the effect of viewers of the live page."""
 
     out: Path = RESULT  #: file of the result
-    turns: int = 6  #: with and without viewers, each
-    updates: int = 300  #: of each turn
-    rate: float = 30.0  #: updates a second
+    turns: int = 6  #: turns with viewers, and as many without
+    updates: int = 300  #: updates per turn
+    rate: float = 30.0  #: updates per second
     viewers: int = 20  #: that read
 
 
 @contextmanager
 def looked_at(page: LivePage, viewers: int) -> Iterator[None]:
-    """Have viewers, and one more that asks for the stream and never reads it."""
+    """Connect viewers, and one more that requests the stream and never reads it."""
     given = [sys.executable, "-c", READERS, str(page.address.port), str(viewers)]
     with socket.create_connection(("127.0.0.1", page.address.port)) as stuck:
         stuck.sendall(f"GET /stream HTTP/1.1\r\nHost: 127.0.0.1:{page.address.port}\r\n\r\n".encode())
@@ -65,7 +65,7 @@ def looked_at(page: LivePage, viewers: int) -> Iterator[None]:
 
 
 def measure(options: Options) -> dict[str, Any]:
-    """Take turns; times of update and publication together, ms."""
+    """Time update and publication together, in turn with and without viewers, ms."""
     torch.set_num_threads(1)
     factory, obj = imgcal.load_rig("O10"), imgcal.load_object("asymmetric8")
     true = PhysicalDrift(0.01, 0.1, 2e-4, 0.3, 2e-4).apply(factory, torch.Generator().manual_seed(0))
@@ -87,7 +87,7 @@ def measure(options: Options) -> dict[str, Any]:
                 rows.append((time.perf_counter() - wall, time.thread_time() - cpu))
             return np.array(rows) * 1e3
 
-        turn(150)  # the first ones learn the rig, and wait for the compiler
+        turn(150)  # the first updates learn the rig and compile code
         for _ in range(options.turns):
             kinds["nobody"].append(turn(options.updates))
             with looked_at(page, options.viewers):
@@ -104,15 +104,15 @@ def measure(options: Options) -> dict[str, Any]:
 
 
 def table(result: Mapping[str, Any]) -> str:
-    """Markdown."""
+    """Make the table, as Markdown."""
     keys = ("p50_ms", "p95_ms", "p99_ms", "cpu_p50_ms", "cpu_p99_ms")
-    names = {"nobody": "nobody looks", "viewers": f"{result['viewers']} viewers, and one that never reads"}
+    names = {"nobody": "no viewers", "viewers": f"{result['viewers']} viewers, and one that never reads"}
     rows = [[names[name], *(f"{row[key]:.2f}" for key in keys)] for name, row in result["rows"].items()]
     return markdown(["update and publication, ms", "p50", "p95", "p99", "CPU p50", "CPU p99"], rows)
 
 
 def main() -> None:
-    """Measure, write, print."""
+    """Measure, write and print."""
     options = tyro.cli(Options, description=__doc__)
     before = surroundings()
     write_json(options.out, before | measure(options))

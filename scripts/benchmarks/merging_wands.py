@@ -1,9 +1,9 @@
-"""Wands whose markers merge: is a steady camera said to have moved, and is one that was bumped found?
+"""Wands whose markers merge: is a steady camera reported as moved, and is a bumped one found?
 
-Run as `python -m scripts.benchmarks.merging_wands`. Rings, domes and rows of cameras see a wand, carried by hand or put
-anywhere. Where the discs of two markers touch, a camera has one blob, round and sharp, between them: as its detector
-gives it, with the sigma of one marker and no flag. In steady captures nothing moves; in the others one camera is turned
-by 0.1 to 1 degree before a snapshot drawn at random. What has been run with the same code is not run again
+Run as `python -m scripts.benchmarks.merging_wands`. Rings, domes and rows of cameras see a wand, carried by hand or at
+random poses. Where the discs of two markers touch, a camera has one round and sharp blob between them, with the sigma
+of one marker and no flag, like a detector's output. In steady captures nothing moves; in the others one camera is
+rotated by 0.1 to 1 degree before a random snapshot. Finished items of the same code are not run again
 (`out/work/merging_wands`).
 """
 
@@ -33,18 +33,18 @@ RESULT = ROOT / "docs" / "benchmarks" / "merging_wands.json"
 SHAPES: tuple[Literal["ring", "dome", "row"], ...] = ("ring", "dome", "row")
 CAMERAS = (4, 6, 8, 10)
 LENGTHS = (20, 20, 30, 30, 50, 50, 80, 120, 200)
-"""Snapshots; short captures are the usual ones."""
+"""Range of the number of snapshots; most captures are short."""
 RATES = (5.0, 15.0, 30.0)
-"""Snapshots a second of a wand that is carried: the slower it goes from one to the next, the more of them are alike."""
+"""Snapshots per second of a carried wand: the slower it moves between them, the more similar they are."""
 BY_HAND = 0.7
-"""Share of captures in which it is carried; in others it is put anywhere."""
+"""Share of captures in which the wand is carried; in the others its poses are random."""
 MARKER = 6.0  # mm, radius of a marker
-EDGES = 1.0  # px between the edges of two discs that merge
-NOISE, CLAIMED = 0.014, 0.012  # px, of a centre, and the sigma that its blob claims
-MISSED, CLUTTER = 0.01, 0.1  # share of the markers; false blobs a frame
+EDGES = 1.0  # px, largest gap between two discs that merge
+NOISE, CLAIMED = 0.014, 0.012  # px, noise of a centre, and sigma of its blob
+MISSED, CLUTTER = 0.01, 0.1  # share of missed markers; false blobs per frame
 DEGREES = (0.1, 1.0)
 AT_EITHER_END = 2
-"""Snapshots before and after a bump, at least, in which the camera sees the wand; fewer: `--last`."""
+"""Least number of snapshots before and after a bump in which the camera sees the wand; fewer with `--last`."""
 WANDS = {
     "wand4": [(-120.0, 0.0, 0.0), (-30.0, 0.0, 0.0), (150.0, 0.0, 0.0), (0.0, -350.0, 0.0)],
     "T5": [(-200.0, 0.0, 0.0), (-80.0, 0.0, 0.0), (0.0, 0.0, 0.0), (200.0, 0.0, 0.0), (0.0, -380.0, 0.0)],
@@ -54,7 +54,7 @@ WANDS = {
 
 @dataclass(frozen=True)
 class Capture:
-    """What cameras saw, and the truth."""
+    """Detections of a capture, and the ground truth."""
 
     detections: Detections
     factory: CameraRig
@@ -65,7 +65,7 @@ class Capture:
 
 @dataclass(frozen=True)
 class Bump:
-    """A camera that was turned before a snapshot."""
+    """A rotation of a camera before a snapshot."""
 
     camera: int
     snapshot: int
@@ -90,7 +90,7 @@ def scene(seed: int) -> tuple[CameraRig, CalibrationObject, Truth, np.random.Gen
 
 
 def turned(truth: Truth, obj: CalibrationObject, bump: Bump, draw: np.random.Generator) -> Truth:
-    """Turn a camera about some axis before a snapshot; the rig of the truth is that before."""
+    """Rotate a camera about a random axis before a snapshot; the true rig is the one before."""
     axis = torch.from_numpy(draw.standard_normal(3))
     step = torch.zeros(truth.rig.num_cameras, truth.rig.num_parameters, dtype=torch.float64)
     step[bump.camera, :3] = axis / axis.norm() * math.radians(bump.degrees)
@@ -110,7 +110,7 @@ def shown(truth: Truth) -> torch.Tensor:
 
 
 def images(truth: Truth, obj: CalibrationObject, draw: np.random.Generator) -> tuple[Detections, int]:
-    """What detectors find: blobs without labels, and how many of them are several markers."""
+    """Simulate detections: unlabelled blobs, and the number of merged ones."""
     points = truth.rig_from_object.apply(obj.points)
     depth = truth.rig.expand(len(points)).project(points).depth.numpy()
     focal = truth.rig.focal_length.mean(-1).numpy()[:, None]
@@ -156,9 +156,9 @@ def capture(seed: int, moving: bool = False, last: int | None = None) -> tuple[C
     """Simulate a capture.
 
     Args:
-        seed: of everything.
-        moving: a camera is bumped.
-        last: the bump is before so many of the last snapshots; None = anywhere.
+        seed: of all random values.
+        moving: bump a camera.
+        last: the bump is before this many of the last snapshots; None = at random.
     """
     rig, obj, truth, draw = scene(seed)
     bump = None
@@ -170,11 +170,11 @@ def capture(seed: int, moving: bool = False, last: int | None = None) -> tuple[C
 
 
 def drawn_bump(truth: Truth, draw: np.random.Generator, last: int | None) -> Bump:
-    """Draw a camera that sees the wand, the moment, and how far it is turned."""
+    """Draw a camera that sees the wand, and the snapshot and size of its rotation."""
     whole = shown(truth).all(-1).numpy()
     degrees = math.exp(draw.uniform(math.log(DEGREES[0]), math.log(DEGREES[1])))
     cameras = np.flatnonzero(whole.sum(0) >= 4 * AT_EITHER_END)
-    if last is not None:  # such as see it at the end
+    if last is not None:  # cameras that see it at the end
         cameras = np.intersect1d(cameras, np.flatnonzero(whole[-last:].all(0)))
     camera = int(draw.choice(cameras if len(cameras) else np.arange(whole.shape[1])))
     rows = np.flatnonzero(whole[:, camera])
@@ -192,7 +192,7 @@ class Item:
 
 
 def run(item: Item) -> dict[str, Any]:
-    """Say what becomes of a capture."""
+    """Calibrate a capture, and describe the outcome."""
     made, bump = capture(item.seed, item.moving, item.last)
     began = time.process_time()
     said: dict[str, Any] = {
@@ -217,13 +217,13 @@ def run(item: Item) -> dict[str, Any]:
 
 
 def _judged(said: dict[str, Any], bump: Bump, made: Capture) -> str:
-    """Whether a bump was found: `right` camera and moment, `other` (camera or moment), else as it was."""
+    """Judge the report of a bump: `right` camera and snapshot, `other` (camera or snapshot), else the outcome."""
     if said["outcome"] == "accepted":
         named = any(camera == said["camera"] for camera, _ in said["doubtful"])
         return "doubted" if named else "accepted"
     if said["outcome"] != "moved":
         return str(said["outcome"])
-    # A camera moves unseen until it sees the wand again, and is off by less than it can tell for some snapshots.
+    # A move is invisible until the camera sees the wand again, and too small to detect for some snapshots more.
     seeing = np.flatnonzero(shown(made.truth).sum(-1).numpy()[:, bump.camera] >= 3)
     first = np.searchsorted(seeing, bump.snapshot)
     near = {f"{s:05d}" for s in seeing[max(first - 1, 0) : first + 2]} | {f"{bump.snapshot:05d}"}
@@ -232,7 +232,7 @@ def _judged(said: dict[str, Any], bump: Bump, made: Capture) -> str:
 
 
 def measure(seeds: int, moved: int, last: int, cores: int | None) -> dict[str, Any]:
-    """Run everything."""
+    """Run all captures."""
     items = [Item(seed, False) for seed in range(seeds)] + [Item(1000 + seed, True) for seed in range(moved)]
     items += [Item(2000 + seed, True, 1 + seed % 2) for seed in range(last)]
     rows = []
@@ -262,7 +262,7 @@ def _brief(row: dict[str, Any]) -> str:
 
 
 def table(result: dict[str, Any]) -> str:
-    """Markdown."""
+    """Make the table, as Markdown."""
     kinds = ("accepted", "moved", "right", "other", "doubted", "refused", "false_notes")
     rows = [[n, str(row["captures"]), *(str(row.get(kind, 0)) for kind in kinds)] for n, row in result.items()]
     return markdown(["captures", "number", *(kind.replace("_", " ") for kind in kinds)], rows)
@@ -270,17 +270,17 @@ def table(result: dict[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Options:
-    """Calibrate captures of wands whose markers merge, steady ones and such with a bump."""
+    """Calibrate captures of wands whose markers merge, with and without a bump."""
 
     seeds: int = 200  #: steady captures
-    moved: int = 60  #: captures with a bump anywhere
+    moved: int = 60  #: captures with a bump at a random snapshot
     last: int = 40  #: captures with a bump before the last snapshot or the last two
     cores: int | None = 1
     out: Path = RESULT
 
 
 def main() -> None:
-    """Run, count, write, print."""
+    """Run the captures, then count, write and print the outcomes."""
     options = tyro.cli(Options, description=__doc__)
     before, began = surroundings(), time.monotonic()
     result = measure(options.seeds, options.moved, options.last, options.cores)

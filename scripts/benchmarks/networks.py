@@ -1,4 +1,4 @@
-"""One rig at a time through each shipped network and its refinement, beside the paper's networks; training rigs/s."""
+"""Latency of one rig with each shipped network and its refinement, and with the paper's; training throughput."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from scripts.benchmarks.effort import Effort
 from scripts.output import BLUE, GREY, figure, markdown
 from scripts.timing import Timing, side_by_side
 
-# The paper's networks: untrained, because full-size training needs a GPU; time does not depend on the weights.
+# The paper's networks are untrained, because full-size training needs a GPU; time does not depend on the weights.
 PAPERS = {"points": "paper-points", "cnn1d": "paper-cnn1d", "vit": "paper-vit", "cnn": "paper-cnn2d"}
 LATENCY, TRAINING = "networks latency", "networks training"
 Calls = dict[str, Callable[[], object]]
 
 
 def measure(effort: Effort) -> dict[str, Any]:
-    """Time all networks in turn, one thread, one rig."""
+    """Time all networks in turn, with one thread and one rig."""
     torch.set_num_threads(1)
-    # Names that end in rig and object: the others are parts of a detector, which belong to neither.
+    # Names that end in rig and object; the others are parts of detectors, without a rig and object.
     paths = sorted(data_path("models").glob("*-*-*.safetensors"))
     if effort.smoke:
         paths = [path for path in paths if path.stem.startswith("points")]
@@ -51,7 +51,7 @@ def measure(effort: Effort) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, str]:
-    """Latency of one rig; training throughput."""
+    """Make the tables: latency of one rig, and training throughput."""
     head = ("network", "parameters, M", "file, MB", "alone, ms p50 / p99", "refined, ms p50 / p99")
     rows = [
         (
@@ -68,18 +68,18 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
     trained = [(name, str(row["batch_size"]), f"{row['rigs_per_s']:.0f}") for name, row in result["training"].items()]
     return {
         LATENCY: markdown(head, rows),
-        TRAINING: markdown(("shipped encoder", "rigs a step", "rigs/s of training"), trained),
+        TRAINING: markdown(("shipped encoder", "rigs per step", "rigs/s of training"), trained),
     }
 
 
 def draw(result: Mapping[str, Any], path: Path) -> None:
-    """Latency against the number of parameters."""
+    """Draw latency over the number of parameters."""
     with figure(path, size=(6.0, 3.4)) as [axes]:
         for name, row in result["networks"].items():
             ours = "megabytes" in row
             time_ms = row["refined" if ours else "alone"]["p50"]
             axes.plot(row["parameters"] / 1e6, time_ms, "o", color=BLUE if ours else GREY, markersize=5)
-            if not name.endswith("cube8"):  # as large and as fast as its sibling
+            if not name.endswith("cube8"):  # same size and speed as its sibling
                 place = (row["parameters"] / 1e6, time_ms)
                 axes.annotate(name.split("-O10")[0], place, fontsize=7, xytext=(5, 3), textcoords="offset points")
         axes.set(xscale="log", yscale="log", xlabel="parameters, millions", ylabel="one rig: ms, 1 thread")
@@ -92,7 +92,7 @@ def _row(network: torch.nn.Module, parts: Calls, timings: Mapping[str, Timing], 
 
 
 def _views(trained: Checkpoint, network: Network) -> Views:
-    """What the cameras of one drifted rig see."""
+    """Simulate the views of one drifted rig."""
     factory, drift = trained.rig.to(torch.float32), trained.experiment.drift
     seen = synthesize(factory, trained.obj, 1, torch.Generator().manual_seed(0), drift=drift).projection
     options = network.image_options
@@ -108,7 +108,7 @@ def _forward(network: Network, trained: Checkpoint) -> Callable[[], object]:
 
 
 def _calls(trained: Checkpoint) -> Calls:
-    """Forward alone, and with the refinement."""
+    """Make the calls to time: forward pass alone, and with refinement."""
     network, views = trained.network, _views(trained, trained.network)
     given = (trained.rig, trained.obj, trained.drift_std)
 
@@ -129,7 +129,7 @@ def _untrained(preset: str, like: Checkpoint) -> Network:
 
 
 def _throughput(name: str, steps: int) -> dict[str, float]:
-    """Everything a training step does: synthesis, drawing, forward, loss, backward, optimizer."""
+    """Time full training steps: synthesis, drawing, forward, loss, backward, optimizer."""
     experiment = load_experiment(name, ["training.validation_rigs=0", "training.device=cpu", "training.threads=1"])
     run = prepare(experiment)
     train_step(run)

@@ -1,9 +1,9 @@
 """How many poses a second does an OpenIGTLink client get: `python -m scripts.benchmarks.open_igt_link --seconds 20`.
 
-Poses are published at 60 Hz, by the clock, and two clients of pyigtl in another process read them: one that keeps every
-message, and one that asks for the latest as pyigtl offers it. Rates are by the time stamps in the messages. With
-`--watch` the same with all that comes before: a simulated rig sends blobs at 60 Hz by ZeroMQ, and `imgcal watch`
-publishes the poses (for a machine with nothing else to do). Writes docs/benchmarks/open_igt_link.json.
+Poses are published at 60 Hz, by the clock, and two pyigtl clients in another process read them: one keeps every
+message, and one asks for the latest, as pyigtl offers it. Rates come from the time stamps in the messages. With
+`--watch` also the whole chain: a simulated rig sends blobs at 60 Hz by ZeroMQ, and `imgcal watch` publishes the poses
+(needs an idle machine). Writes docs/benchmarks/open_igt_link.json.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from tests.imgcal.watch.test_poses import record
 RESULT = ROOT / "docs" / "benchmarks" / "open_igt_link.json"
 EXAMPLE = ROOT / "scripts" / "examples" / "send_blobs.py"
 RATE = 60.0
-SETTLED = 90  # poses that are not counted: connections are made, loops are compiled
-PATIENCE = 900.0  # s until the first pose
+SETTLED = 90  # first poses, not counted, while connections are made and loops compiled
+PATIENCE = 900.0  # s to wait for the first pose
 
 
 class Every(dict[str, Any]):
-    """What pyigtl keeps of its messages: not only the latest of each device."""
+    """Replaces pyigtl's message buffer, to keep all messages instead of the latest per device."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -48,10 +48,10 @@ class Every(dict[str, Any]):
 
 
 def main() -> None:
-    """Measure and write."""
+    """Measure, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--watch", action="store_true", help="also what imgcal watch publishes")
+    parser.add_argument("--watch", action="store_true", help="also measure the poses that imgcal watch publishes")
     parser.add_argument("--publish", type=int, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.publish is not None:
@@ -62,7 +62,7 @@ def main() -> None:
 
 
 def measure(seconds: float, watch: bool) -> dict[str, Any]:
-    """Read what is published alone, and what `imgcal watch` publishes."""
+    """Measure a plain publisher, and with `watch` also `imgcal watch`."""
     port = free_port()
     with running(["-m", "scripts.benchmarks.open_igt_link", "--publish", str(port)]):
         result = {"sent_a_second": RATE, "published": read(port, seconds)}
@@ -72,7 +72,7 @@ def measure(seconds: float, watch: bool) -> dict[str, Any]:
 
 
 def read_watched(seconds: float) -> dict[str, Any]:
-    """From blobs to poses."""
+    """Measure the whole chain from blobs to poses."""
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         port, address = free_port(), f"ipc://{folder}/blobs"
         watch = ["-m", "imgcal", "watch", address, "--rig", "T4", "--object", "asymmetric8", "--out", f"{folder}/out"]
@@ -82,14 +82,14 @@ def read_watched(seconds: float) -> dict[str, Any]:
 
 
 def read(port: int, seconds: float) -> dict[str, Any]:
-    """Connect two clients, and count what each gets."""
+    """Connect two clients, and count the poses that each gets."""
     with connected(port) as every, connected(port) as latest:
         every.incoming_messages = kept = Every()
         asked: list[float] = []
         ends = time.monotonic() + PATIENCE
         while len(kept.stamps) <= SETTLED or kept.stamps[-1] - kept.stamps[SETTLED] < seconds:
             if time.monotonic() > ends:
-                raise RuntimeError(f"{len(kept.stamps)} poses came")
+                raise RuntimeError(f"received only {len(kept.stamps)} poses")
             message = latest.wait_for_message("ObjectToRig", timeout=1.0)
             if message is not None and len(kept.stamps) >= SETTLED:
                 asked.append(float(message.timestamp))
@@ -103,7 +103,7 @@ def read(port: int, seconds: float) -> dict[str, Any]:
 
 
 def publish(port: int) -> None:
-    """Publish poses by the clock until the process is ended."""
+    """Publish poses by the clock until the process is terminated."""
     sink, number, began = OpenIGTLink(port=port), 0, time.monotonic()
     while True:
         sink.send(replace(record(number), time=time.time()))
@@ -112,13 +112,13 @@ def publish(port: int) -> None:
 
 
 def rate_of(stamps: list[float]) -> float:
-    """Messages a second, by their own times."""
+    """Messages per second, by their time stamps."""
     return (len(stamps) - 1) / (stamps[-1] - stamps[0])
 
 
 @contextlib.contextmanager
 def running(arguments: list[str]) -> Iterator[subprocess.Popen[bytes]]:
-    """A Python process that is ended afterwards."""
+    """Run a Python process, and terminate it at the end."""
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL, env=environment)
     try:
@@ -130,7 +130,7 @@ def running(arguments: list[str]) -> Iterator[subprocess.Popen[bytes]]:
 
 @contextlib.contextmanager
 def connected(port: int) -> Iterator[Any]:
-    """A client of pyigtl, which goes on trying to connect."""
+    """Connect a pyigtl client, which retries until it succeeds."""
     client = pyigtl.OpenIGTLinkClient("127.0.0.1", port)
     try:
         yield client
@@ -139,7 +139,7 @@ def connected(port: int) -> Iterator[Any]:
 
 
 def free_port() -> int:
-    """One that nobody listens at."""
+    """Find a free port."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         return int(listening.getsockname()[1])
 

@@ -1,4 +1,4 @@
-"""Other people's tools, which may be absent: ``pip install -e '.[peers]'`` brings those of the package registry."""
+"""Other tools, which may be absent: ``pip install -e '.[peers]'`` installs those on PyPI."""
 
 from __future__ import annotations
 

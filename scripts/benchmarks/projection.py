@@ -1,4 +1,4 @@
-"""Projection and distortion: one camera with many points, batches of rigs, derivatives; synthesis of rigs on top."""
+"""Projection and distortion: one camera with many points, batches of rigs, derivatives, and synthesis of rigs."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from scripts.benchmarks.peers.projections import Run, Views
 from scripts.output import BLUE, GREY, figure, markdown
 from scripts.timing import side_by_side
 
-POINTS = (1_000, 10_000, 100_000, 1_000_000, 10_000_000)  # of one camera
-RIGS = (1, 64, 512, 4096)  # of 10 cameras and 8 fiducials
+POINTS = (1_000, 10_000, 100_000, 1_000_000, 10_000_000)  # in one camera
+RIGS = (1, 64, 512, 4096)  # with 10 cameras and 8 fiducials
 DERIVATIVES = (("camera", 10_000), ("rigs", 64), ("rigs", 512))
 OURS, OURS_SINGLE = "**imgcal**", "**imgcal**, float32"
 TENSORS, OURS_KORNIA = "imgcal's tensors, any device", "imgcal's kornia path"
@@ -40,12 +40,12 @@ COMPUTES = {
     KORNIA: "one gradient, also by points",
     OPENCV: "Jacobian by camera",
 }
-OBSERVED = slice(6, 15)  # focal length, principal point, distortion: the same in everybody's parametrization
+OBSERVED = slice(6, 15)  # focal length, principal point, distortion: the same in all parametrizations
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Cameras and what is before them, in float64."""
+    """Cameras and points in front of them, in float64."""
 
     rig: CameraRig  # (B,)
     rig_from_object: RigidTransform  # (B,)
@@ -73,7 +73,7 @@ class Scene:
 
 
 def measure(effort: Effort) -> dict[str, Any]:
-    """Time all of them on the same points."""
+    """Time all tools on the same points."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     sizes = [("camera", n) for n in effort.pick(POINTS, (50,))] + [("rigs", n) for n in effort.pick(RIGS, (2,))]
@@ -99,7 +99,7 @@ def scene_of(kind: str, count: int) -> Scene:
 
 
 def value_cases(scene: Scene) -> dict[str, Run | None]:
-    """Ways to project; None: the tool is absent. Each returns (B, C, N, 2)."""
+    """Functions that project; None = the tool is absent. Each returns (B, C, N, 2)."""
     rig, points, views = scene.rig, scene.points, scene.views
     single, few = rig.to(torch.float32), points.float()
     lens = (rig.focal_length, rig.principal_point, rig.distortion, rig.image_size)
@@ -116,7 +116,7 @@ def value_cases(scene: Scene) -> dict[str, Run | None]:
 
 
 def derivative_cases(scene: Scene, upstream: Tensor) -> dict[str, tuple[Run, Callable[[Any], np.ndarray]]]:
-    """Ways to differentiate: what to time, and what takes upstream (B, C, N, 2) times J (B * C, 9) from its answer."""
+    """Functions to time, each with one that extracts upstream (B, C, N, 2) times J (B * C, 9) from its result."""
     views, pull = scene.views, upstream.numpy()
     rig = scene.rig
     inputs = (rig.focal_length, rig.principal_point, rig.distortion, rig.cam_from_rig.rotation)
@@ -144,13 +144,13 @@ def derivative_cases(scene: Scene, upstream: Tensor) -> dict[str, tuple[Run, Cal
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, str]:
-    """Nanoseconds a point by size, derivatives, synthesis."""
+    """Make the tables: nanoseconds per point by size, derivatives, synthesis."""
     names = list(result["shapes"][0]["rows"])
     made = {}
     for kind, marker, unit in (("camera", "projection camera", "points"), ("rigs", "projection rigs", "rigs")):
         shapes = [shape for shape in result["shapes"] if shape["kind"] == kind]
         rows = [[name, *(_cell(shape, name) for shape in shapes), _worst(shapes, name)] for name in names]
-        head = ("ns a point, p50", *(f"{shape['count']:,} {unit}" for shape in shapes), "largest difference, px")
+        head = ("ns per point, p50", *(f"{shape['count']:,} {unit}" for shape in shapes), "largest difference, px")
         made[marker] = markdown(head, rows)
     shapes = result["derivatives"]
     labels = [f"{s['count']:,} points" if s["kind"] == "camera" else f"{s['count']:,} rigs" for s in shapes]
@@ -158,7 +158,9 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
         [name, what, *(_cell(shape, name) for shape in shapes), _worst(shapes, name, "{:.0e}")]
         for name, what in COMPUTES.items()
     ]
-    made["projection derivatives"] = markdown(("ns a point, p50", "what", *labels, "largest relative difference"), rows)
+    made["projection derivatives"] = markdown(
+        ("ns per point, p50", "result", *labels, "largest relative difference"), rows
+    )
     rows = [
         [row["name"], *(f"{1e3 * row['rigs'] / row['times'][n]['p50']:,.0f}" for n in row["times"])]
         for row in result["synthesis"]["rows"]
@@ -169,7 +171,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
 
 
 def draw(result: Mapping[str, Any], path: Path) -> None:
-    """Nanoseconds a point, over points of one camera and over rigs."""
+    """Draw nanoseconds per point, over points of one camera and over rigs."""
     with figure(path, panels=2, size=(9.0, 3.4)) as panels:
         for axes, kind, label in zip(panels, ("camera", "rigs"), ("points of one camera", "rigs"), strict=True):
             shapes = [shape for shape in result["shapes"] if shape["kind"] == kind]
@@ -218,7 +220,7 @@ def _measure_derivatives(kind: str, count: int, effort: Effort) -> dict[str, Any
 
 
 def _equations(scene: Scene, upstream: Tensor) -> Run:
-    """One linearization by the estimate's compiled loop, at observations that leave `upstream` as residuals."""
+    """Linearize once with the estimate's compiled loop, for observations whose residuals are `upstream`."""
     rig, points = scene.rig, scene.points_object
     centroid = points.mean(0)
     observed = rig.project_values(scene.points).uv - upstream
@@ -232,7 +234,7 @@ def _equations(scene: Scene, upstream: Tensor) -> Run:
 
 
 def _measure_synthesis(effort: Effort) -> dict[str, Any]:
-    """Rigs with drift, pose, projection and visibility check, as training draws them: float32."""
+    """Time the synthesis of rigs for training: drift, pose, projection and visibility check, float32."""
     rig, obj = read_rig("O10").to(torch.float32), load_object("asymmetric8")
     generator = torch.Generator().manual_seed(0)
     batches, count = effort.pick(((64, 512, 4096), 512), ((8,), 8))

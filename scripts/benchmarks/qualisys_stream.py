@@ -1,9 +1,9 @@
 """Do ten cameras at 100 Hz from QTM give the same events as a file: `python -m scripts.benchmarks.qualisys_stream`.
 
 A small server speaks QTM's protocol. It sends the markers of a simulated rig in real time: some frames are lost,
-packets that mean nothing come in between, and the connection breaks in the middle of a packet. One camera is turned on
-the way. The frames that arrive whole are also written to a file of JSON lines, with the times that they came to have.
-Both are watched; events and the rig at the end are compared. Writes docs/benchmarks/qualisys_stream.json.
+invalid packets are inserted, and the connection breaks in the middle of a packet. One camera is rotated halfway. Frames
+that arrive complete are also written to a file of JSON lines, with their times of arrival. Both are watched; events and
+the final rigs are compared. Writes docs/benchmarks/qualisys_stream.json.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from tests.imgcal.watch.qtm import Qtm, frame, general, packet
 
 RESULT = ROOT / "docs" / "benchmarks" / "qualisys_stream.json"
 RATE = 100.0  # Hz
-LOST = 0.02  # of the frames
-BREAKS = 3  # of the connection
-TURN = 0.3  # degrees, of the second camera, after half of the time
+LOST = 0.02  # share of lost frames
+BREAKS = 3  # interruptions of the connection
+TURN = 0.3  # degrees, rotation of the second camera after half of the time
 SIGMA = 0.07  # px
-PATIENCE = 20.0  # s without a snapshot
+PATIENCE = 20.0  # s to wait for a snapshot
 
-Markers = list[NDArray[np.float64]]  # of each camera, (K, 2) pixels
+Markers = list[NDArray[np.float64]]  # (K, 2) pixels for each camera
 
 
 def main() -> None:
-    """Measure and write."""
+    """Measure, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=30.0)
     given = parser.parse_args()
@@ -89,7 +89,7 @@ def measure(seconds: float, rig_name: str = "O10") -> dict[str, Any]:
 
 
 def frames_of(stream: Stream, count: int) -> list[Markers]:
-    """What each camera sees, in 64ths of a pixel."""
+    """Simulate the markers in each camera, rounded to 1/64 of a pixel."""
     bumped, found = stream.bumped([1], turn_deg=TURN), []
     for number in range(count):
         blobs, _ = stream.blobs(number, bumped if number >= count // 2 else stream.true, noise=SIGMA)
@@ -104,7 +104,7 @@ def with_faults(
     """Distribute frames over connections.
 
     Returns:
-        For each connection when what is sent, and the numbers of the frames that arrive whole.
+        For each connection, the packets and their times; and the numbers of the frames that arrive complete.
     """
     parts = np.array_split(np.array(kept), BREAKS + 1)
     connections, arrive = [], []
@@ -122,7 +122,7 @@ def with_faults(
 
 
 def garbage(number: int, markers: Markers, random: np.random.Generator) -> bytes:
-    """A packet that means nothing, as long as it says it is."""
+    """Make an invalid packet with a correct length."""
     choices = (
         packet(3, b""),
         packet(3, random.bytes(200)),
@@ -137,7 +137,7 @@ def garbage(number: int, markers: Markers, random: np.random.Generator) -> bytes
 
 
 def lines_of(moment: float, markers: Markers, rig: CameraRig) -> str:
-    """A snapshot as lines of JSON."""
+    """Format a snapshot as lines of JSON."""
     return "".join(
         json.dumps({"camera": name, "time": moment, "uv": uv.tolist()}) + "\n"
         for name, uv in zip(rig.camera_names, markers, strict=True)
@@ -145,7 +145,7 @@ def lines_of(moment: float, markers: Markers, rig: CameraRig) -> str:
 
 
 def watched(source: Source, stream: Stream, count: int) -> tuple[list[dict[str, Any]], CameraRig, list[float], int]:
-    """Follow a source for so many snapshots: events, the rig at the end, times, unreadable packets."""
+    """Follow a source for `count` snapshots: events, final rig, times, unreadable packets."""
     events: list[dict[str, Any]] = []
     times: list[float] = []
     with RigKeeper(stream.rig, stream.obj) as keeper, SourceReader(source, stream.rig, keep_all=True) as intake:
@@ -160,7 +160,7 @@ def watched(source: Source, stream: Stream, count: int) -> tuple[list[dict[str, 
 
 
 def differences(events: Sequence[dict[str, Any]], expected: Sequence[dict[str, Any]]) -> int:
-    """How many events differ; numbers may by a millionth, since times of the stream are rounded otherwise."""
+    """Count different events; numbers may differ by a millionth, since the stream rounds times differently."""
     differ = abs(len(events) - len(expected))
     for one, other in zip(events, expected, strict=False):
         same = one.keys() == other.keys() and all(_is_same(one[key], other[key]) for key in one)

@@ -1,7 +1,7 @@
-"""Are the sigmas of a calibration honest on real noise? Disjoint blocks of one real stream, calibrated independently.
+"""Are predicted errors right on real noise? Calibrates disjoint blocks of one real stream independently.
 
-Run as `python -m scripts.benchmarks.real_blocks`; needs IMGCAL_CAPTURES. Nothing moved in the recording, so that all
-blocks have one true rig: their differences should be as large as their covariances say.
+Run as `python -m scripts.benchmarks.real_blocks`; needs IMGCAL_CAPTURES. Nothing moved in the recording, so all blocks
+have the same true rig, and their differences should match their covariances.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from scripts.output import ROOT, command, surroundings, write_json
 
 CAPTURE = "wand-ten-cameras-stream"
 GATE = 1.6
-"""Most chi2 per degree of freedom of focal lengths and positions."""
+"""Largest permitted chi2 per degree of freedom of focal lengths and positions."""
 ROUNDS = 20
-"""Of weighing cameras by how well they fit, when the motion of the whole rig is taken out."""
+"""Iterations of reweighting cameras by their fit when the motion of the whole rig is removed."""
 RESULT = ROOT / "docs" / "benchmarks" / "real_blocks.json"
 
 
@@ -38,16 +38,16 @@ class Block:
     """One calibration."""
 
     calibration: Calibration
-    said_to_move: str | None  # refused at first, because this camera is said to have moved
+    said_to_move: str | None  # refused at first, because this camera was reported as moved
 
     def covariance(self, inflated: bool) -> Tensor:
-        """Covariance of all parameters (K C, K C), with or without what the scatter of the snapshots adds."""
+        """Covariance of all parameters (K C, K C), with or without the inflation by the scatter of the snapshots."""
         found = self.calibration.estimate
         return camera_covariance(found if inflated else replace(found, inflation=None), curved=False)
 
 
 def calibrated(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Block:
-    """Calibrate unlabelled blobs; where a move is claimed, which is wrong here, without asking for moves."""
+    """Calibrate from unlabelled blobs; if a move is reported, which is wrong here, repeat without that check."""
     try:
         return Block(calibrate(detections, rig, obj), None)
     except MovedError as error:
@@ -56,15 +56,15 @@ def calibrated(detections: Detections, rig: CameraRig, obj: CalibrationObject) -
 
 
 def frames(detections: Detections, first: int, last: int) -> Detections:
-    """Keep the frames of these numbers, `last` excluded; snapshots are named after their frames."""
+    """Keep frames `first` to `last` (excluded); snapshots are named after their frames."""
     rows = [row for row, name in enumerate(detections.snapshot_names) if first <= int(name) < last]
     return detections.of_snapshots(rows[0], rows[-1] + 1)
 
 
 def chi2_by_kind(rigs: Sequence[CameraRig], covariances: Sequence[Tensor]) -> dict[str, float]:
-    """Scatter of rigs about their weighted mean over their variances, per degree of freedom, by kind of parameter.
+    """Scatter of rigs about their weighted mean divided by their variances, per degree of freedom and parameter kind.
 
-    The motion of the whole rig between them is taken out first, by a fit in which cameras that differ count less; the
+    The motion of the whole rig between them is removed first, by a fit that gives outlying cameras less weight. The
     same projection is applied to the covariances.
     """
     cameras, width = rigs[0].num_cameras, rigs[0].num_parameters
@@ -90,7 +90,7 @@ def chi2_by_kind(rigs: Sequence[CameraRig], covariances: Sequence[Tensor]) -> di
 
 
 def measure(blocks: Sequence[Block]) -> dict[str, Any]:
-    """Compare calibrations of one rig with each other."""
+    """Compare calibrations of the same rig."""
     rigs = [block.calibration.rig for block in blocks]
     published = chi2_by_kind(rigs, [block.covariance(True) for block in blocks])
     return {
@@ -119,12 +119,12 @@ class Options:
 
     first: int = 0  #: frame
     blocks: int = 6
-    length: int = 400  #: frames of a block
+    length: int = 400  #: frames per block
     out: Path = RESULT
 
 
 def main() -> None:
-    """Measure, write, print.
+    """Measure, write and print.
 
     Raises:
         InputError: no captures.

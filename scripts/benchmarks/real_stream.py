@@ -1,11 +1,11 @@
-"""Gates of a running rig on the real stream: left alone, and with one camera turned.
+"""Targets for a running rig on the real stream: untouched, and with one camera rotated.
 
-Run as `python -m scripts.benchmarks.real_stream`. Frames 0-2399, every eighth, are calibrated; the keeper starts from
-that and follows frames 2400-4799. Nothing moved in this recording, so every event but a loss of the wand is false. A
-camera that is turned can only be known to be so while it sees the wand: delays count that time. What has been run with
-the same code is not run again (`out/work/real_stream`).
+Run as `python -m scripts.benchmarks.real_stream`. A calibration uses every eighth of frames 0-2399; the keeper starts
+from it and follows frames 2400-4799. Nothing moved in this recording, so every event except a loss of the wand is
+false. A rotation can only be detected while the camera sees the wand, so delays count only that time. Finished runs of
+the same code are not repeated (`out/work/real_stream`).
 
-With `--lights`, nothing is known of the wand: its markers are lights, each of which may be anywhere.
+With `--lights`, the wand is unknown: its markers are separate lights at unknown positions.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from scripts.output import ROOT, WORK, command, markdown, surroundings, write_js
 RESULT = ROOT / "docs" / "benchmarks" / "real_stream.json"
 LIGHTS_RESULT = RESULT.with_name("real_stream_lights.json")
 QUIET = ("camera_lost", "camera_back")
-"""Events that are true: cameras lose the wand. Each is to be reported once."""
+"""True events: cameras lose the wand. Each should be reported once."""
 BUMPED = 3000
-"""Frame from which on a camera is turned."""
+"""First frame after a camera is rotated."""
 AFTER = 6.0
-"""Seconds in which a turned camera sees the wand that it is followed for, or to the end of the recording."""
+"""Seconds of seeing the wand for which a rotated camera is followed, unless the recording ends before."""
 LIMITS = {0.1: 5.0}
-"""Seconds of seeing the wand within which a turn (degrees) must be reported; others: `LIMIT`."""
+"""Seconds of seeing the wand within which a rotation (degrees) must be reported; default: `LIMIT`."""
 LIMIT, LIGHTS_LIMIT = 1.0, 2.0
 SCORE_EVERY = 100
 """Frames between scores."""
 WORST_FINAL, WORST_ON_THE_WAY = 1.0, 1.2
-"""Gates: final rig to the calibration, and any rig on the way to that which it started from."""
+"""Targets: error of the final rig relative to the calibration, and of any rig on the way relative to the first."""
 
 
 def start(calibration: imgcal.Calibration, lights: bool = False) -> imgcal.RigKeeper:
-    """Begin to keep a rig that has just been calibrated; `lights`: nothing is known of what it will see."""
+    """Start a keeper from a new calibration; `lights`: the markers that it will see are unknown."""
     return imgcal.RigKeeper(calibration.rig, imgcal.CalibrationObject.unknown() if lights else calibration.obj)
 
 
@@ -55,14 +55,14 @@ def start(calibration: imgcal.Calibration, lights: bool = False) -> imgcal.RigKe
 class Case:
     """One run through the stream."""
 
-    stride: int  # every which frame
-    camera: int | None = None  # that is turned; None = nothing is touched
+    stride: int  # step between frames
+    camera: int | None = None  # rotated camera; None = untouched
     degrees: float = 0.0
-    lights: bool = False  # nothing is known of the wand
+    lights: bool = False  # the wand is unknown
 
     @property
     def key(self) -> str:
-        """What its result is found by."""
+        """Identify the result of the run."""
         seen = "lights, " if self.lights else ""
         return f"{seen}stride {self.stride}, camera {self.camera}, {self.degrees} degrees"
 
@@ -73,7 +73,7 @@ def run(case: Case) -> dict[str, Any]:
 
 
 def untouched(case: Case) -> dict[str, Any]:
-    """Follow the stream as it is; list all events, score the rig on the way."""
+    """Follow the original stream; list all events, and score the rig on the way."""
     given, known, stride = recording(), calibrated(), case.stride
     batch, batch_median = known.score(known.calibration.rig)
     events, scores, refused, began = [], [], Counter[str](), time.process_time()
@@ -109,7 +109,7 @@ def untouched(case: Case) -> dict[str, Any]:
 
 
 def bumped(case: Case) -> dict[str, Any]:
-    """Turn one camera; follow it until it has seen the wand for a while."""
+    """Rotate one camera, and follow the stream until it has seen the wand for a while."""
     given, known = recording(), calibrated()
     assert case.camera is not None
     name, frames = given.factory.camera_names[case.camera], FOLLOWED[:: case.stride]
@@ -133,7 +133,7 @@ def bumped(case: Case) -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def kept_until_bump(stride: int, lights: bool) -> tuple[list[dict[str, Any]], bytes]:
-    """Follow the stream until a camera is turned: all events, and the state of the keeper."""
+    """Follow the stream until a camera is rotated; return all events, and the state of the keeper."""
     given, events = recording(), []
     with start(calibrated().calibration, lights) as keeper, tempfile.TemporaryDirectory() as folder:
         for number in (n for n in FOLLOWED[::stride] if n < BUMPED):
@@ -151,20 +151,20 @@ def judge(
     limit: float,
     stride: int = 1,
 ) -> dict[str, Any]:
-    """Say whether a bump was reported in time, and what else was.
+    """Judge whether a bump was reported in time, and count other events.
 
     Args:
-        events: as `plain` gives them.
-        camera: that was bumped.
-        kind: how.
-        since: frame from which on it was.
-        seeing: frames from then on in which that camera sees the object, in ascending order.
+        events: from `plain`.
+        camera: the bumped camera.
+        kind: of the bump.
+        since: first frame after the bump.
+        seeing: frames after the bump in which that camera sees the object, in ascending order.
         limit: seconds of seeing the object.
-        stride: every which frame is followed.
+        stride: step between frames.
 
     Returns:
-        Among others `delay_s`, from the first of the latter on, and `seen_s`, how long the camera saw the object in
-        that time.
+        Among others `delay_s`, the time from the first frame in `seeing`, and `seen_s`, how long the camera saw the
+        object in that time.
     """
     loud = [event for event in events if event["event"] not in QUIET]
     before, after = ([e for e in loud if (e["frame"] >= since) is late] for late in (False, True))
@@ -191,7 +191,7 @@ def judge(
 
 
 def plain(event: imgcal.Event, frame: int) -> dict[str, Any]:
-    """Take an event apart into plain values."""
+    """Convert an event into plain values."""
     return {
         "frame": frame, "event": event.kind, "camera": event.camera, "change": event.change, "size": event.size,
         "sigma": event.sigma, "unit": event.unit, "message": event.message,
@@ -199,7 +199,7 @@ def plain(event: imgcal.Event, frame: int) -> dict[str, Any]:
 
 
 def _lost_twice(events: list[dict[str, Any]]) -> int:
-    """Count losses of cameras that had not come back since their last one."""
+    """Count repeated losses of cameras that had not come back in between."""
     gone, twice = set(), 0
     for event in events:
         if event["event"] == "camera_lost":
@@ -211,7 +211,7 @@ def _lost_twice(events: list[dict[str, Any]]) -> int:
 
 
 def summarize(bumps: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Count what came of the bumps of one size and stride."""
+    """Count the outcomes of bumps, by size and stride."""
     groups: dict[tuple[int, float], list[dict[str, Any]]] = {}
     for bump in bumps:
         groups.setdefault((bump["stride"], bump["degrees"]), []).append(bump)
@@ -234,7 +234,7 @@ def summarize(bumps: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def tables(result: dict[str, Any]) -> dict[str, str]:
-    """Markdown, by name."""
+    """Make the tables, by name."""
     quiet = [
         [
             str(row["stride"]), str(row["false"]), ", ".join(f"{n} {k}" for k, n in row["false_by_kind"].items()),
@@ -252,27 +252,35 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
         for row in result["bumps"]
     ]  # fmt: skip
     head = ["every", "false events", "which", "losses (reported twice)", "final px", "to calibration", "worst to start",
-            "ms a frame"]  # fmt: skip
-    turn = ["every", "degrees", "in time", "and right", "others blamed", "seen for, s (median)", "false before"]
+            "ms per frame"]  # fmt: skip
+    turn = [
+        "every",
+        "degrees",
+        "in time",
+        "right kind",
+        "other cameras blamed",
+        "time in view, s (median)",
+        "false events before",
+    ]
     return {"real stream untouched": markdown(head, quiet), "real stream bumps": markdown(turn, turns)}
 
 
 @dataclass(frozen=True)
 class Options:
-    """Follow the recorded wand, as it is and with one camera turned."""
+    """Follow the recorded wand, untouched and with one camera rotated."""
 
-    strides: tuple[int, ...] = (1, 2, 3, 4, 8)  #: every which frame is followed, untouched
+    strides: tuple[int, ...] = (1, 2, 3, 4, 8)  #: steps between frames, untouched
     bumps: tuple[float, ...] = (0.1, 0.3, 1.0)  #: degrees
-    bump_strides: tuple[int, ...] = (1,)  #: every which frame is followed where a camera is turned
-    cameras: tuple[int, ...] = tuple(range(10))  #: that are turned, each in a run of its own
+    bump_strides: tuple[int, ...] = (1,)  #: steps between frames, with a rotated camera
+    cameras: tuple[int, ...] = tuple(range(10))  #: cameras to rotate, each in a separate run
     cores: int = 1
-    fresh: bool = False  #: calibrate again, though the last calibration is kept
-    lights: bool = False  #: follow the markers as lights of which nothing is known
+    fresh: bool = False  #: calibrate again instead of using the cached calibration
+    lights: bool = False  #: follow the markers as unknown lights
     out: Path | None = None  #: default: docs/benchmarks/real_stream.json, or real_stream_lights.json
 
 
 def main() -> None:
-    """Run, count, write, print."""
+    """Run the cases, then count, write and print the results."""
     options = tyro.cli(Options, description=__doc__)
     known = calibrated(options.fresh)
     texts = [Path(str(module)).read_text("utf-8") for module in (__file__, wand_recording.__file__)]
@@ -308,6 +316,6 @@ def _brief(row: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    from scripts.benchmarks import real_stream  # workers find its functions by that name
+    from scripts.benchmarks import real_stream  # workers find its functions by this name
 
     command(real_stream.main)

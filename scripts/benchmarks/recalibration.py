@@ -1,4 +1,4 @@
-"""Recalibrate O10 from snapshots of a known object: imgcal beside pycolmap, pyceres, mrcal, OpenCV and SciPy."""
+"""Recalibrate O10 from snapshots of a known object with imgcal, pycolmap, pyceres, mrcal, OpenCV and SciPy."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from scripts.benchmarks.recalibration_methods import COLD, EVERY, FREE, IMGCAL, 
 from scripts.output import BLUE, GREEN, GREY, RED, figure, markdown
 from scripts.timing import side_by_side, timing_of
 
-FITS = 0.1  # px, twice the noise: a rig that leaves more on its own observations has not found its minimum
+FITS = 0.1  # px, twice the noise: a rig with a larger error on its own observations has not converged
 BASIN_SNAPSHOTS = (1, 5)
 UNITS = {"focal_length": "f, px", "principal_point": "c, px", "rotation": "rotation, deg", "position": "position, mm"}
 COLOURS = {"imgcal": BLUE, "pyceres": RED, "scipy": GREY, "pycolmap": "#d98b1f", "mrcal": GREEN, "OpenCV": "#7b4fa3"}
 
 
 def measure(effort: Effort) -> dict[str, Any]:
-    """Run everything with one thread."""
+    """Run all parts with one thread."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     sizes = effort.pick({1: (100, 12.0), 5: (60, 15.0), 20: (40, 20.0), 100: (20, 40.0)}, {1: (2, 0.1), 5: (1, 0.1)})
@@ -51,7 +51,7 @@ def measure(effort: Effort) -> dict[str, Any]:
 
 
 def _compare(cases: Cases, names: Sequence[str], seconds: float) -> dict[str, Any]:
-    """Time the methods in turn, and judge the answers to as many cases as each solves within a third of that time."""
+    """Time the methods in turn, and score the results of as many cases as each solves within a third of the time."""
     spans: dict[str, list[float]] = {}
     solved = {}
     with methods(cases, names) as found:
@@ -65,17 +65,17 @@ def _compare(cases: Cases, names: Sequence[str], seconds: float) -> dict[str, An
     rows: dict[str, Any] = dict.fromkeys(names)
     for name, method in found.items():
         rows[name] = _judged(method, cases, solved[name], limit)
-        rows[name] |= timing_of(spans[name][-times[name].calls :]).values()  # without the calls to warm up
+        rows[name] |= timing_of(spans[name][-times[name].calls :]).values()  # without the warm-up calls
     return {"cases": len(cases), "start": times["start"].values(), "bound": _root_mean(limit), "methods": rows}
 
 
 def _in_turn(method: Method, count: int, spans: list[float]) -> Callable[[], None]:
-    """Solve one case after another; times are those of the solvers alone."""
+    """Solve one case after another; only the solvers are timed."""
     return lambda: spans.append(method.solve(len(spans) % count))
 
 
 def _solve_all(method: Method, count: int, seconds: float) -> int:
-    """Solve case after case while there is time; returns how many."""
+    """Solve case after case until the time is up; return their number."""
     begin = time.perf_counter()
     for index in range(count):
         method.solve(index)
@@ -102,7 +102,7 @@ def _root_mean(squares: Mapping[str, np.ndarray]) -> dict[str, float]:
 
 
 def _basin(snapshots: int, scales: Sequence[int], names: Sequence[str], count: int) -> dict[str, list[float] | None]:
-    """Share of cases in which a method finds a rig that fits its observations, by the size of the factory errors."""
+    """Share of cases in which a method finds a rig that fits its observations, by size of the factory errors."""
     shares: dict[str, list[float]] = {name: [] for name in names}
     for scale in scales:
         cases = make_cases(count, snapshots, seed=1000 + scale, scale=scale)
@@ -115,7 +115,7 @@ def _basin(snapshots: int, scales: Sequence[int], names: Sequence[str], count: i
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, str]:
-    """Tables of the page."""
+    """Make the tables of the page."""
     sizes: Mapping[str, Any] = result["snapshots"]
     one, *more = sizes
     head = ["method", "ms p50", "p99", *UNITS.values(), "held out, px", "times the bound", "failures", "cases"]
@@ -147,12 +147,12 @@ def _rows(size: Mapping[str, Any]) -> list[list[str]]:
         rows.append([*cells, str(row["failures"]), str(row["solved"])])
     start, limit = size["start"], size["bound"]
     rows.append(["the start pose that all but OpenCV get", f"{start['p50']:.3g}", f"{start['p99']:.3g}"])
-    rows.append(["Cramer-Rao bound", "", "", *(f"{limit[kind]:.3g}" for kind in KINDS), "", "1"])
+    rows.append(["Cramér-Rao bound", "", "", *(f"{limit[kind]:.3g}" for kind in KINDS), "", "1"])
     return rows
 
 
 def _middle(ratios: Mapping[str, float]) -> float:
-    """Geometric mean over the kinds of error."""
+    """Geometric mean over the kinds of values."""
     return math.exp(sum(math.log(ratio) for ratio in ratios.values()) / len(ratios))
 
 
@@ -181,7 +181,7 @@ def _alone_rows(times: Mapping[str, Any]) -> list[list[str]]:
 
 
 def draw(result: Mapping[str, Any], path: Path) -> None:
-    """Time against snapshots, and convergence against the size of the factory errors."""
+    """Draw time over snapshots, and convergence over the size of the factory errors."""
     with figure(path, panels=2) as (speed, basin):
         sizes = {int(size): found["methods"] for size, found in result["snapshots"].items()}
         for name in FREE:

@@ -1,4 +1,4 @@
-"""imgcal alone: batches of rigs, long captures, and the compiled solver beside the one in tensors."""
+"""imgcal alone: batches of rigs, long captures, and the compiled solver compared with the tensor version."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LIMITS = (SQUARED.max_iterations, SQUARED.tolerance)
 
 
 def measure(effort: Effort) -> dict[str, Any]:
-    """Time it; the compiled and the tensor solver must agree."""
+    """Time all cases; the compiled and the tensor solver must agree."""
     one, many = make_cases(1, 1, 5), make_cases(effort.pick(512, 8), 1, 6)
     long = make_cases(1, effort.pick(300, 20), 7)
 

@@ -1,4 +1,4 @@
-"""The data of the recalibration benchmark, and how answers are judged."""
+"""Data of the recalibration benchmark, and the scores of results."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ SQUARED = EstimationOptions(loss="squared")
 DRIFT = PhysicalDrift(rotation_deg=1.0, position=10.0, focal_length=0.05, principal_point=10.0, distortion=0.005)
 NOISE = 0.05  # px, each axis
 KINDS = ("focal_length", "principal_point", "rotation", "position")
-UNUSABLE = 0.2  # of the true focal length: factory values below are drawn anew
+UNUSABLE = 0.2  # share of the true focal length; smaller factory values are redrawn
 
 
 @dataclass(frozen=True)
 class Cases:
-    """Snapshots of the true rig, one factory calibration a case, and the start that everybody gets."""
+    """Snapshots of the true rig, one factory calibration per case, and the start poses for all methods."""
 
     truth: CameraRig
     obj: CalibrationObject
@@ -66,7 +66,7 @@ class Cases:
 
 
 def make_cases(count: int, snapshots: int, seed: int, scale: float = 1.0) -> Cases:
-    """Observe O10 by random poses; disturb its factory calibration by `scale` times the drift."""
+    """Simulate random poses in front of O10; perturb its factory calibration by `scale` times the drift."""
     truth, obj = read_rig("O10"), load_object("asymmetric8")
     generator = torch.Generator().manual_seed(seed)
     prior_std = scale * DRIFT.std(truth)
@@ -79,7 +79,7 @@ def make_cases(count: int, snapshots: int, seed: int, scale: float = 1.0) -> Cas
 
 
 def _offsets(prior_std: Tensor, count: int, generator: torch.Generator, truth: CameraRig) -> Tensor:
-    """Draw (B, C, 15) errors; those that leave a camera hardly any focal length anew."""
+    """Draw errors (B, C, 15), and redraw those that make a focal length far too short."""
     offsets = prior_std * torch.randn(count, *prior_std.shape, generator=generator, dtype=prior_std.dtype)
     while bool((bad := ((offsets[..., 6:8] / truth.focal_length) < UNUSABLE - 1).any(-1)).any()):
         offsets[bad] = (prior_std * torch.randn(offsets.shape, generator=generator, dtype=prior_std.dtype))[bad]
@@ -107,15 +107,15 @@ def _observed(uv: Tensor) -> Observations:
 
 @dataclass(frozen=True)
 class Score:
-    """How good answers are, one number a case."""
+    """Errors of the results, one number per case."""
 
     squares: dict[str, np.ndarray]  # (B,) mean squared error of each of KINDS: px, px, degrees, mm
-    held_out: np.ndarray  # (B,) px, RMS of each axis on poses that took no part
-    fit: np.ndarray  # (B,) px, the same on the observations given
+    held_out: np.ndarray  # (B,) px, RMS per axis on held-out poses
+    fit: np.ndarray  # (B,) px, the same on the given observations
 
 
 def score(answers: Sequence[RigAnswer], cases: Cases, seed: int = 99, fresh: int = 20) -> Score:
-    """Judge answers (B) by the truth; object poses are fitted anew, each rig held as it is."""
+    """Score results (B) against the truth; object poses are refitted with each rig fixed."""
     found = rigs(answers, cases.truth)
     squares = _of_kinds(relative_difference(found, cases.truth).square())
     generator = torch.Generator().manual_seed(seed)
@@ -128,7 +128,7 @@ def score(answers: Sequence[RigAnswer], cases: Cases, seed: int = 99, fresh: int
 
 
 def bound(cases: Cases) -> dict[str, np.ndarray]:
-    """Posterior Cramer-Rao bound, one mean variance a case: what the observations and the prior leave."""
+    """Posterior Cramér-Rao bound from observations and prior: one mean variance per case."""
     found = estimate(
         cases.observations, cases.factory, cases.obj, cases.poses, prior_std=cases.prior_std, initial_rig=cases.truth,
         options=SQUARED,

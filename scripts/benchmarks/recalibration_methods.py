@@ -1,4 +1,4 @@
-"""Who takes part in the recalibration benchmark, behind one interface."""
+"""Methods of the recalibration benchmark, behind one interface."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ FREE = tuple(name for name in EVERY if HELD not in name)
 
 
 class Method(Protocol):
-    """Solves tasks on demand and keeps the last answer of each; mrcal's can be read only when the block has ended."""
+    """Solves tasks on demand and keeps the last answer of each; mrcal's can be read only after the `with` block."""
 
     def solve(self, index: int) -> float:
-        """Return the seconds that it took; nan = the solver gave up."""
+        """Solve one task; return the seconds that it took; nan = the solver gave up."""
 
     def answers(self) -> list[RigAnswer]:
-        """One for each task; the factory values where a task was not solved."""
+        """Return one answer for each task; the factory values for unsolved tasks."""
 
 
 class InProcess:
@@ -60,12 +60,12 @@ class InProcess:
         return self._answers[index].seconds
 
     def answers(self) -> list[RigAnswer]:
-        """Give what was found."""
+        """Return the answers."""
         return self._answers
 
 
 def factory_answer(task: RigTask) -> RigAnswer:
-    """Change nothing."""
+    """Return the factory values."""
     values = (task.focal_length, task.principal_point, task.distortion, task.rotation, task.translation)
     return RigAnswer(*values, float("nan"))
 

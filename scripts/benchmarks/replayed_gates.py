@@ -1,8 +1,8 @@
-"""Gates of a running rig on replayed noise: left alone for hours, and with cameras bumped.
+"""Targets for a running rig with replayed noise: untouched for hours, and with bumped cameras.
 
 Run as `python -m scripts.benchmarks.replayed_gates`. Each item simulates a place with the noise of the recorded wand
-(`replayed_stream`), calibrates it, and keeps it from there on. What has been run with the same code is not run again
-(`out/work/replayed_gates`); the result holds what was done within `--minutes`.
+(`replayed_stream`), calibrates it, and keeps it calibrated from there on. Finished items of the same code are not run
+again (`out/work/replayed_gates`); the result contains the items that were run within `--minutes`.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from scripts.output import ROOT, WORK, command, markdown, surroundings, write_js
 
 RESULT = ROOT / "docs" / "benchmarks" / "replayed_noise.json"
 LONG = 6000
-"""Snapshots of an item without a bump."""
+"""Snapshots in an item without a bump."""
 BEFORE, AFTER = 300, 480
 """Snapshots before a bump, and those in which the camera sees the object after it."""
 BUMPS = {"rotation": math.radians(0.3), "position": 20.0, "focal_length": 20.0, "principal_point": 5.0}
-"""Rad, mm, px: each some five pixels in the rigs of a room."""
+"""Rad, mm, px: each about five pixels in the rigs of a room."""
 LOOK_EVERY = 60
-"""Snapshots between looks at what is believed of the cameras, and the first look."""
+"""Snapshots between evaluations of the belief, and the first evaluation."""
 EIGHT_HOURS = 1_728_000
 VALUES = 10
 """Parameters of a camera in `distance`."""
@@ -46,16 +46,16 @@ VALUES = 10
 
 @dataclass(frozen=True)
 class Item:
-    """Something to run."""
+    """One work item."""
 
     place: str
     seed: int
-    kind: str | None = None  # of the bump; None = there is none
+    kind: str | None = None  # of the bump; None = no bump
     snapshots: int = LONG
 
     @property
     def key(self) -> str:
-        """What its result is found by."""
+        """Identify the result of the item."""
         return f"{self.place} {self.seed} {self.kind} {self.snapshots}"
 
 
@@ -75,7 +75,7 @@ def run(item: Item) -> dict[str, Any]:
         return {**said, "refused": str(reason)}
     taught = time.process_time() - began
     events: list[dict[str, Any]] = []
-    looks: list[list[float]] = []  # chi-squared of each camera that is said to be ok
+    looks: list[list[float]] = []  # chi-squared of each camera that is reported as ok
     seeing, learnt = list[int](), 0  # numbers of the snapshots in which a bumped camera sees the object
     names = stream.factory.camera_names
     with start(calibration) as keeper:
@@ -116,14 +116,14 @@ def run(item: Item) -> dict[str, Any]:
 
 
 def _calibration_nees(calibration: Any, stream: ReplayedStream) -> float:
-    """What the keeper is given: chi-squared a value of the calibration itself, in the middle over the cameras."""
+    """Chi-squared per value of the calibration that the keeper starts from, median over the cameras."""
     assert stream.place is not None
     with start(calibration) as keeper:
         return float(distance(keeper.belief, stream.place.truth).median() / VALUES)
 
 
 def items(snapshots: int = LONG, bumped: int | None = None) -> Iterator[Item]:
-    """Items without end: quiet ones of so many snapshots, the first `bumped` (None = all) with two bumps each."""
+    """Yield endless items: quiet ones of `snapshots`, the first `bumped` (None = all) followed by two with bumps."""
     kinds, number = tuple(BUMPS), 0
     while True:
         place = PLACES[number % len(PLACES)]
@@ -135,7 +135,7 @@ def items(snapshots: int = LONG, bumped: int | None = None) -> Iterator[Item]:
 
 
 def summarize(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Count."""
+    """Count the results of each place."""
     done = [row for row in rows if "refused" not in row]
     quiet, bumps = [r for r in done if "false" in r], [r for r in done if "in_time" in r]
     looks = sum(row["looks"] for row in quiet)
@@ -163,7 +163,7 @@ def summarize(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def compared() -> list[dict[str, Any]]:
-    """Statistics of the recorded residuals of each camera, and of what is replayed of them."""
+    """Statistics of the recorded residuals of each camera, and of the replayed ones."""
     residual, series = recorded_residuals(), recorded_series()
     replay = replayed_noise.Replay(series, residual.shape[2], np.random.default_rng(1)).draw(12_000)
     found = []
@@ -176,9 +176,9 @@ def compared() -> list[dict[str, Any]]:
 
 
 def tables(result: dict[str, Any]) -> dict[str, str]:
-    """Markdown, by name."""
+    """Make the tables, by name."""
     head = ["place", "snapshots", "false events", "in 8 hours", "NEES (median)", "beyond 3 sigma", "bumps in time",
-            "and right", "others blamed"]  # fmt: skip
+            "right kind", "other cameras blamed"]  # fmt: skip
     rows = [
         [
             place, f"{part['snapshots']:,}", str(part["false"]), _figure(part["false_in_8_hours"], ".0f"),
@@ -221,17 +221,17 @@ def _figure(value: float | None, form: str) -> str:
 class Options:
     """Keep simulated rigs under replayed noise."""
 
-    minutes: float = 60.0  #: begin no item later than this; the next run goes on
-    count: int = 10_000  #: items at most
-    snapshots: int = LONG  #: of an item without a bump
-    bumped: int | None = None  #: of the items without a bump, those that are followed by two with one; default: all
+    minutes: float = 60.0  #: start no item later than this; the next run resumes
+    count: int = 10_000  #: largest number of items
+    snapshots: int = LONG  #: per item without a bump
+    bumped: int | None = None  #: number of items without a bump that are followed by two with one; default: all
     cores: int = 1
-    fresh: bool = False  #: calibrate the recording and take its residuals again, though they are kept
+    fresh: bool = False  #: calibrate the recording again, instead of using cached residuals
     out: Path = RESULT
 
 
 def main() -> None:
-    """Run, count, write, print."""
+    """Run the items, then count, write and print the results."""
     options = tyro.cli(Options, description=__doc__)
     if options.fresh:
         calibrated(anew=True)

@@ -1,4 +1,4 @@
-"""Residuals of real cameras, replayed: a block bootstrap that keeps how they go together in time and among markers."""
+"""Replay residuals of real cameras by a block bootstrap, which keeps their correlation in time and among markers."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from scripts.output import WORK, make_folder
 Floats = NDArray[np.float64]
 
 BLOCK = (60, 240)
-"""Frames of a block: beyond 60 no correlation is left in the recording."""
+"""Range of the frames per block; correlations in the recording vanish beyond 60 frames."""
 BRIDGED = 10
-"""Frames without a camera's residuals that are filled; a longer gap ends a run."""
+"""Longest gap, in frames, in a camera's residuals that is filled; a longer one ends a run."""
 LEAST_RUN = 20
-"""Frames of the shortest run that is replayed; blocks go on from run to run."""
+"""Frames of the shortest run that is replayed; blocks continue from run to run."""
 SHARING = 3
-"""Markers of a frame, at least, from which the shift that they share is taken."""
+"""Least number of markers in a frame to compute their common shift."""
 LAGS = (1, 5, 20, 60)
-"""Frames between residuals whose correlation is reported."""
+"""Lags, in frames, at which correlations are reported."""
 POSE = 6
-"""Values that are fitted to a frame, and take their share out of its residuals."""
+"""Number of values fitted to each frame, which reduce its residuals."""
 CACHE = WORK / "wand_residuals.npz"
 
 
@@ -41,20 +41,20 @@ class Series:
     residual: Floats  # (F, N, 2) pixels, N markers
 
     def __post_init__(self) -> None:
-        """Refuse a camera that has too little to be replayed.
+        """Refuse a camera with too few residuals.
 
         Raises:
-            InputError: there are fewer frames than in the shortest block.
+            InputError: fewer frames than in the shortest block.
         """
         if len(self.residual) < BLOCK[0]:
             raise InputError(f"residuals: found {len(self.residual)} frames in runs, expected at least {BLOCK[0]}")
 
 
 def series_of(residual: Floats, generator: np.random.Generator) -> Series:
-    """Fill the gaps of a camera's residuals, and cut them where it saw nothing for long.
+    """Fill short gaps in a camera's residuals, and split them at long gaps.
 
-    What a frame lacks is made of the shift that its markers share, interpolated where it is not known, and of a
-    deviation from that shift that some other marker had at some other time.
+    A missing residual is the sum of the common shift of the frame's markers, interpolated if unknown, and a random
+    deviation that some marker had from that shift at another time.
 
     Args:
         residual: (F, N, 2) pixels, nan where a marker was not seen.
@@ -78,18 +78,18 @@ def series_of(residual: Floats, generator: np.random.Generator) -> Series:
 
 @dataclass
 class Replay:
-    """Residuals without end for the cameras of a rig, each replaying one real camera, in blocks of random length."""
+    """Endless residuals for the cameras of a rig; each replays one real camera, in blocks of random length."""
 
     sources: Sequence[Series]  # C
-    markers: int  # of the object; more than the series have share their camera's shift
+    markers: int  # of the object; markers beyond those of the series get only their camera's shift
     generator: np.random.Generator
-    _left: list[Floats] = field(default_factory=list, repr=False)  # what is left of each camera's block
+    _left: list[Floats] = field(default_factory=list, repr=False)  # rest of each camera's block
 
     def __post_init__(self) -> None:
         self._left = [self._block(camera) for camera in range(len(self.sources))]
 
     def draw(self, frames: int) -> Floats:
-        """Go on for some frames: (F, C, N, 2) pixels."""
+        """Draw the next frames: (F, C, N, 2) pixels."""
         return np.stack([self._drawn(camera, frames) for camera in range(len(self.sources))], 1)
 
     def _drawn(self, camera: int, frames: int) -> Floats:
@@ -103,7 +103,7 @@ class Replay:
         return np.concatenate(parts)
 
     def _block(self, camera: int) -> Floats:
-        """Draw a block (F, N, 2) of one camera: every frame is as probable."""
+        """Draw a block (F, N, 2) of one camera; all frames are equally probable."""
         block = self._piece(camera, int(self.generator.integers(*BLOCK)))
         count = self.markers - block.shape[1]
         if count <= 0:
@@ -120,15 +120,14 @@ class Replay:
 
 
 def statistics(residual: Floats) -> dict[str, Any]:
-    """How the residuals of one camera go together.
+    """Spread and correlations of the residuals of one camera.
 
     Args:
         residual: (F, N, 2) pixels, nan where not seen.
 
     Returns:
-        RMS of an axis and standard deviation of the shift that all markers share, in pixels, a tenth at each end being
-        left out; what independent markers would give for the latter; correlation of shifts and of single markers
-        `LAGS` frames apart.
+        RMS per axis and standard deviation of the common shift of all markers, in pixels, without a tenth at each end;
+        the latter for independent markers; correlations of shifts and of single markers `LAGS` frames apart.
     """
     known = ~np.isnan(residual[..., 0])
     several = known.sum(1) >= SHARING
@@ -137,7 +136,7 @@ def statistics(residual: Floats) -> dict[str, Any]:
     share = np.nanmean(1 / known.sum(1)[several])
     spread = _spread(residual[known])
     own = (residual - shift[:, None])[known & several[:, None]]
-    unbiased = np.sqrt(1 / max(1 - share, 1e-9))  # their mean took a share of each marker
+    unbiased = np.sqrt(1 / max(1 - share, 1e-9))  # the mean removes a share of each marker's residual
     return {
         "spread_px": spread,
         "shift_px": _spread(shift[several]),
@@ -151,13 +150,13 @@ def statistics(residual: Floats) -> dict[str, Any]:
 
 
 def _spread(values: Floats) -> float:
-    """Standard deviation by the range of the middle four fifths of normal values."""
+    """Standard deviation from the range of the middle four fifths, assuming a normal distribution."""
     low, high = np.quantile(values, (0.1, 0.9))
     return float((high - low) / 2.5631)
 
 
 def _correlation(series: Floats, lag: int) -> float:
-    """Correlation (of both axes) of a series (F, 2), nan where unknown, with itself some frames later."""
+    """Autocorrelation at a lag of a series (F, 2) with nan where unknown, over both axes."""
     limit = 4 * _spread(series[~np.isnan(series)])
     clean = np.clip(series - np.nanmedian(series, 0), -limit, limit)
     first, second = clean[:-lag], clean[lag:]
@@ -169,9 +168,9 @@ def _correlation(series: Floats, lag: int) -> float:
 
 @lru_cache(maxsize=1)
 def recorded_residuals() -> Floats:
-    """Residuals (F, C, N, 2) px of the recorded wand in consecutive frames, nan where not seen; kept in `out/work`.
+    """Residuals (F, C, N, 2) px of the recorded wand in consecutive frames, nan where not seen; cached in `out/work`.
 
-    The rig is held as calibrated, the poses are fitted; what six fitted values take out of a frame is put back.
+    The rig is fixed to the calibration and the poses are fitted; residuals are scaled up for the six fitted values.
     """
     if CACHE.is_file():
         with np.load(CACHE) as file:
@@ -186,7 +185,7 @@ def recorded_residuals() -> Floats:
     seen = observations.seen.numpy()
     values = 2.0 * seen.sum((1, 2))
     back = np.sqrt(values / np.maximum(values - POSE, 1.0))
-    sound = values >= 4 * POSE  # the pose is not bent to a few markers
+    sound = values >= 4 * POSE  # enough markers that the pose does not overfit
     numbers = np.array([int(labelled.snapshots[s].name) for s in labelled.used])
     residual = np.full((len(frames), *seen.shape[1:], 2), np.nan)
     seen &= sound[:, None, None]
@@ -197,7 +196,7 @@ def recorded_residuals() -> Floats:
 
 
 def recorded_series(seed: int = 0) -> list[Series]:
-    """One series for each camera of the recorded wand that has long runs."""
+    """Make one series for each camera of the recorded wand that has long runs."""
     residual, generator = recorded_residuals(), np.random.default_rng(seed)
     found = []
     for camera in range(residual.shape[1]):

@@ -1,4 +1,4 @@
-"""A simulated rig with the noise of real cameras: a wand carried by hand, people in the way, blobs that merge."""
+"""A simulated rig with the noise of real cameras: a hand-carried wand, people in the way, blobs that merge."""
 
 from __future__ import annotations
 
@@ -20,34 +20,34 @@ from scripts.benchmarks.rig_streams import Blobs, Bump, Conditions, Stream
 from scripts.benchmarks.wand_recording import calibrated, recording
 
 AHEAD = 600
-"""Snapshots that are simulated at once."""
+"""Snapshots per simulated block."""
 PLACES = ("ring8", "room10", "wand10")
 REPLAYED = Conditions(hidden=0.01, clutter=0.02, radius=math.nan, labelled=False)
-"""Beside what is replayed; blobs claim 0.1 px, as those of the recording."""
+"""Disturbances besides replayed noise; blobs have a sigma of 0.1 px, as in the recording."""
 TEACHING, TEACH_EVERY = 1600, 8
-"""Snapshots before the keeper begins, and every which of them is calibrated."""
+"""Snapshots before the keeper starts, and the step between those that are calibrated."""
 
 
 @dataclass(frozen=True)
 class Disturbances:
-    """What happens in a room, beside noise."""
+    """Disturbances in a room besides noise."""
 
     merged: float = 5.0  # px between centres below which two markers are one blob, at their middle
-    wrong: float = 0.002  # share of images with a blob that is not where its marker is, for one snapshot ...
-    wrong_by: tuple[float, float] = (3.0, 30.0)  # px ... by so much
-    people_every: float = 10.0  # s, mean time from person to person in front of a camera ...
-    people_for: tuple[float, float] = (0.5, 6.0)  # s ... each as long
-    whole: float = 0.5  # share of people who hide the whole image; others hide one side of a line across it
-    away_every: float = 60.0  # s, mean time from one absence of the object to the next ...
+    wrong: float = 0.002  # share of images in which one blob is displaced from its marker ...
+    wrong_by: tuple[float, float] = (3.0, 30.0)  # px ... by this distance
+    people_every: float = 10.0  # s, mean time between people in front of a camera ...
+    people_for: tuple[float, float] = (0.5, 6.0)  # s ... and their stay
+    whole: float = 0.5  # share of people who hide the whole image; others hide one side of a line
+    away_every: float = 60.0  # s, mean time between absences of the object ...
     away_for: tuple[float, float] = (2.0, 10.0)  # s
-    off: tuple[float, float] = (0.2, 0.6)  # mm from where the object's file has each marker
-    speed: float = 2500.0  # mm/s: some 9 px a frame, as in the recording
+    off: tuple[float, float] = (0.2, 0.6)  # mm, error of each marker's position in the object's file
+    speed: float = 2500.0  # mm/s: about 9 px per frame, as in the recording
     turning: float = 150.0  # degrees/s
 
 
 @dataclass(frozen=True)
 class Place:
-    """A rig, where a wand is carried, and what is known of both beforehand."""
+    """A rig, the volume in which a wand is carried, and the prior knowledge of both."""
 
     factory: CameraRig
     truth: CameraRig
@@ -56,9 +56,9 @@ class Place:
 
 
 def place_of(name: str, seed: int) -> Place:
-    """One of `PLACES`: a ring of eight, a room of ten, or the recorded rig as calibrated; all with the recorded wand.
+    """Make one of `PLACES`, with the recorded wand: a ring of eight, a room of ten, or the calibrated recorded rig.
 
-    The first two are disturbed anew by each seed.
+    Each seed perturbs the first two differently.
     """
     wand = recording().obj
     if name == "wand10":
@@ -79,15 +79,15 @@ def place_of(name: str, seed: int) -> Place:
 
 @dataclass
 class ReplayedStream(Stream):
-    """Snapshots of a place; ask for each in turn."""
+    """Snapshots of a place; request them in order."""
 
     place: Place | None = None
-    sources: Sequence[Series] = ()  # of the noise; none = the recorded ones
-    length: int = 6000  # snapshots at most
+    sources: Sequence[Series] = ()  # sources of noise; empty = the recorded ones
+    length: int = 6000  # largest number of snapshots
     given: Disturbances = Disturbances()
     _first: int = field(default=0, init=False)
-    _ahead: int = field(default=0, init=False)  # the first one that is not simulated yet
-    _rigs_ahead: CameraRig = field(init=False, repr=False)  # (S,) true rigs of these, since `_first`
+    _ahead: int = field(default=0, init=False)  # first snapshot that is not simulated yet
+    _rigs_ahead: CameraRig = field(init=False, repr=False)  # (S,) true rigs of the simulated snapshots since `_first`
 
     def __post_init__(self) -> None:
         assert self.place is not None
@@ -113,11 +113,11 @@ class ReplayedStream(Stream):
         self.people = [self._intervals(self.given.people_every, self.given.people_for) for _ in range(cameras)]
 
     def poses_at(self, seconds: Tensor) -> RigidTransform:
-        """Poses of the object at times (S,), those of the nearest snapshots."""
+        """Poses of the object at times (S,), from the nearest snapshots."""
         return self.path[(seconds * self.conditions.rate).round().long()]
 
     def _intervals(self, every: float, lasting: tuple[float, float]) -> NDArray[np.float64]:
-        """Draw when something happens: (M, 5) first and last snapshot, and three numbers from 0 to 1."""
+        """Draw intervals of a disturbance: (M, 5) first and last snapshot, and three random numbers from 0 to 1."""
         found, at = [], 0.0
         while math.isfinite(every) and (at := at + self.noise.exponential(every)) < self.length / self.conditions.rate:
             end = at + self.noise.uniform(*lasting)
@@ -139,7 +139,7 @@ class ReplayedStream(Stream):
         return camera, np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
 
     def _merged(self, camera: int, row: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Blobs (M, 2) of a camera where markers may be too near each other, and a label of each."""
+        """Blobs (M, 2) of a camera, with close markers merged, and a label for each."""
         uv, left = self._uv[row, camera], list(np.flatnonzero(self._seen[row, camera]))
         spots, labels = [], []
         while left:
@@ -153,7 +153,7 @@ class ReplayedStream(Stream):
         return np.array(spots), np.array(labels, dtype=np.int64)
 
     def _simulate(self, first: int) -> None:
-        """Simulate what cameras see from a snapshot on."""
+        """Simulate the views from a snapshot on."""
         last = min(first + AHEAD, self.length)
         count, given, noise = last - first, self.given, self.noise
         if self._ahead:
@@ -188,7 +188,7 @@ class ReplayedStream(Stream):
         uv: NDArray[np.float64],
         seen: NDArray[np.bool_],
     ) -> None:
-        """Hide what is behind a person: all of an image, or one side of an upright line that stands still in it."""
+        """Hide fiducials behind a person: in the whole image, or on one side of a fixed vertical line."""
         begin, end = max(int(person[0]) - first, 0), max(int(person[1]) - first, 0)
         whole, edge, side = person[2:]
         if whole < self.given.whole:
@@ -199,11 +199,11 @@ class ReplayedStream(Stream):
         seen[begin:end, camera] &= right if side < 0.5 else ~right
 
     def _advance(self, number: int) -> None:
-        """Leave the rig to `_simulate`."""
+        """Do nothing: `_simulate` moves the rig."""
 
 
 def combined(parts: Sequence[Detections]) -> Detections:
-    """Join snapshots to one capture."""
+    """Join snapshots into one capture."""
     columns = {
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in ("uv", "sigma", "camera", "fiducial", "radius", "flags")
@@ -216,7 +216,7 @@ def combined(parts: Sequence[Detections]) -> Detections:
 def calibrated_stream(
     name: str, seed: int, count: int, bumps: Sequence[Bump] = (), given: Disturbances = Disturbances()
 ) -> tuple[ReplayedStream, imgcal.Calibration]:
-    """A stream whose first `TEACHING` snapshots have been calibrated, from labels; `count` more are to come.
+    """Make a stream whose first `TEACHING` snapshots have been calibrated from labels; `count` more will follow.
 
     Raises:
         RefusedError: these snapshots cannot be calibrated.

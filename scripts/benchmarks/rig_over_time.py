@@ -1,9 +1,9 @@
-"""Does the filter of a rig know what the batch estimate knows, and is an update fast enough?
+"""Does the filter of a rig match the batch estimate, and is an update fast enough?
 
-Run as `python -m scripts.benchmarks.rig_over_time --out docs/benchmarks/rig_over_time.json`. Three questions: after 1,
-10, 100 and 1,000 snapshots of a steady rig, how far are the filter's standard deviations and values from those of the
-batch estimate from all of them; over many runs, steady and drifting, are its errors as large as it says; and how long
-does `RigKeeper.update` take from blobs, with everything that ever came and with the last snapshots only.
+Run as `python -m scripts.benchmarks.rig_over_time --out docs/benchmarks/rig_over_time.json`. Three questions: After 1,
+10, 100 and 1,000 snapshots of a steady rig, how far are the filter's values and standard deviations from those of the
+batch estimate? Over many steady and drifting runs, are its errors as large as predicted? How long does
+`RigKeeper.update` take from blobs, with all snapshots so far and with only the last ones?
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ STEADY = DriftRate(0.0, 0.0, 0.0, 0.0, 0.0)
 WARMING = DriftRate(
     focal_length=2e-4 * 60**0.5, principal_point=0.0, distortion=0.0, rotation=np.deg2rad(0.01), position=0.0
 )
-"""A focal length that walks 0.02 % in a minute, mounts that walk 0.01 degrees in an hour."""
-BETWEEN = 10.0  # s between snapshots of the runs that ask for errors
+"""Focal lengths drift by 0.02 % per minute, mounts by 0.01 degrees per hour."""
+BETWEEN = 10.0  # s between snapshots in the runs for normalized errors
 SQUARED = EstimationOptions(loss="squared", tolerance=1e-6)
 
 
@@ -46,19 +46,19 @@ SQUARED = EstimationOptions(loss="squared", tolerance=1e-6)
 class Options:
     """Measure the filter of a rig."""
 
-    rig: str = "O10"  #: of the comparison with the batch estimate
+    rig: str = "O10"  #: rig for the comparison with the batch estimate
     counts: tuple[int, ...] = (1, 10, 100, 1000)
     runs: int = 200
-    snapshots: int = 60  #: of each run
-    updates: int = 400  #: that are timed
-    only: tuple[str, ...] = ("against batch", "normalized errors", "times")  #: the rest stays as it was
+    snapshots: int = 60  #: per run
+    updates: int = 400  #: updates to time
+    only: tuple[str, ...] = ("against batch", "normalized errors", "times")  #: parts; others are kept
     out: Path | None = None  #: a result file; docs/benchmarks/rig_over_time.json rewrites its tables in the page
 
 
 def seen_by(
     rig: CameraRig, obj: imgcal.CalibrationObject, poses: RigidTransform, generator: torch.Generator
 ) -> Observations:
-    """Noisy observations (S, C, N), a tenth of them hidden."""
+    """Simulate noisy observations (S, C, N), a tenth of them hidden."""
     image = rig.expand(len(poses.translation)).project_values(poses.apply(obj.points), obj.radius)
     uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
     seen = image.visible & (torch.rand(image.visible.shape, generator=generator) > 0.1)
@@ -70,13 +70,13 @@ def part(observations: Observations, first: int, last: int) -> Observations:
 
 
 def carried(count: int, generator: torch.Generator, poses: RigidTransform) -> RigidTransform:
-    """Poses of an object that is carried about in front of a rig."""
+    """Draw poses of an object that is carried around in front of a rig."""
     shift = torch.tensor([90.0, 60.0, 60.0]) * (2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1)
     return RigidTransform(poses.rotation, poses.translation + shift)
 
 
 def against_batch(options: Options) -> list[dict[str, float]]:
-    """The filter and the batch estimate from the same snapshots."""
+    """Compare the filter and the batch estimate on the same snapshots."""
     factory, obj = imgcal.load_rig(options.rig).to(torch.float64), imgcal.load_object("asymmetric8")
     generator, count = torch.Generator().manual_seed(1), max(options.counts)
     truth = simulate_truth(factory, obj, count, generator, PhysicalDrift())
@@ -105,10 +105,10 @@ def against_batch(options: Options) -> list[dict[str, float]]:
 
 
 def held_out(rig: CameraRig, truth: CameraRig, obj: imgcal.CalibrationObject, poses: RigidTransform) -> float:
-    """RMS distance (px) on exact images of an object elsewhere, its pose fitted with the rig held."""
+    """RMS error (px) on exact images of an object in other poses, which are fitted with a fixed rig."""
     squared = []
     for s in range(len(poses.translation)):
-        turned = poses.rotation[s].roll(1, 0)  # another pose than any that was seen
+        turned = poses.rotation[s].roll(1, 0)  # an unseen pose
         there = RigidTransform(turned[None], poses.translation[s : s + 1] * 1.03)
         image = truth.expand(1).project_values(there.apply(obj.points), obj.radius)
         seen = Observations(image.uv, torch.full(image.visible.shape, NOISE, dtype=torch.float64), image.visible)
@@ -118,9 +118,9 @@ def held_out(rig: CameraRig, truth: CameraRig, obj: imgcal.CalibrationObject, po
 
 
 def normalized_errors(options: Options, rate: DriftRate) -> dict[str, list[float]]:
-    """Squared error per degree of freedom at the end of each run, of the filter and, of a steady rig, of the batch.
+    """Squared error per degree of freedom at the end of each run, for the filter and, with a steady rig, for the batch.
 
-    "Value by value" takes the motion of the whole rig, which no image shows, as so much of each value, too.
+    "Value by value" includes the motion of the whole rig, which images do not show, in the errors of the values.
     """
     factory, obj = imgcal.load_rig("T4").to(torch.float64), imgcal.load_object("asymmetric8")
     factory = replace(factory, prior=RigPrior())
@@ -153,7 +153,7 @@ def normalized_errors(options: Options, rate: DriftRate) -> dict[str, list[float
 
 
 def times(options: Options) -> dict[str, dict[str, float]]:
-    """CPU time (ms) of updates from the blobs of O10, with several horizons in turns."""
+    """Measure the CPU time (ms) of updates from blobs of O10, with several horizons in turn."""
     factory, obj = imgcal.load_rig("O10"), imgcal.load_object("asymmetric8")
     stream = Stream(factory, obj, 1, Conditions(noise=0.07, hidden=0.0, clutter=0.0))
     shots: list[tuple[float, Detections]] = list(stream.snapshots(options.updates + 100))
@@ -174,7 +174,7 @@ def times(options: Options) -> dict[str, dict[str, float]]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, str]:
-    """Markdown by marker."""
+    """Make the tables, by marker."""
     batch = [
         (f"{row['snapshots']:,}", *(f"{value:.3g}" for key, value in row.items() if key != "snapshots"))
         for row in result["against batch"]
@@ -201,7 +201,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
 
 
 def main() -> None:
-    """Measure, write, print."""
+    """Measure, write and print."""
     options = tyro.cli(Options, description=__doc__)
     torch.set_num_threads(1)
     questions: dict[str, Callable[[], Any]] = {

@@ -1,4 +1,4 @@
-"""A simulated rig that watches an object move, as blobs of one snapshot after another."""
+"""A simulated rig that watches a moving object: blobs, snapshot by snapshot."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ Blobs = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class Conditions:
-    """How well the object is seen, and how much the rig wanders."""
+    """Visibility and noise of the object, and errors of the rig."""
 
     noise: float = 0.1  # px
-    shake: float = 0.0  # px, of all that a camera sees in a snapshot alike
-    noisy: float = 0.0  # px, more noise of the second camera than its blobs say
-    lens: float = 0.0  # px RMS of each axis, that lenses bend an image and nobody knows, over 300 to 900 px
-    hidden: float = 0.1  # share of fiducials
-    clutter: float = 0.5  # false blobs a camera and snapshot
+    shake: float = 0.0  # px, sigma of a shift that all points of an image share
+    noisy: float = 0.0  # px, noise of the second camera in addition to its blobs' sigma
+    lens: float = 0.0  # px RMS per axis, unmodelled lens errors with wavelengths of 300 to 900 px
+    hidden: float = 0.1  # share of hidden fiducials
+    clutter: float = 0.5  # false blobs per camera and snapshot
     radius: float = 5.0  # px, of each blob; nan = unknown
     rate: float = 60.0  # snapshots/s
     drift: DriftRate = DriftRate(0.0, 0.0, 0.0, 0.0, 0.0)
-    reach: tuple[float, float, float] = (90.0, 60.0, 60.0)  # mm, how far the object goes from the middle
+    reach: tuple[float, float, float] = (90.0, 60.0, 60.0)  # mm, amplitude of the object's motion
     labelled: bool = False
 
 
 @dataclass(frozen=True)
 class Bump:
-    """A camera changes before a snapshot."""
+    """A change of a camera before a snapshot."""
 
     snapshot: int
     camera: int
@@ -66,8 +66,8 @@ class Stream:
     conditions: Conditions = Conditions()
     bumps: Sequence[Bump] = ()
     absent: Sequence[tuple[int, int]] = ()  # snapshots (first, last excluded) without the object
-    out: Mapping[int, tuple[int, int]] = field(default_factory=dict)  # camera -> snapshots without its frames
-    creep: Tensor | None = None  # (C, K) what cameras change with every snapshot of `labelled`
+    out: Mapping[int, tuple[int, int]] = field(default_factory=dict)  # camera -> snapshots without frames
+    creep: Tensor | None = None  # (C, K) change of the cameras per snapshot of `labelled`
     slips: Sequence[Slip] = ()
 
     def __post_init__(self) -> None:
@@ -98,7 +98,7 @@ class Stream:
         return self.rig.retract(step)
 
     def snapshot(self, number: int) -> Detections:
-        """Blobs of a snapshot; `self.rig` and `self.pose` are then the truth of it."""
+        """Simulate the blobs of a snapshot; `self.rig` and `self.pose` then hold its ground truth."""
         given, noise = self.conditions, self.noise
         self._advance(number)
         cameras, spots, fiducials = self._blobs(number)
@@ -122,7 +122,7 @@ class Stream:
         )
 
     def _advance(self, number: int) -> None:
-        """Let the rig wander, and bump what is bumped before a snapshot."""
+        """Let the rig drift, and apply the bumps before a snapshot."""
         if number:
             walk = self.conditions.drift.std(self.rig) * math.sqrt(1 / self.conditions.rate / 3600)
             if walk.any():
@@ -132,7 +132,7 @@ class Stream:
                 self.rig = self.changed(bump)
 
     def _blobs(self, number: int) -> Blobs:
-        """Blobs of fiducials in a snapshot: cameras (M,), pixels (M, 2), fiducials (M,)."""
+        """Simulate blobs of fiducials in a snapshot: cameras (M,), pixels (M, 2), fiducials (M,)."""
         given, noise = self.conditions, self.noise
         uv, visible = self._images(torch.tensor([number]), self.rig.expand(1))
         uv, seen = uv[0], visible[0]
@@ -147,9 +147,9 @@ class Stream:
         return cameras, uv[cameras, fiducials], fiducials
 
     def labelled(self, first: int, last: int) -> tuple[Observations, CameraRig]:
-        """Fiducials (S, C, N) of many snapshots at once, without false blobs, and the true rigs (S,).
+        """Simulate fiducials (S, C, N) of many snapshots at once, without false blobs, and the true rigs (S,).
 
-        Many times faster than one after another; the noise is not that of `snapshot`.
+        Many times faster than one after another; the noise differs from that of `snapshot`.
         """
         given, noise, count = self.conditions, self.noise, last - first
         rigs = self._rigs(first, last)
@@ -164,7 +164,7 @@ class Stream:
         return Observations(torch.from_numpy(uv), sigma, torch.from_numpy(seen)), rigs
 
     def _images(self, numbers: Tensor, rigs: CameraRig) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Fiducials (S, C, N, 2) of some snapshots by their rigs (S,), each camera at the time of its own clock."""
+        """Project the fiducials (S, C, N, 2) with rigs (S,), each camera at the time of its own clock."""
         seconds = numbers.double() / self.conditions.rate
         image = rigs.project_values(self.poses_at(seconds).apply(self.obj.points), self.obj.radius)
         uv, visible = image.uv.numpy(), image.visible.numpy()
@@ -176,7 +176,7 @@ class Stream:
         return uv, visible
 
     def _rigs(self, first: int, last: int) -> CameraRig:
-        """True rigs (S,) of some snapshots; `self.rig` is the last one then."""
+        """True rigs (S,) of some snapshots; sets `self.rig` to the last one."""
         steps = self.conditions.drift.std(self.rig) * math.sqrt(1 / self.conditions.rate / 3600)
         walk = steps * torch.from_numpy(self.noise.standard_normal((last - first, *steps.shape)))
         walk = walk + (0.0 if self.creep is None else self.creep)
@@ -194,12 +194,12 @@ class Stream:
         return CameraRig.cat(parts)
 
     def _shaken(self, uv: NDArray[np.float64]) -> NDArray[np.float64] | float:
-        """Shifts of what cameras see, like one fiducial of each."""
+        """Random shifts of each image, in the shape of one fiducial per camera."""
         size = self.conditions.shake
         return size * self.noise.standard_normal(uv.shape) if size else 0.0
 
     def _bent(self, uv: NDArray[np.float64]) -> NDArray[np.float64] | float:
-        """What lenses do that nobody knows to what cameras (C, N, 2) see: waves over the image, two for each axis."""
+        """Unmodelled lens errors at pixels (C, N, 2): waves over the image, two for each axis."""
         if not self.conditions.lens:
             return 0.0
         draw = np.random.default_rng((self.seed, 1))
@@ -212,6 +212,6 @@ class Stream:
         return first <= number < last
 
     def snapshots(self, count: int) -> Iterator[tuple[float, Detections]]:
-        """Times (s) and blobs."""
+        """Yield times (s) and blobs."""
         for number in range(count):
             yield number / self.conditions.rate, self.snapshot(number)

@@ -1,4 +1,4 @@
-"""Colour-coded images: ten cameras' fiducials drawn as Gaussian splats, beside other ways to draw them on the CPU."""
+"""Colour-coded images: fiducials of ten cameras drawn as Gaussian splats, compared with other CPU renderers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from scripts.timing import side_by_side
 
 CAMERAS, SIGMA = 10, 2.0
 SCENES = ((224, 8), (224, 64), (448, 8), (448, 64))  # side of the images, fiducials
-MARGIN = 8.0  # pixels to the border: OpenCV's blur loses what it cuts off
+MARGIN = 8.0  # pixels to the border, because OpenCV's blur loses light there
 EQUAL = 1 / 255
 OURS, OURS_OUT = "**imgcal**", "**imgcal**, `out=`"
 DENSE = "sum of whole images (kornia `render_gaussian2d`)"
@@ -40,14 +40,14 @@ Run = Callable[[], Any]
 
 @dataclass(frozen=True)
 class Case:
-    """One way to draw a scene."""
+    """One method to draw a scene."""
 
     forward: Run  # returns the images
-    backward: Run | None = None  # draws and returns the gradient by the points
+    backward: Run | None = None  # draws, and returns the gradient with respect to the points
 
 
 def measure(effort: Effort) -> dict[str, Any]:
-    """Draw the same scenes in all ways."""
+    """Draw the same scenes with all methods."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     scenes = [_measure_scene(side, count, effort) for side, count in effort.pick(SCENES, ((32, 3),))]
@@ -62,7 +62,7 @@ def measure(effort: Effort) -> dict[str, Any]:
 
 
 def cases(scene: Scene, upstream: np.ndarray) -> dict[str, Callable[[], Case] | None]:
-    """Return what prepares each case; None: the tool is absent."""
+    """Return functions that prepare each case; None = the tool is absent."""
     shape = (len(scene.uv), 3, scene.side, scene.side)
     swapped = (len(scene.uv), scene.side, scene.side, 3)
     made: dict[str, Callable[[], Case] | None] = {
@@ -87,7 +87,7 @@ def cases(scene: Scene, upstream: np.ndarray) -> dict[str, Callable[[], Case] | 
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, str]:
-    """Ways to draw, many rigs at once, infrared frames."""
+    """Make the tables: methods, many rigs at once, infrared frames."""
     rows = []
     for scene in result["scenes"]:
         ours = next(row for row in scene["rows"] if row["name"] == OURS)
@@ -125,13 +125,13 @@ def tables(result: Mapping[str, Any]) -> dict[str, str]:
     frames = [[row["name"], f"{row['p50']:.3g}", f"{row['p99']:.3g}"] for row in result["infrared"]]
     return {
         "splatting": markdown((*head, "memory, MB", "largest difference"), rows),
-        "splatting rigs": markdown(("O10, 8 fiducials, 224 x 224", "ms a rig, p50", "best", "rigs/s"), rigs),
+        "splatting rigs": markdown(("O10, 8 fiducials, 224 x 224", "ms per rig, p50", "best", "rigs/s"), rigs),
         "infrared": markdown(("ten frames of 2048 x 1088, 8 markers", "ms p50", "p99"), frames),
     }
 
 
 def draw(result: Mapping[str, Any], path: Path) -> None:
-    """Images a second by the number of splats, forward and with gradient."""
+    """Draw images per second by number of splats, forward and with gradient."""
     scene = result["scenes"][0]
     rows = [row for row in scene["rows"] if "forward" in row][::-1]
     with figure(path, panels=2, size=(9.0, 3.2)) as panels:
@@ -171,7 +171,7 @@ def _measure_scene(side: int, count: int, effort: Effort) -> dict[str, Any]:
 
 
 def as_images(drawn: Any) -> np.ndarray:
-    """Bring what a case draws to (M, 3, H, W) in [0, 1]."""
+    """Convert the output of a case to (M, 3, H, W) in [0, 1]."""
     images = np.asarray(drawn.detach() if isinstance(drawn, torch.Tensor) else drawn)
     images = images / 255 if images.dtype == np.uint8 else images
     return images if images.shape[1] == 3 else images.transpose(0, 3, 1, 2)
@@ -209,7 +209,7 @@ def _filling(
 
 
 def peak_megabytes(run: Run) -> float | None:
-    """Resident memory that a call adds at its highest, in MB; None where Linux does not say."""
+    """Peak resident memory that a call adds, in MB; None if Linux does not report it."""
     status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
     try:
         gc.collect()

@@ -1,4 +1,4 @@
-"""More about the renderers: many rigs at once, precisions and modes; infrared frames."""
+"""More on the renderers: many rigs at once, precisions and modes; infrared frames."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FRAME = (1088, 2048)
 
 
 def many_rigs(effort: Effort) -> list[dict[str, Any]]:
-    """Time splats of more images than any cache holds, in all precisions and modes."""
+    """Time splats of more images than fit into any cache, in all precisions and modes."""
     rigs = effort.pick(32, 2)
     generator = torch.Generator().manual_seed(0)
     uv = torch.rand(rigs, CAMERAS, FIDUCIALS, 2, generator=generator) * torch.tensor([SIZE[1], SIZE[0]])
@@ -49,7 +49,7 @@ def many_rigs(effort: Effort) -> list[dict[str, Any]]:
 
 
 def infrared(effort: Effort) -> list[dict[str, Any]]:
-    """Time grey frames with markers of 2 to 10 px radius, as `imgcal simulate` makes them."""
+    """Time grey frames with markers of 2 to 10 px radius, like those of `imgcal simulate`."""
     cameras, size = effort.pick((CAMERAS, FRAME), (1, (64, 64)))
     generator = torch.Generator().manual_seed(0)
     uv = torch.rand(cameras, FIDUCIALS, 2, generator=generator) * torch.tensor([size[1], size[0]])

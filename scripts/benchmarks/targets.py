@@ -1,6 +1,6 @@
-"""Sticks and several objects without labels, simulated: what is calibrated, refused and wrong.
+"""Simulated captures of sticks and several objects without labels: how many are calibrated, refused and wrong?
 
-Run as `python -m scripts.benchmarks.targets`. A quarter of the markers is hidden, and every camera has three false
+Run as `python -m scripts.benchmarks.targets`. A quarter of the markers are hidden, and every camera has three false
 blobs. Sticks of a real recording: `python -m scripts.benchmarks.lights stream`.
 """
 
@@ -25,11 +25,11 @@ from renderers import palette
 from scripts.output import ROOT, command, read_json, surroundings, write_json
 
 HIDDEN, FALSE, NOISE = 0.25, 3, 0.1
-"""Share of hidden markers, false blobs a camera, px."""
+"""Share of hidden markers; false blobs per camera; noise, px."""
 PLACES = 300
-"""In the rig's volume, that are triangulated to compare a rig with the truth."""
+"""Points in the rig's volume that are triangulated to compare a rig with the truth."""
 WRONG = 3.0
-"""Times the predicted error (95 %) from which an accepted rig is wrong."""
+"""Multiple of the predicted error (95 %) beyond which an accepted rig is wrong."""
 POINTS = {
     "stick2": [[0, 0, 0], [500, 0, 0]],
     "stick3": [[0, 0, 0], [200, 0, 0], [500, 0, 0]],
@@ -51,7 +51,7 @@ RESULT = ROOT / "docs" / "benchmarks" / "targets.json"
 
 
 def named_object(name: str) -> CalibrationObject:
-    """An object of the campaign."""
+    """Make an object of the campaign."""
     if name not in POINTS:
         return load_object(name)
     points = torch.tensor(POINTS[name], dtype=torch.float64)
@@ -94,7 +94,7 @@ def capture(
 
 
 def error_mm(rig: CameraRig, truth: CameraRig) -> tuple[float, float]:
-    """Median error (mm) of triangulated places after the best rigid motion, and relative error of the scale."""
+    """Median error (mm) of triangulated points after the best rigid alignment, and relative error of the scale."""
     assert truth.volume is not None
     low, high = (torch.tensor(end, dtype=torch.float64) for end in (truth.volume.low, truth.volume.high))
     places = low + (high - low) * torch.rand(PLACES, 3, generator=torch.Generator().manual_seed(0), dtype=low.dtype)
@@ -114,7 +114,7 @@ def error_mm(rig: CameraRig, truth: CameraRig) -> tuple[float, float]:
 
 
 def nees(found: Calibration, truth: CameraRig) -> float:
-    """Squared error of all parameters over their covariance, per parameter."""
+    """Normalized squared error of all parameters, per parameter."""
     error = truth.local(found.estimate.rig).flatten()
     covariance = camera_covariance(found.estimate, curved=False)
     return float(error @ torch.linalg.solve(covariance, error)) / len(error)
@@ -155,7 +155,7 @@ def outcome(scene: str, drift: float, seed: int) -> dict[str, Any]:
 
 
 def table_of(outcomes: list[dict[str, Any]]) -> dict[str, Any]:
-    """Count by scene and drift."""
+    """Count outcomes by scene and drift."""
     table: dict[str, Any] = {}
     for scene in SCENES:
         for drift in sorted({o["drift"] for o in outcomes}):
@@ -177,13 +177,13 @@ def table_of(outcomes: list[dict[str, Any]]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Simulated:
-    """Calibrate simulated captures, and count what is calibrated, refused and wrong."""
+    """Calibrate simulated captures, and count those that are calibrated, refused and wrong."""
 
-    captures: int = 3  #: of each scene and drift
-    drifts: tuple[float, ...] = (0.3, 1.0, 2.0)  #: times half a degree, 2 mm, 1 % and 5 px
+    captures: int = 3  #: per scene and drift
+    drifts: tuple[float, ...] = (0.3, 1.0, 2.0)  #: multiples of half a degree, 2 mm, 1 % and 5 px
     scenes: tuple[str, ...] = tuple(SCENES)  #: which
     first: int = 0  #: first seed
-    out: Path = RESULT  #: result; captures that it holds already stay
+    out: Path = RESULT  #: result file; captures in it are kept
 
     def run(self) -> None:
         """Run, and write after each capture."""
@@ -205,7 +205,7 @@ class Simulated:
 
 
 def main() -> None:
-    """Run it from the command line."""
+    """Run from the command line."""
     command(lambda: tyro.cli(Simulated, description=__doc__).run())
 
 

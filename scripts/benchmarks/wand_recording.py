@@ -1,6 +1,6 @@
-"""The recorded wand: ten real cameras, 4,800 frames at full rate, and nothing that moved.
+"""The recorded wand: ten real cameras that did not move, 4,800 frames at full rate.
 
-The recording stays where `IMGCAL_CAPTURES` says; nothing of it is stored in the project.
+The recording stays in the folder `IMGCAL_CAPTURES`; the project contains no part of it.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from scripts.output import WORK, make_folder
 
 FOLDER = "wand-ten-cameras-stream"
 RATE = 60.0  # frames/s
-SEEN = 4  # blobs with which a camera sees the wand
+SEEN = 4  # least number of blobs for a camera to see the wand
 CALIBRATED = range(0, 2400, 8)  # frames
 FOLLOWED = range(2400, 4800)  # frames
 SCORED = range(2400, 4800, 7)  # frames
-LEAST_CAMERAS = 3  # that see the wand in a scored frame
-ROUNDS = 4  # of leaving out outliers
-LEAST_POINTS = 6  # of a snapshot, for its pose
+LEAST_CAMERAS = 3  # least number of cameras that see the wand in a scored frame
+ROUNDS = 4  # rounds of outlier removal
+LEAST_POINTS = 6  # in a snapshot, to fit its pose
 CACHE = WORK / "wand_recording.pkl"
 
 
@@ -55,7 +55,7 @@ class Recording:
 
     @cached_property
     def _rows(self) -> NDArray[np.int64]:
-        """Where the blobs of each frame begin among rows in the order of frames: (4801,)."""
+        """First row of each frame's blobs, with rows in the order of frames: (4801,)."""
         number = self.frames[self.detections.snapshot]
         if (np.diff(number) < 0).any():
             raise InputError(f"{FOLDER}: found frames out of order, expected ascending numbers")
@@ -79,16 +79,16 @@ class Recording:
 
 @dataclass(frozen=True)
 class Calibrated:
-    """The calibration of the first half, and labels of the second half's frames that rigs are scored on."""
+    """Calibration from the first half, and labels of frames in the second half, on which rigs are scored."""
 
     calibration: imgcal.Calibration
     observations: Observations  # (S, C, N)
     poses: RigidTransform  # (S,)
 
     def score(self, rig: CameraRig) -> tuple[float, float]:
-        """RMS and median (px) of the whole wand, its poses alone being fitted to a rig that is held fixed.
+        """RMS and median error (px) of the whole wand, with poses fitted to a fixed rig.
 
-        Outliers are left out as `imgcal.score` does. Labels and object are those of the calibration, for every rig.
+        Outliers are removed as in `imgcal.score`. Labels and object come from the calibration, for every rig.
         """
         obj, seen = self.calibration.object, self.observations.seen
         even = replace(self.observations, sigma=torch.full_like(self.observations.sigma, 0.3))
@@ -110,7 +110,7 @@ def folder() -> Path:
     """Folder of the recording.
 
     Raises:
-        InputError: `IMGCAL_CAPTURES` does not say where it is.
+        InputError: `IMGCAL_CAPTURES` is not set, or does not contain it.
     """
     captures = os.environ.get("IMGCAL_CAPTURES")
     if not captures or not (Path(captures) / FOLDER).is_dir():
@@ -128,7 +128,7 @@ def recording() -> Recording:
 
 @lru_cache(maxsize=1)
 def calibrated(anew: bool = False) -> Calibrated:
-    """Calibrate the first half, every eighth frame; what came of it last time, unless it is wanted `anew`."""
+    """Calibrate from every eighth frame of the first half, or use the cached result unless `anew`."""
     if not anew and CACHE.is_file():
         with CACHE.open("rb") as file:
             found: Calibrated = pickle.load(file)  # written below, by this program
@@ -154,13 +154,13 @@ def calibrated(anew: bool = False) -> Calibrated:
 
 
 def turned(blobs: Detections, rig: CameraRig, camera: int, degrees: float) -> Detections:
-    """Turn what a camera sees, as if the camera had turned about an axis across its view.
+    """Move the blobs of a camera as if it had rotated about an axis perpendicular to its optical axis.
 
     Args:
         blobs: of one snapshot.
-        rig: whose lens and focal length are taken for true.
-        camera: which.
-        degrees: by how much; the axis is another one for each camera.
+        rig: its lens and focal length are taken as true.
+        camera: index of the camera.
+        degrees: angle; each camera has another axis.
     """
     rows = np.flatnonzero(blobs.camera == camera)
     if not len(rows):

@@ -1,14 +1,14 @@
-"""Tell whether a live page answers on this machine: exit code 0 or 1. Usage: python health.py PORT."""
+"""Check whether a live page answers on this machine: exit code 0 or 1. Usage: python health.py PORT."""
 
 import sys
 import urllib.error
 import urllib.request
 
-ASKS_FOR_TOKEN = 401  # of whoever has none: it is there
+ASKS_FOR_TOKEN = 401  # the page is up, and wants a token
 
 
 def answers(port: int, seconds: float = 3.0) -> bool:
-    """Ask for the page."""
+    """Tell whether the page answers."""
     try:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=seconds) as answer:
             return bool(answer.status == 200)

@@ -1,9 +1,8 @@
-"""Run the Dockerfile's steps where nothing builds images: `python scripts/container/steps.py`.
+"""Run the Dockerfile's steps on a machine that cannot build images: `python scripts/container/steps.py`.
 
-In a folder that stands for the image's root: what .dockerignore lets through is copied, the package is built and
-installed, loops are compiled as the user without rights (where that can be), the image's command is started, and its
-health check is asked until it says yes. Other packages are those of this environment: what pip would bring from its
-index, and the base image itself, are not tried.
+A folder stands for the image's root. Copy what .dockerignore lets through, build and install the package, compile loops
+as the unprivileged user (if possible), start the image's command, and run its health check until it succeeds. All other
+packages are those of this environment: downloads by pip and the base image itself are not tested.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ HEALTHY_WITHIN = 180.0  # s
 
 
 def main() -> None:
-    """Run every step; a failure ends with its exit code."""
+    """Run every step; on failure, exit with that step's exit code."""
     with build() as image:
         image.start()
     print("all steps run, and the page answers")
@@ -53,7 +52,7 @@ def build() -> Iterator[Image]:
 
 
 def instructions(text: str) -> Iterator[tuple[str, str]]:
-    """Keyword and rest of every instruction."""
+    """Yield the keyword and the rest of each instruction."""
     for line in re.sub(r"\\\n\s*", "", text).splitlines():
         if line.strip() and not line.startswith("#"):
             keyword, rest = line.split(maxsplit=1)
@@ -62,7 +61,7 @@ def instructions(text: str) -> Iterator[tuple[str, str]]:
 
 @dataclass
 class Image:
-    """A folder that stands for the root of an image."""
+    """Folder that stands for the root of an image."""
 
     root: Path
     environment: dict[str, str] = field(default_factory=lambda: {"LANG": "C.UTF-8"} | _passed_on())
@@ -71,7 +70,7 @@ class Image:
     start_with: dict[str, list[str]] = field(default_factory=dict)  # ENTRYPOINT, CMD, HEALTHCHECK
 
     def step(self, keyword: str, rest: str) -> None:
-        """Do what an instruction says."""
+        """Execute an instruction."""
         match keyword:
             case "ARG":
                 name, _, value = rest.partition("=")
@@ -92,10 +91,10 @@ class Image:
                 self.start_with[keyword] = json.loads(rest[rest.index("[") :])
 
     def start(self) -> None:
-        """Start the image's command, and ask its health check until it says yes.
+        """Start the image's command, and run its health check until it succeeds.
 
         Raises:
-            SystemExit: it never does.
+            SystemExit: it never succeeds.
         """
         with socket.create_server(("127.0.0.1", 0)) as free:
             port = str(free.getsockname()[1])
@@ -122,7 +121,7 @@ class Image:
         """Copy what .dockerignore sends to the builder."""
         sent = [line[1:] for line in (TOP / ".dockerignore").read_text().splitlines() if line.startswith("!")]
         if not any(source == one or source.startswith(f"{one}/") for one in sent):
-            raise SystemExit(f"COPY {source}: .dockerignore keeps it from the builder")
+            raise SystemExit(f"COPY {source}: excluded by .dockerignore")
         if (TOP / source).is_dir():
             shutil.copytree(TOP / source, target, ignore=shutil.ignore_patterns("__pycache__"))
             return
@@ -131,7 +130,7 @@ class Image:
         shutil.copyfile(TOP / source, target)
 
     def _run(self, command: str) -> None:
-        """Run a command in the image; installing is done with the packages of this environment."""
+        """Run a command in the image; `pip install` uses the packages of this environment."""
         python = self.root / "opt" / "imgcal" / "bin" / "python"
         if "-m venv" in command:
             subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(python.parents[1])], check=True)
@@ -148,7 +147,7 @@ class Image:
             subprocess.run(["sh", "-c", asked], check=True, **self._as_user())
 
     def _may_run_as(self, user: int) -> bool:
-        """Tell whether a user without rights can be had, and can read this Python."""
+        """Tell whether commands can run as an unprivileged user who can read this Python."""
         if os.geteuid() != 0:
             return False
         python = [str(self.root / "opt" / "imgcal" / "bin" / "python"), "-c", "import torch"]
@@ -157,7 +156,7 @@ class Image:
         except OSError:
             done = None
         if done is None or done.returncode:
-            print("        note: other users cannot read this Python, so that all runs as root", flush=True)
+            print("        note: other users cannot read this Python, so everything runs as root", flush=True)
             return False
         return True
 
@@ -168,17 +167,17 @@ class Image:
         return {"env": environment, "user": self.user, "group": self.user, "extra_groups": []}
 
     def _found(self, command: Sequence[str]) -> list[str]:
-        """The command with its program in the image's PATH."""
+        """Resolve a command's program in the image's PATH."""
         program = shutil.which(command[0], path=self.environment["PATH"])
         return [program or command[0], *command[1:]]
 
     def _with_values(self, text: str) -> str:
-        """Put ARG and ENV in: $NAME."""
+        """Substitute ARG and ENV values for $NAME."""
         known = self.values | self.environment
         return re.sub(r"\$(\w+)", lambda match: known.get(match[1], match[0]), text)
 
     def _inside(self, text: str) -> str:
-        """Paths of the image as they are in the folder."""
+        """Translate the image's paths into paths of the folder."""
         return ROOTS.sub(lambda match: f"{self.root}/{match[1]}", text)
 
 

@@ -1,4 +1,4 @@
-"""Let a rig drift, look at the object twenty times, and recover the drift with its uncertainty."""
+"""Let a rig drift, take twenty snapshots of an object, and recover the drift with its uncertainty."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""Differentiate through the estimate: how does one pixel of one camera move the recalibrated rig?"""
+"""Differentiate through the estimate: how does a pixel in one camera change the recalibrated rig?"""
 
 import torch
 

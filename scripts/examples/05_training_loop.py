@@ -1,4 +1,4 @@
-"""A training loop of one's own: how far to trust a fiducial by its brightness, learnt through the rig's estimate."""
+"""Write your own training loop: learn a fiducial's sigma from its brightness, through the rig's estimate."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""Calibrate cameras of which only a rough field of view is known, from a wand that was carried around."""
+"""Calibrate cameras from a wand that is carried around, given only their approximate field of view."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ truth = simulate_volume(planned, wand, 100, generator, PhysicalDrift(), hand=Han
 
 exact = true_detections(truth)
 noise = np.random.default_rng(1).normal(scale=0.1, size=exact.uv.shape)  # px
-blobs = replace(exact, uv=exact.uv + noise, fiducial=np.full(len(exact), -1))  # nobody says which blob is which
+blobs = replace(exact, uv=exact.uv + noise, fiducial=np.full(len(exact), -1))  # unlabelled
 rough = replace(planned, focal_length=1.1 * planned.focal_length)
 
 result = calibrate_from_scratch(blobs, drop_poses(rough), wand)

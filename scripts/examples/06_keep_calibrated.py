@@ -1,4 +1,4 @@
-"""Keep a rig calibrated while an object is carried about in front of it; a camera is bumped on the way."""
+"""Keep a rig calibrated while an object is carried around in front of it; one camera is bumped on the way."""
 
 import math
 

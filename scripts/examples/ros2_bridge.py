@@ -4,10 +4,10 @@ Usage: python ros2_bridge.py tcp://127.0.0.1:5555 cam01=/rig/cam01/image_raw cam
            [poses=tcp://127.0.0.1:5556]
 and imgcal watch tcp://127.0.0.1:5555 --rig rig.yaml --object object.csv --out out/watch [--poses tcp://127.0.0.1:5556]
 
-Limits: needs rclpy of a sourced ROS 2 and pyzmq in one Python; has been tried without ROS only (what it makes of a
-message is tested, its node is not). Takes mono8 and mono16, not compressed; a frame's time is its header's stamp, which
-the driver must set to the middle of the exposure by synchronized clocks. Poses become PoseWithCovarianceStamped in
-metres, covariance in ROS's order (position, then rotation), in the frame `rig`.
+Limits: it needs rclpy of a sourced ROS 2 and pyzmq in the same Python. It has been tested without ROS only: message
+conversion is tested, the node is not. It accepts uncompressed mono8 and mono16. A frame's time is its header's stamp;
+the driver must set it to the middle of the exposure, with synchronized clocks. Poses become PoseWithCovarianceStamped
+in metres, with the covariance in ROS's order (position, then rotation), in the frame `rig`.
 """
 
 import json
@@ -21,7 +21,7 @@ KINDS = {"mono8": "uint8", "8UC1": "uint8", "mono16": "uint16", "16UC1": "uint16
 
 
 def frame_parts(camera: str, message: Any) -> list[bytes]:
-    """The two parts of a message to imgcal: a header, and pixels without gaps, low byte first."""
+    """Make the two parts of a message to imgcal: a header, and contiguous little-endian pixels."""
     kind = np.dtype(KINDS[message.encoding])
     rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)[
         :, : message.width * kind.itemsize
@@ -33,7 +33,7 @@ def frame_parts(camera: str, message: Any) -> list[bytes]:
 
 
 def pose_values(line: str | bytes) -> tuple[Any, Any, Any, float] | None:
-    """Position (m), quaternion (x, y, z, w) and covariance (36,) of a line that imgcal publishes; None = no pose."""
+    """Parse a line that imgcal publishes: position (m), quaternion (x, y, z, w), covariance (36,); None = no pose."""
     from scipy.spatial.transform import Rotation
 
     entry = json.loads(line)

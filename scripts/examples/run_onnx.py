@@ -1,4 +1,4 @@
-"""Measure a marker with an exported network: NumPy and onnxruntime alone, no PyTorch and no imgcal.
+"""Measure a marker with an exported network, using only NumPy and onnxruntime: no PyTorch, no imgcal.
 
 Usage: imgcal export measurer-cnn --to onnx --out measurer.onnx && python scripts/examples/run_onnx.py measurer.onnx
 """
@@ -13,7 +13,7 @@ SIZE = 24  # pixels of a patch, each way
 
 
 def normalized(patches: Any) -> Any:
-    """Grey patches (M, S, S) as networks take them: less their median, over their noise, compressed; NaN becomes 0."""
+    """Normalize grey patches (M, S, S): subtract the median, divide by the noise, compress; NaN becomes 0."""
     level = median(patches)
     noise = 1.05 * median(np.abs(patches[:, :, 2:] - patches[:, :, :-2]))
     largest = np.nan_to_num(np.abs(patches - level)).max((1, 2), keepdims=True)
@@ -22,14 +22,14 @@ def normalized(patches: Any) -> Any:
 
 
 def median(values: Any) -> Any:
-    """Of what is no NaN in each patch: (M, 1, 1); of two in the middle the lower one; 0 where nothing is."""
+    """Lower median of each patch, ignoring NaN: (M, 1, 1); 0 where all values are NaN."""
     flat = np.sort(values.reshape(len(values), -1), axis=1)  # NaN last
     middle = np.maximum(np.isfinite(flat).sum(1) - 1, 0) // 2
     return np.nan_to_num(flat[np.arange(len(flat)), middle])[:, None, None]
 
 
 def measure(session: Any, frame: Any, place: Any, radius: float) -> tuple[Any, float, float]:
-    """Centre (u, v) of the marker of a radius (pixels, 3.5 at most) near a place, its sigma, and whether it is one."""
+    """Measure a marker near a place: centre (u, v), sigma, probability that it is one; radius at most 3.5 pixels."""
     corner = np.round(np.asarray(place) - (SIZE - 1) / 2).astype(int)
     patch = frame[corner[1] : corner[1] + SIZE, corner[0] : corner[0] + SIZE].astype(np.float64)
     given = {"patches": normalized(patch[None]), "radius": np.array([radius], np.float32)}

@@ -1,7 +1,7 @@
-"""Send blobs of a simulated rig, bumped after a while, to `imgcal watch ADDRESS --rig T4 --object asymmetric8`.
+"""Send the blobs of a simulated rig to `imgcal watch ADDRESS --rig T4 --object asymmetric8`; a camera is bumped later.
 
-Usage: python scripts/examples/send_blobs.py tcp://127.0.0.1:5555 [SNAPSHOTS]. What a real sender needs are the lines
-about zmq and json.
+Usage: python scripts/examples/send_blobs.py tcp://127.0.0.1:5555 [SNAPSHOTS]. A real sender needs only the lines with
+zmq and json.
 """
 
 import json
@@ -22,7 +22,7 @@ bump = torch.zeros(rig.num_cameras, 15, dtype=torch.float64)
 bump[1, 0] = math.radians(0.3)  # the second camera turns by 0.3 degrees
 snapshots = int(sys.argv[2]) if len(sys.argv) > 2 else 100_000
 
-with zmq.Context() as context, context.socket(zmq.PUB) as socket:  # who publishes never waits for those who read
+with zmq.Context() as context, context.socket(zmq.PUB) as socket:  # a publisher never waits for its readers
     socket.bind(sys.argv[1])
     began = time.monotonic()
     for snapshot in range(snapshots):
@@ -36,4 +36,4 @@ with zmq.Context() as context, context.socket(zmq.PUB) as socket:  # who publish
             uv = seen.uv[camera][seen.visible[camera]]
             blobs = (uv + 0.05 * torch.randn_like(uv)).tolist()
             socket.send_string(json.dumps({"camera": name, "time": now, "uv": blobs, "sigma": 0.05}))
-        time.sleep(max(0.0, began + (snapshot + 1) / RATE - time.monotonic()))  # by the clock: work takes time, too
+        time.sleep(max(0.0, began + (snapshot + 1) / RATE - time.monotonic()))  # the work takes time too

@@ -1,4 +1,4 @@
-"""Simulate a fleet: blobs of an object in front of many rigs that have drifted, and the manifest of all of them.
+"""Simulate a fleet: many drifted rigs that see an object, a table of blobs for each, and a manifest.
 
 Usage: python -m scripts.examples.simulate_fleet FOLDER --devices 200
 """
@@ -23,9 +23,9 @@ from imgcal.types import RigPrior
 from scripts.output import command
 
 TRUE = RigPrior(focal_length=0.004, principal_point=3.0, distortion=0.005, rotation=0.003, position=1.5)
-"""How far these devices drift: what `imgcal fleet` should find."""
+"""Drift of these devices, which `imgcal fleet` should recover."""
 BUMP = 0.05  # rad, of one camera
-WARMTH = 2e-4  # by which focal lengths grow for each degree
+WARMTH = 2e-4  # relative growth of focal lengths per degree
 NOISE = 0.1  # px
 
 
@@ -36,12 +36,12 @@ class Options:
     out: Annotated[Path, tyro.conf.Positional]  #: folder of manifest.csv and a table of blobs for each device
     devices: int = 200
     snapshots: int = 3
-    bumped: float = 0.01  #: share of devices one of whose cameras was bumped
+    bumped: float = 0.01  #: share of devices with a bumped camera
     seed: int = 0
 
 
 def main(options: Options) -> None:
-    """Write captures and manifest."""
+    """Write the captures and the manifest."""
     options.out.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(options.seed)
     bumped = rng.random(options.devices) < options.bumped
@@ -58,7 +58,7 @@ def main(options: Options) -> None:
 
 
 def drifted(seed: int, temperature: float, bumped: bool) -> imgcal.CameraRig:
-    """A rig away from its factory values."""
+    """Make a rig that has drifted from its factory values."""
     factory, generator = imgcal.load_rig("T4"), torch.Generator().manual_seed(seed)
     drift = PhysicalDrift(
         math.degrees(TRUE.rotation), TRUE.position, TRUE.focal_length, TRUE.principal_point, TRUE.distortion
@@ -75,7 +75,7 @@ def _direction(generator: torch.Generator) -> Tensor:
 
 
 def blobs_of(rig: imgcal.CameraRig, snapshots: int, seed: int, path: Path) -> None:
-    """What the cameras of a rig see of the object, unlabelled."""
+    """Write the blobs of the object in a rig's cameras, unlabelled."""
     truth = simulate_truth(rig, imgcal.load_object("asymmetric8"), snapshots, torch.Generator().manual_seed(seed), None)
     seen = true_detections(truth)
     noise = np.random.default_rng(seed).normal(0.0, NOISE, seen.uv.shape)

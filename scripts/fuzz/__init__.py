@@ -1,1 +1,1 @@
-"""Damaged and hostile input, thousands of it, by seed and number: one line and an exit code go out."""
+"""Thousands of damaged and hostile inputs, by seed and number; each must end in one line and an exit code."""

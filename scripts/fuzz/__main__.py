@@ -1,7 +1,7 @@
-"""`python -m scripts.fuzz --minutes 10 --seed 1`: damaged input by the thousand, and what did not end in one line.
+"""Try thousands of damaged inputs and report faults: `python -m scripts.fuzz --minutes 10 --seed 1`.
 
-A worker goes through the cases in its own process, so that a crash or a hang is found like any other fault.
-`--only N` repeats one case and shows its traceback.
+A worker runs the cases in its own process, so that a crash or a hang is found like any other fault. An input that does
+not end in a one-line message is a fault. `--only N` repeats one case and shows its traceback.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import tempfile
 import time
 from pathlib import Path
 
-PATIENCE = 120.0  # s for one case
-MOST_MEMORY = 6 * 2**30  # bytes of data of a worker
+PATIENCE = 120.0  # s, time limit of one case
+MOST_MEMORY = 6 * 2**30  # bytes, memory limit of a worker
 
 
 def main() -> int:
-    """Run the campaign; the exit code says whether a fault was found."""
+    """Run the campaign and return an exit code: 1 if a fault was found."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=5.0)
     parser.add_argument("--seed", type=int, default=0)
@@ -38,7 +38,7 @@ def main() -> int:
 
 
 def campaign(place: Path, seed: int, minutes: float) -> int:
-    """Start workers one after another until the time is over; a new one goes on after the case that ended the last."""
+    """Run one worker after another until the time is up; each starts after the case that ended the one before it."""
     end, number, faults = time.monotonic() + 60 * minutes, 0, 0
     while time.monotonic() < end:
         command = [sys.executable, "-m", "scripts.fuzz", "--seed", str(seed), "--worker", str(number)]
@@ -53,7 +53,7 @@ def campaign(place: Path, seed: int, minutes: float) -> int:
 
 
 def _follow(worker: subprocess.Popen[bytes], number: int, end: float) -> tuple[int, list[str]]:
-    """Read what a worker says, until the end, its end, or a hang: the number of the next case, and the faults."""
+    """Read a worker's output until time is up, it ends or it hangs; return the next case's number and the faults."""
     assert worker.stdout is not None
     os.set_blocking(worker.stdout.fileno(), False)
     words, pending, heard = [], b"", time.monotonic()
@@ -80,7 +80,7 @@ def _follow(worker: subprocess.Popen[bytes], number: int, end: float) -> tuple[i
 
 
 def work(place: Path, seed: int, first: int) -> int:
-    """Go through cases and say the number of each, and its fault if it has one."""
+    """Run cases and write the number of each, and its fault if there is one."""
     from scripts.fuzz.cases import case, prepare
     from scripts.fuzz.verdict import run
 
@@ -101,7 +101,7 @@ def work(place: Path, seed: int, first: int) -> int:
 
 
 def repeat(place: Path, seed: int, number: int) -> int:
-    """Run one case for somebody who watches."""
+    """Run one case in the foreground, with its traceback."""
     from imgcal.cli.main import main as command
     from scripts.fuzz.cases import case, prepare
 

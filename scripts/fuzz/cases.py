@@ -1,4 +1,4 @@
-"""What is tried: a small sound place to work in, and cases that damage one thing in a copy of it."""
+"""Inputs to try: a small folder of valid files, and cases that damage one thing in a copy of it."""
 
 from __future__ import annotations
 
@@ -57,30 +57,30 @@ class Case:
 
     folder: Path
     arguments: list[str]
-    damage: str  # what was done, for people
+    damage: str  # what was damaged, in words
 
 
 def prepare(folder: Path) -> None:
-    """Make the sound place: rig, object, capture, detections, other images, a video, a network, an experiment."""
+    """Make the valid files: rig, object, capture, detections, other images, a video, a network, an experiment."""
     folder.mkdir(parents=True)
     save_rig(read_rig("T4").resized(torch.tensor(SIZE)), folder / "rig.yaml")
     save_object(load_object("asymmetric8"), folder / "object.csv")
     made = ["simulate", "--rig", str(folder / "rig.yaml"), "--object", str(folder / "object.csv"), "--out"]
     made += [str(folder / "capture"), "--snapshots", "2", "--kappa", "0.005", "--no-clutter", "--marker-radius", "14"]
     if main(made):
-        raise RuntimeError("the sound capture cannot be made")
+        raise RuntimeError("could not make the valid capture")
     truth = load_detections(folder / "capture" / "truth" / "detections.csv")
     save_detections(truth, folder / "labelled.csv")
     save_detections(truth, folder / "labelled.csv.gz")
     if main(["detect", str(folder / "capture"), "--out", str(folder / "blobs.csv")]):
-        raise RuntimeError("no blobs are found in the sound capture")
+        raise RuntimeError("found no blobs in the valid capture")
     _other_frames(folder)
     _network(folder)
     prepare_foreign(folder / "foreign", read_rig(folder / "rig.yaml"))
 
 
 def case(sound: Path, folder: Path, seed: int, number: int) -> Case:
-    """Make the case of a seed and a number in a folder that does not exist."""
+    """Make the case with this seed and number, in a folder that does not exist yet."""
     random = Random(f"{seed} {number}")
     shutil.copytree(sound, folder)
     kind = random.choice(tuple(KINDS))
@@ -89,7 +89,7 @@ def case(sound: Path, folder: Path, seed: int, number: int) -> Case:
 
 
 def _other_frames(folder: Path) -> None:
-    """The same capture as TIFF, BMP, PGM, JPEG and as video."""
+    """Write the same capture as TIFF, BMP, PGM, JPEG and video."""
     capture, rig = folder / "capture", read_rig(folder / "rig.yaml")
     for suffix in ("tif", "bmp", "pgm", "jpg", "avi"):
         other = folder / suffix
@@ -141,7 +141,7 @@ def _subject(folder: Path) -> list[str]:
 
 
 def _on(folder: Path, source: str, random: Random) -> list[str]:
-    """A command on a capture or a table."""
+    """Choose a command for a capture or a table."""
     place, out = str(folder / source), ["--out", str(folder / "out")]
     commands = (
         ["calibrate", place, *_subject(folder), *out],
@@ -157,7 +157,7 @@ def _rig(folder: Path, random: Random) -> tuple[list[str], str]:
 
 
 def _foreign(folder: Path, random: Random) -> tuple[list[str], str]:
-    """Another tool's calibration, converted or used as a rig."""
+    """Damage another tool's calibration, and convert it or use it as a rig."""
     place = random.choice(sorted((folder / "foreign").iterdir()))
     path = random.choice(sorted(place.iterdir()))
     damage = f"{place.name}/{_damage(path, random)}"
@@ -190,7 +190,7 @@ def _frames(folder: Path, random: Random) -> tuple[list[str], str]:
 
 
 def _names(folder: Path, random: Random) -> tuple[list[str], str]:
-    """Give a file or folder of the capture another name."""
+    """Rename a file or folder of the capture."""
     paths = sorted((folder / "capture" / "frames").rglob("*"))
     path = random.choice(paths)
     name = random.choice([name for name in NAMES if name.strip(".") and not set(name) & set("/\0")])[:200]
@@ -227,7 +227,7 @@ def _setting(folder: Path, random: Random) -> tuple[list[str], str]:
 
 
 def _option(folder: Path, random: Random) -> tuple[list[str], str]:
-    """Give an option a value that nobody means."""
+    """Give an option a nonsensical value."""
     command = random.choice(tuple(OPTIONS))
     option = random.choice(OPTIONS[command])
     value = random.choice((*VALUES, *NAMES)).replace("\0", "")
@@ -240,7 +240,7 @@ def _option(folder: Path, random: Random) -> tuple[list[str], str]:
         "render": ["render", str(folder / "capture"), *_subject(folder), "--out", str(folder / "out"), "--size", "32"],
         "score": ["score", str(folder / "capture"), *_subject(folder)],
     }[command]
-    if option == "--out":  # where to write is for the user to say, but here it stays within the case
+    if option == "--out":  # users may write anywhere, but here outputs stay in the case's folder
         value = str(folder / "out" / value.replace("..", "").lstrip("/"))
     more = [value, value] if option.endswith(("-deg", "--phi", ".radius")) else [value]
     return [*sound, option, *more], f"{command} {option} {value[:60]!r}"

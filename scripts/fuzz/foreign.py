@@ -1,4 +1,4 @@
-"""Sound calibrations of other tools, one of every format, to be damaged."""
+"""Valid calibrations of other tools, one in each format, to be damaged."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ WRITTEN_BY_HAND = {
 
 
 def prepare_foreign(folder: Path, rig: CameraRig) -> None:
-    """Write a rig in every format that can be written, and small ones in those that are only read."""
+    """Write a rig in every format that can be written, and small rigs in the read-only formats."""
     bare = replace(from_camera_rig(rig), own=None)
     for one in FORMATS:
         if one.write is None:
@@ -62,6 +62,6 @@ def prepare_foreign(folder: Path, rig: CameraRig) -> None:
 
 
 def _file_name(one: Format) -> str:
-    """A name with the suffix that its tool gives it, which decides how it is damaged."""
+    """Name a file with its tool's suffix, which determines how it is damaged."""
     suffixes = {"multical": ".json", "pymvg": ".json", "kalibr": ".yaml", "opencv-multiview": ".yaml"}
     return f"calibration{suffixes.get(one.name, '.toml')}"

@@ -1,4 +1,4 @@
-"""How files are damaged: as a bad disk, a careless hand or a bad mind would do it. Every choice comes from `random`."""
+"""Damage files as a bad disk, a careless user or an attacker would. Every choice comes from `random`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WHOLE = (0, 1, 2, 3, 7, 8, 255, 256, 32000, 65535, 65536, 2**24, 2**31 - 1, 2**3
 
 
 def mutated(content: bytes, kind: str, random: Random) -> bytes:
-    """Damage the content of a file of some kind (its suffix): mostly once, now and then several times."""
+    """Damage the content of a file according to its suffix `kind`: usually once, sometimes several times."""
     for _ in range(random.choice((1, 1, 1, 2, 5))):
         content = random.choice(MUTATIONS.get(kind, BYTES))(content, random)
     return content
@@ -41,12 +41,12 @@ def flip(content: bytes, random: Random) -> bytes:
 
 
 def cut(content: bytes, random: Random) -> bytes:
-    """End early."""
+    """Truncate the content."""
     return content[: random.randrange(len(content) + 1)]
 
 
 def replace_range(content: bytes, random: Random) -> bytes:
-    """Put something else, or nothing, in the place of a part; or repeat the part."""
+    """Replace a part with something else or nothing, or repeat it."""
     first = random.randrange(len(content) + 1)
     last = min(len(content), first + random.choice((0, 1, 4, 50, 1000)))
     new = random.choice(
@@ -56,7 +56,7 @@ def replace_range(content: bytes, random: Random) -> bytes:
 
 
 def numbers_in_binary(content: bytes, random: Random) -> bytes:
-    """Overwrite a binary number, more often near the start, where headers are."""
+    """Overwrite a binary number, usually near the start, where headers are."""
     layout = random.choice(("<H", ">H", "<I", ">I", "<Q", ">Q"))
     end = min(len(content), random.choice((64, 400, len(content) + 1)))
     if end < 8:
@@ -76,7 +76,7 @@ def other_value(content: bytes, random: Random) -> bytes:
 
 
 def other_name(content: bytes, random: Random) -> bytes:
-    """Replace a word in a text, by a nasty one or by another of the same text."""
+    """Replace a word in a text with a nasty one or with another word of the text."""
     found = list(re.finditer(rb"[A-Za-z_][A-Za-z_0-9]*", content))
     if not found:
         return content
@@ -86,7 +86,7 @@ def other_name(content: bytes, random: Random) -> bytes:
 
 
 def lines(content: bytes, random: Random) -> bytes:
-    """Drop, repeat, exchange or shuffle lines."""
+    """Drop, repeat, swap, shuffle or truncate lines."""
     rows = content.split(b"\n")
     first, second = random.randrange(len(rows)), random.randrange(len(rows))
     match random.randrange(6):
@@ -108,7 +108,7 @@ def lines(content: bytes, random: Random) -> bytes:
 
 
 def columns(content: bytes, random: Random) -> bytes:
-    """Exchange the columns of a CSV, or set one to the same value everywhere."""
+    """Swap two columns of a CSV, or set one to the same value in every row."""
     rows = [row.split(b",") for row in content.split(b"\n")]
     width = len(rows[0])
     first, second = random.randrange(width), random.randrange(width)
@@ -122,7 +122,7 @@ def columns(content: bytes, random: Random) -> bytes:
 
 
 def structure(content: bytes, random: Random) -> bytes:
-    """Put what only a parser minds into a YAML text."""
+    """Insert a construct that is hard to parse into a YAML text."""
     nasty = random.choice(
         (
             b"[" * 5000,
@@ -141,7 +141,7 @@ def structure(content: bytes, random: Random) -> bytes:
 
 
 def markup(content: bytes, random: Random) -> bytes:
-    """Put what only a parser of XML minds into a text: in UTF-16 where the text is."""
+    """Insert a construct that is hard to parse into an XML text, in UTF-16 if the text is."""
     nasty = random.choice(
         (
             "<!DOCTYPE a [<!ENTITY l 'lol'><!ENTITY m '&l;&l;&l;&l;&l;&l;&l;&l;'>]>",
@@ -161,7 +161,7 @@ def markup(content: bytes, random: Random) -> bytes:
 
 
 def png_chunks(content: bytes, random: Random) -> bytes:
-    """Damage a chunk of a PNG and make its checksum right again."""
+    """Damage a chunk of a PNG and correct its checksum."""
     position, chunks = 8, []
     while position + 12 <= len(content):
         length = int.from_bytes(content[position : position + 4], "big")
@@ -188,7 +188,7 @@ def png_chunks(content: bytes, random: Random) -> bytes:
 
 
 def compressed(content: bytes, random: Random) -> bytes:
-    """Damage what is inside of a gzip file."""
+    """Damage the content of a gzip file."""
     try:
         inside = gzip.decompress(content)
     except (OSError, EOFError, zlib.error):
@@ -197,7 +197,7 @@ def compressed(content: bytes, random: Random) -> bytes:
 
 
 def tensors(content: bytes, random: Random) -> bytes:
-    """Damage the header of a safetensors file: what it says of a tensor, or one of the texts in it."""
+    """Damage the header of a safetensors file: a tensor's entry, or one of the metadata texts."""
     length = int.from_bytes(content[:8], "little")
     try:
         header = json.loads(content[8 : 8 + length])
@@ -217,7 +217,7 @@ def tensors(content: bytes, random: Random) -> bytes:
 
 
 def deep(content: bytes, random: Random) -> bytes:
-    """Nest."""
+    """Nest brackets too deeply."""
     return random.choice((b"[" * 100_000, b'{"a":' * 300 + b"1" + b"}" * 300, b"[" + content + b"]"))
 
 

@@ -1,4 +1,4 @@
-"""How a case is run, and what must be true of it afterwards."""
+"""Run a case, and check what must be true afterwards."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from scripts.fuzz.cases import Case
 
 NOISE = re.compile(r"Traceback|Warning|internal error|libpng|Corrupt JPEG|\[avi|^\s+File ", re.MULTILINE)
 CODES = (0, 2, 3)
-LONGEST = 1100  # characters of the line
+LONGEST = 1100  # characters of the message
 
 
 def run(case: Case) -> str:
-    """Run a case in this process; says what was wrong, in words, or nothing."""
+    """Run a case in this process; return its fault in words, empty if there is none."""
     return attempt(case)[1]
 
 
 def attempt(case: Case) -> tuple[object, str]:
-    """Run a case in this process; its exit code, and what was wrong, in words, or nothing."""
+    """Run a case in this process; return its exit code and its fault in words, empty if there is none."""
     before = _listing(case.folder)
     torch.set_num_threads(1)  # an experiment may have set another number for the whole process
     with _written() as texts, warnings.catch_warnings():
@@ -45,7 +45,7 @@ def attempt(case: Case) -> tuple[object, str]:
 
 
 def judge(case: Case, code: object, error: str, before: set[Path]) -> str:
-    """Compare what a case left behind with what is promised."""
+    """Compare what a case left behind with what imgcal promises."""
     if code not in CODES:
         return f"exit code {code}"
     if NOISE.search(error):
@@ -94,7 +94,7 @@ def _listing(folder: Path) -> set[Path]:
 
 @contextmanager
 def _written() -> Iterator[list[str]]:
-    """Catch what this process writes, by Python or past it; the texts of both streams are there afterwards."""
+    """Capture what this process writes, from Python or native code; yields a list that gets both texts at the end."""
     texts: list[str] = []
     streams = (sys.stdout, sys.stderr)
     kept = [os.dup(1), os.dup(2)]

@@ -1,8 +1,8 @@
 """Repeat the paper's study of bundle adjustment: ``python -m scripts.results.bundle_adjustment``.
 
-1,000 rigs O6 over cube8 with intrinsics off by up to 10 %, one snapshot each: RE left alone, after 1 and 25 iterations
-of imgcal's MAP solver and of a plain bundle adjustment, and of a network when its file is given; seconds for each
-(of bundle adjustment: without its start).
+1,000 rigs O6 over cube8 with intrinsics wrong by up to 10 %, one snapshot each. Measures the RE of the factory rig,
+after 1 and 25 iterations of imgcal's MAP solver and of a plain bundle adjustment, and of a network if its file is
+given; and the seconds for each (for bundle adjustment, without its initialization).
 Writes docs/results/bundle_adjustment.json and .png.
 """
 
@@ -37,8 +37,8 @@ from scripts.output import BLUE, GREEN, GREY, RED, RESULTS, command, figure, sur
 
 Array = NDArray[np.float64]
 
-LEAST_RE = 1e-5  # pixels: smaller ones are drawn there
-NUMBERS = 15  # of a camera in plain bundle adjustment: rotation vector, translation, f, principal point, distortion
+LEAST_RE = 1e-5  # pixels: smaller values are drawn here
+NUMBERS = 15  # per camera in plain bundle adjustment: rotation vector, translation, f, principal point, distortion
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Options:
     """Compare with bundle adjustment."""
 
     trials: int = 1000
-    plain_trials: int = 200  #: of plain bundle adjustment, which is slow: the first ones
+    plain_trials: int = 200  #: trials of plain bundle adjustment, which is slow: the first ones
     iterations: tuple[int, int] = (1, 25)
     model: Path | None = None  #: network for O6, cube8 (table1-row09)
     out: Path = RESULTS  #: folder of bundle_adjustment.json and .png
@@ -54,20 +54,20 @@ class Options:
 
 @dataclass(frozen=True)
 class Column:
-    """One way to go about it: RE of each trial in pixels, and seconds."""
+    """One method: RE of each trial in pixels, and seconds."""
 
     re: list[float]
     seconds: list[float]
 
     def summary(self) -> dict[str, Any]:
-        """Plain values for the result file."""
+        """Return plain values for the result file."""
         quartiles = np.quantile(self.re, (0.0, 0.25, 0.5, 0.75, 1.0)).tolist()
         took = {"seconds_p50": statistics.median(self.seconds)} if self.seconds else {}
         return {"trials": len(self.re), "mean_px": statistics.fmean(self.re), "quartiles_px": quartiles, **took}
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run all trials, print, write."""
+    """Run all trials, print and write the results."""
     options = tyro.cli(Options, args=arguments, description=__doc__)
     rig, obj = read_rig("O6"), load_object("cube8")
     conditions = Conditions(rig, obj, PoseRange.overhead(), RelativeDrift(0.1, 0.0))
@@ -96,7 +96,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def pose_by_pnp(given: Given) -> Prediction:
-    """The factory rig, and a pose by PnP over all cameras: where every bundle adjustment here begins."""
+    """Return the factory rig and a pose by PnP over all cameras: the start of every bundle adjustment here."""
     observations = make_observations(given.uv, given.seen, given.sigma)
     return Prediction(given.factory.expand(len(given.uv)), initial_pose(observations, given.factory, given.obj)[:, 0])
 
@@ -106,7 +106,7 @@ def _times(iterations: int) -> str:
 
 
 def _each(predict: Callable[..., Prediction], sample: Sample) -> Column:
-    """Give a method one rig at a time."""
+    """Run a method on one rig at a time."""
     errors, seconds = [], []
     for row in range(len(sample)):
         one = slice(row, row + 1)
@@ -119,7 +119,7 @@ def _each(predict: Callable[..., Prediction], sample: Sample) -> Column:
 
 
 def _map(sample: Sample, iterations: int) -> Column:
-    """Take so many iterations of imgcal's solver, from the factory rig and a pose by PnP."""
+    """Run imgcal's solver for a number of iterations, from the factory rig and a pose by PnP."""
     limits = EstimationOptions(loss="squared", max_iterations=iterations)
     errors, seconds = [], []
     for row in range(len(sample)):
@@ -135,7 +135,7 @@ def _map(sample: Sample, iterations: int) -> Column:
 
 
 def _plain(sample: Sample, iterations: int, trials: int) -> Column:
-    """Bundle adjustment as it is usually written: all parameters free, no prior, numerical derivatives."""
+    """Run bundle adjustment as it is usually written: all parameters free, no prior, numerical derivatives."""
     errors, seconds = [], []
     for row in range(trials):
         given = sample.given(slice(row, row + 1))
@@ -148,7 +148,7 @@ def _plain(sample: Sample, iterations: int, trials: int) -> Column:
             return (_projected(x, points) - uv).ravel()
 
         began = time.perf_counter()
-        # scipy counts the evaluation at the start, too.
+        # scipy also counts the evaluation at the start.
         found = least_squares(residuals, start, x_scale="jac", max_nfev=iterations + 1)
         seconds.append(time.perf_counter() - began)
         errors.append(float(np.sqrt(np.square(found.fun).mean())))  # exact points: their residual is the RE
@@ -156,7 +156,7 @@ def _plain(sample: Sample, iterations: int, trials: int) -> Column:
 
 
 def numbers_of(cameras: CameraRig) -> Array:
-    """Start of plain bundle adjustment: 15 numbers of each camera, one after the other."""
+    """Initial values of plain bundle adjustment: 15 numbers per camera, concatenated."""
     packed = pack21(cameras)
     turn: Tensor = vector_from_rotation(cameras.cam_from_rig.rotation)
     numbers: Array = torch.cat((turn, packed[..., 9:]), dim=-1).numpy().ravel()
@@ -164,7 +164,7 @@ def numbers_of(cameras: CameraRig) -> Array:
 
 
 def _projected(x: Array, points: Array) -> Array:
-    """(C, N, 2) pixels."""
+    """Project points (N, 3) into every camera: (C, N, 2) pixels."""
     images = []
     for turn, shift, (fx, fy, cx, cy), lens in (
         (camera[:3], camera[3:6], camera[6:10], camera[10:]) for camera in x.reshape(-1, NUMBERS)
@@ -181,7 +181,7 @@ def _errors(found: Prediction, sample: Sample, rows: slice = slice(None)) -> lis
 
 
 def draw_figure(columns: dict[str, Column], path: Path) -> None:
-    """Draw the RE of all trials, box by box, and what each took."""
+    """Draw the RE of all trials as boxes, and the times."""
     colours = {"left": RED, "start": RED, "MAP": BLUE, "plain": GREY, "network": GREEN}
     with figure(path, panels=2, size=(8.5, 3.6)) as (left, right):
         values = [np.maximum(column.re, LEAST_RE) for column in columns.values()]

@@ -1,7 +1,7 @@
-"""Draw true and predicted cameras in 3D, to turn around in a browser: ``python -m scripts.results.cameras``.
+"""Draw true and predicted cameras in 3D, for a browser: ``python -m scripts.results.cameras``.
 
 Several random rigs on the hemisphere over the object: true cameras blue, predicted ones red.
-Writes out/results/cameras.html, which needs nothing else.
+Writes out/results/cameras.html, a self-contained page.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ body {{ font: 15px sans-serif; margin: 20px; }} canvas {{ width: 100%; height: 8
 class Options:
     """Draw cameras in 3D."""
 
-    model: Path | None = None  #: a trained network; none = the factory rig with the object's pose fitted
-    refined: bool = False  #: refine what it predicts
+    model: Path | None = None  #: a trained network; None = the factory rig with the object's pose fitted
+    refined: bool = False  #: refine its prediction
     rig: str = "O10"  #: without a model
     object: str = "sphere64"  #: without a model
     count: int = 6  #: rigs
@@ -54,7 +54,7 @@ class Options:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Predict, draw, write."""
+    """Predict, draw and write the page."""
     options = tyro.cli(Options, args=arguments, description=__doc__)
     if options.count < 1:
         raise InputError(f"--count: found {options.count}, expected at least 1")
@@ -71,7 +71,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def predict(method: Method, given: Given, refined: bool) -> Prediction:
-    """Predict, and refine if asked to."""
+    """Predict, and refine if `refined`."""
     found = method.predict(given)
     return method.refine(found, given).prediction if refined and method.refine is not None else found
 
@@ -84,7 +84,7 @@ def drawn(truth: CameraRig, predicted: CameraRig, fiducials: Tensor, title: str)
 
 
 def _one_rig(cameras: CameraRig) -> CameraRig:
-    """All cameras (B, C) as those of one rig, named by its number."""
+    """Collect all cameras (B, C) in one rig; names include the rig's number."""
     count = cameras.batch_shape[0]
     flat = cameras.map_tensors(lambda tensor, axes: tensor.flatten(0, 1).unflatten(0, (1, -1)))[0]
     names = tuple(f"{rig + 1} {name}" for rig in range(count) for name in cameras.camera_names)

@@ -1,4 +1,4 @@
-"""Plots of docs/results/tables.md that come from the evaluated networks."""
+"""Plots of evaluated networks for docs/results/tables.md."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 from scripts.output import BLUE, GREEN, RED, figure
 from scripts.results.measuring import NETWORK, ONE_PASS, WITHOUT
 
-LEAST_RE = 1e-4  # pixels: exact points are refined to rounding errors, which say nothing
+LEAST_RE = 1e-4  # pixels: with exact points, refinement reaches rounding errors, which are meaningless
 
 
 def over_time(results: Mapping[str, dict[str, Any]], path: Path) -> None:
-    """Draw RE over training time, one line a run."""
+    """Draw RE over training time, one line per run."""
     runs = {name: result["history"] for name, result in sorted(results.items()) if len(result["history"]) > 1}
     if not runs:
         return
@@ -41,7 +41,7 @@ def sweeps(result: dict[str, Any], path: Path) -> None:
             values = [factor * value for value in result[axis]["values"]]
             for name, (text, style) in lines.items():
                 if any(name not in row for row in result[axis]["rows"]):
-                    continue  # a network of one pass
+                    continue  # a one-pass network
                 means = [row[name]["mean"] for row in result[axis]["rows"]]
                 errors = [math.nan if mean is None else max(mean, LEAST_RE) for mean in means]
                 axes.plot(values, errors, marker="o", markersize=3, label=text, **style)

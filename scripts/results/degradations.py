@@ -1,6 +1,6 @@
-"""What real frames are made harder by: written down in what the sensor sees, and drawn anew for each frame from a seed.
+"""Degradations of real frames: defined in terms of what the sensor sees, and drawn for each frame from a seed.
 
-Lengths are in radii of the dots, light in grey levels of 8 bits. Whatever is done, a frame of 8 bits comes of it.
+Lengths are in radii of the dots, light in 8-bit grey levels. The result is always an 8-bit frame.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 Frame = NDArray[np.uint8]
-ELECTRONS = 10.0  # a grey level, before and after: 2,550 fill a pixel
+ELECTRONS = 10.0  # per grey level, before and after: 2,550 fill a pixel
 READ_NOISE = 10.0  # electrons, one standard deviation
-DRAPES = ((5, 40), (150, 250))  # grey levels of dark and of bright ones
+DRAPES = ((5, 40), (150, 250))  # grey levels of dark and of bright drapes
 SHARE_OF_A_DRAPE = (0.01, 0.04)  # of the image
 STRETCH = (1.0, 4.0)  # length over width of a drape
-DISCS = (0.6, 1.5)  # radius of a disc in parts of a dot's
-LIGHT = (0.5, 1.1)  # its difference from the ground in parts of a dot's
-FRACTION_BITS = 4  # of OpenCV's coordinates
+DISCS = (0.6, 1.5)  # radius of a disc, relative to a dot's
+LIGHT = (0.5, 1.1)  # its contrast with the background, relative to a dot's
+FRACTION_BITS = 4  # in OpenCV's fixed-point coordinates
 
 
 @dataclass(frozen=True)
 class Look:
-    """How the dots of a set look in its frames as they are."""
+    """Appearance of the dots of a set in its original frames."""
 
     radius: float  # px
     level: float  # grey value in the middle of a dot
-    ground: float  # of everything else
+    ground: float  # grey value of the background
     count: int  # dots of the object
 
 
@@ -38,25 +38,25 @@ Change = Callable[[Frame, float, Look, np.random.Generator], NDArray[np.floating
 
 @dataclass(frozen=True)
 class Degradation:
-    """One kind, mildest level first."""
+    """One kind of degradation, mildest level first."""
 
     change: Change
     levels: tuple[float, ...]
     meaning: str  # of a level
 
     def apply(self, frame: Frame, level: float, look: Look, draw: np.random.Generator) -> Frame:
-        """Make a frame harder: (H, W)."""
+        """Degrade a frame (H, W)."""
         return np.clip(np.rint(self.change(frame, level, look, draw)), 0, 255).astype(np.uint8)
 
 
 def blurred(frame: Frame, sigma: float, look: Look, draw: np.random.Generator) -> NDArray[np.floating]:
-    """Out of focus: a Gaussian of so many radii."""
+    """Blur by a Gaussian whose sigma is in dot radii."""
     seen = cv2.GaussianBlur(frame.astype(np.float32), (0, 0), sigma * look.radius, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(seen, dtype=np.float32)
 
 
 def moved(frame: Frame, length: float, look: Look, draw: np.random.Generator) -> NDArray[np.floating]:
-    """Moved during the exposure along a line of so many radii, evenly, in any direction: its middle stays."""
+    """Blur by uniform motion along a centred line, its length in dot radii and its direction random."""
     angle, half = draw.uniform(0, np.pi), 0.5 * length * look.radius
     reach = int(np.ceil(half)) + 1
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
@@ -71,18 +71,18 @@ def moved(frame: Frame, length: float, look: Look, draw: np.random.Generator) ->
 
 
 def darkened(frame: Frame, gain: float, look: Look, draw: np.random.Generator) -> NDArray[np.floating]:
-    """So much of the light, with the shot noise of what is left and the sensor's read noise, at the old grey levels."""
+    """Keep a share of the light, with its shot noise and the sensor's read noise, at the original grey levels."""
     electrons = draw.poisson(frame * (gain * ELECTRONS)) + READ_NOISE * draw.standard_normal(frame.shape)
     return electrons / ELECTRONS
 
 
 def noisy(frame: Frame, sigma: float, look: Look, draw: np.random.Generator) -> NDArray[np.floating]:
-    """Gaussian noise of so many grey levels."""
+    """Add Gaussian noise; sigma is in grey levels."""
     return frame + sigma * draw.standard_normal(frame.shape)
 
 
 def draped(frame: Frame, share: float, look: Look, draw: np.random.Generator) -> NDArray[np.floating]:
-    """Dark and bright oblongs with edges hide so much of the image."""
+    """Hide a share of the image behind dark and bright oblongs with sharp edges."""
     height, width = frame.shape
     seen, hidden = frame.astype(np.float64), np.zeros(frame.shape)
     while hidden.mean() < share:
@@ -101,7 +101,7 @@ def draped(frame: Frame, share: float, look: Look, draw: np.random.Generator) ->
 
 
 def crowded(frame: Frame, times: float, look: Look, draw: np.random.Generator) -> NDArray[np.floating]:
-    """Discs that look like dots, anywhere: so many times as many as the object has dots."""
+    """Add discs that look like dots at random places: a multiple of the object's number of dots."""
     height, width = frame.shape
     seen, scale = frame.copy(), 2**FRACTION_BITS
     for _ in range(round(times * look.count)):
@@ -115,8 +115,8 @@ def crowded(frame: Frame, times: float, look: Look, draw: np.random.Generator) -
 DEGRADATIONS = {
     "clean": Degradation(lambda frame, level, look, draw: frame.astype(np.float64), (0.0,), "as captured"),
     "blur": Degradation(blurred, (1.0, 2.0), "sigma of a Gaussian, in radii of a dot"),
-    "motion": Degradation(moved, (3.0, 6.0), "length of the path, in radii of a dot; a direction a frame"),
-    "dark": Degradation(darkened, (0.1, 0.04), f"share of the light; {ELECTRONS:g} electrons a grey level, "
+    "motion": Degradation(moved, (3.0, 6.0), "length of the path, in radii of a dot; a direction per frame"),
+    "dark": Degradation(darkened, (0.1, 0.04), f"share of the light; {ELECTRONS:g} electrons per grey level, "
                         f"read noise of {READ_NOISE:g}"),
     "noise": Degradation(noisy, (15.0, 40.0), "standard deviation, grey levels"),
     "drapes": Degradation(draped, (0.25, 0.5), "share of the image that dark and bright oblongs hide"),

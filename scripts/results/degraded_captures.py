@@ -1,11 +1,11 @@
-"""Detectors on real frames, as they are and made harder: `python -m scripts.results.degraded_captures`.
+"""Compare detectors on real frames, original and degraded.
 
     IMGCAL_CAPTURES=... python -m scripts.results.degraded_captures
 
-Every detector calibrates from the same degraded frames; what comes out is scored on points of the frames as they were
-captured, which had no part in the factory rig. Wrong is what is more than a pixel and more than five times as far off
-there (RMS) as `classical` on the frames as they are. What was measured before stays in the JSON: another call adds
-detectors, sets and kinds, or replaces theirs; a call that was stopped goes on. The table is in docs/results/tables.md.
+Every detector calibrates from the same degraded frames. The result is scored on points of the original frames that were
+not used for the factory rig. It is wrong if its RMS error there is more than a pixel and more than five times that of
+`classical` on the original frames. Earlier measurements stay in the JSON: another call adds or replaces detectors, sets
+and kinds, and resumes a call that was stopped. The table is in docs/results/tables.md.
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ from tests.captures.sets import RealSet, cavity_two_cameras, dot_grid, nominal, 
 
 JSON, PAGE = RESULTS / "degraded_captures.json", ROOT / "docs" / "results" / "tables.md"
 SETS = {"dots": "three-cameras-dots", "cavity": "cavity-two-cameras", "grid": "dot-grid-10x10"}
-OFF = {"dots": 9.0, "cavity": 8.0}  # px RMS that the factory rig is disturbed by; the grid's is nominal
-CALIBRATE = 8  # views of the grid; the others score
+OFF = {"dots": 9.0, "cavity": 8.0}  # px RMS, perturbation of the factory rig; the grid's rig is nominal
+CALIBRATE = 8  # views of the grid; the others are held out
 WRONG_PX, WRONG_RATIO = 1.0, 5.0
-"""Held-out RMS beyond which a calibration is wrong: pixels, and times that of `classical` on the frames as they are."""
+"""Held-out RMS beyond which a calibration is wrong: pixels, and multiple of `classical` on the original frames."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """One set with all that is needed to calibrate from it and to score."""
+    """One set, with everything needed to calibrate from it and to score the result."""
 
     frames: dict[str, list[Frame]]  # camera -> (H, W) of each snapshot
     obj: CalibrationObject
-    rig: CameraRig  # what is known before
+    rig: CameraRig  # the factory rig
     held_out: Detections  # with labels
     look: Look
     detection: imgcal.DetectionOptions = imgcal.DetectionOptions()
 
     def degraded(self, kind: str, level: float, seed: int) -> dict[str, list[Frame]]:
-        """Make all frames harder, each by draws of its own."""
+        """Degrade all frames, each with its own random draws."""
         made, number = DEGRADATIONS[kind], list(DEGRADATIONS).index(kind)
         return {
             name: [
@@ -65,7 +65,7 @@ class Task:
         }
 
     def off(self, rig: CameraRig) -> float:
-        """RMS distance (px) of all held-out points; infinite where no pose fits them."""
+        """RMS error (px) of all held-out points; infinite if no pose fits them."""
         try:
             return float(imgcal.score(self.held_out, rig, self.obj).distances.square().mean().sqrt())
         except RefusedError:
@@ -84,7 +84,7 @@ class Case:
 
     @property
     def key(self) -> str:
-        """What its result depends on."""
+        """Everything that the result depends on."""
         return f"{self.captures}, {self.kind} {self.level:g}, seed {self.seed}, {self.detector}"
 
 
@@ -107,7 +107,7 @@ def _look_of_published(real: RealSet) -> Look:
 def _grid_task(captures: Path) -> Task:
     frames, obj = dot_grid(captures)
     dark = imgcal.DetectionOptions(polarity="dark")
-    # Any turn of the grid is as good a label for it: all views are labelled by the rig that all of them give.
+    # The grid looks the same in any turn, so label all views with the rig that is calibrated from all of them.
     blobs = imgcal.detect({"cam": frames}, dark)
     reference = imgcal.calibrate(blobs, nominal(), obj)
     others = imgcal.score(imgcal.detect({"cam": frames[CALIBRATE:]}, dark), reference.rig, obj).labelled
@@ -116,7 +116,7 @@ def _grid_task(captures: Path) -> Task:
 
 
 def look_of(frames: dict[str, list[Frame]], blobs: Detections, obj: CalibrationObject) -> Look:
-    """Measure how dots look, by blobs that are dots."""
+    """Measure how dots look, from blobs that are dots."""
     levels = []
     for camera, name in enumerate(blobs.camera_names):
         for snapshot, frame in enumerate(frames[name]):
@@ -128,7 +128,7 @@ def look_of(frames: dict[str, list[Frame]], blobs: Detections, obj: CalibrationO
 
 
 def measured(case: Case) -> dict[str, Any]:
-    """Calibrate, and score."""
+    """Calibrate, and score the result."""
     given = task(case.captures, captures_folder())
     frames = given.degraded(case.kind, case.level, case.seed)
     result: dict[str, Any] = {**asdict(case), "reason": "", "off_px": None, "labels": 0}
@@ -144,10 +144,10 @@ def measured(case: Case) -> dict[str, Any]:
 
 
 def captures_folder() -> Path:
-    """Where the real frames lie.
+    """Folder of the real frames.
 
     Raises:
-        InputError: nobody says so.
+        InputError: IMGCAL_CAPTURES is not set.
     """
     if not os.environ.get("IMGCAL_CAPTURES"):
         raise InputError("IMGCAL_CAPTURES: found nothing, expected the folder of the captures")
@@ -155,7 +155,7 @@ def captures_folder() -> Path:
 
 
 def status(row: dict[str, Any], references: dict[str, float]) -> Literal["calibrated", "refused", "wrong"]:
-    """Say what became of a case, beside what `classical` reaches on the frames of its set as they are (px)."""
+    """Classify the outcome of a case, given the RMS (px) of `classical` on the original frames of its set."""
     if row["reason"]:
         return "refused"
     off, limit = row["off_px"], max(WRONG_PX, WRONG_RATIO * references[row["captures"]])
@@ -163,7 +163,7 @@ def status(row: dict[str, Any], references: dict[str, float]) -> Literal["calibr
 
 
 def references_of(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Held-out RMS (px) of `classical` on each set's frames as they are."""
+    """Held-out RMS (px) of `classical` on the original frames of each set."""
     return {
         row["captures"]: row["off_px"]
         for row in rows
@@ -172,7 +172,7 @@ def references_of(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
 
 
 def tables(rows: Sequence[dict[str, Any]]) -> str:
-    """A summary, and one table a set."""
+    """Make a summary, and one table per set."""
     references = references_of(rows)
     names = [name for name in DETECTORS if any(row["detector"] == name for row in rows)]
     by_case = {(row["captures"], row["kind"], row["level"], row["seed"], row["detector"]): row for row in rows}
@@ -204,7 +204,7 @@ def tables(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _place(key: tuple[Any, ...]) -> tuple[int, int, int]:
-    """Kinds and levels as they are listed."""
+    """Sort key: kinds and levels in the order in which they are listed."""
     kind, level, seed = key[1:]
     levels = DEGRADATIONS[kind].levels
     return list(DEGRADATIONS).index(kind), levels.index(level) if level in levels else len(levels), seed
@@ -218,15 +218,15 @@ def main(
     results: Path = JSON,
     page: bool = False,
 ) -> None:
-    """Calibrate, score, write the JSON and, if that is the committed one, the table.
+    """Calibrate, score, and write the JSON and, if it is the committed one, the table.
 
     Args:
-        detectors: what `imgcal calibrate --detector` takes.
-        sets: which frames.
-        kinds: what is done to them.
-        seed: another one hides and moves other things.
+        detectors: values of `imgcal calibrate --detector`.
+        sets: names of the sets.
+        kinds: kinds of degradation.
+        seed: of the random degradations.
         results: the JSON.
-        page: only write the table again.
+        page: only rewrite the table.
     """
     known = read_json(results)["outcomes"] if results.is_file() else []
     if not page:

@@ -1,8 +1,8 @@
-"""Detectors on simulated captures, the classical one tuned to each difficulty: ``python -m scripts.results.detectors``.
+"""Compare detectors on simulated captures: ``python -m scripts.results.detectors``.
 
-`tune` tries settings of the classical detector and of identity on validation captures and keeps the best for every
-difficulty; `compare` then calibrates test captures, of other seeds, with each detector, and writes the tables of
-docs/results/tables.md. What was measured before stays in the JSON: another call adds detectors, or replaces theirs.
+`tune` tries settings of the classical detector and of data association on validation captures and keeps the best for
+each difficulty. `compare` then calibrates test captures, which have other seeds, with each detector, and writes the
+tables of docs/results/tables.md. Earlier measurements stay in the JSON: another call adds or replaces detectors.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ PAGE = ROOT / "docs" / "results" / "tables.md"
 TEST, VALIDATION = 0, 1  # seeds: captures that are reported, and captures on which settings are chosen
 TUNED = "classical, tuned"
 
-# What is tried, each setting for what a difficulty may need. "blind": cameras that saw nothing keep factory values;
-# "loose": blobs may lie farther from where a rig puts them while they are told apart; "lenient": in the result, too.
+# Settings to try, each for the needs of some difficulty. "blind": cameras that saw nothing keep factory values;
+# "loose": blobs may lie farther from the prediction during data association; "lenient": in the result, too.
 BLIND = PipelineOptions(blind_cameras=True)
 LENIENT = replace(BLIND, identity_error=2.0, largest_additive_noise=5.0, most_outliers=0.5)
 LARGE = DetectionOptions(max_elongation=12.0, max_radius=40.0)
@@ -56,20 +56,20 @@ class Options:
     step: Annotated[str, tyro.conf.Positional]  #: tune | compare | page
     detectors: tuple[
         Path, ...
-    ] = ()  #: beside the classical one: what `imgcal calibrate --detector` takes, or run folders
-    captures: int = 8  #: of each difficulty
-    snapshots: int = 2  #: of each capture
+    ] = ()  #: besides the classical one: values of `imgcal calibrate --detector`, or run folders
+    captures: int = 8  #: captures per difficulty
+    snapshots: int = 2  #: snapshots per capture
     difficulty: tuple[str, ...] = tuple(DIFFICULTIES)
     rig: str = "O10"
     object: str = "asymmetric8"
-    address: str | None = None  #: running Ray cluster that does the captures; none = this machine
-    cores: int | None = None  #: of this machine; 1 = this process alone; none = all
-    classical: bool = True  #: measure the classical ones, too
+    address: str | None = None  #: running Ray cluster that processes the captures; None = this machine
+    cores: int | None = None  #: of this machine; 1 = this process alone; None = all
+    classical: bool = True  #: also measure the classical detectors
     results: Path = RESULTS
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Do one step."""
+    """Run one step."""
     options = tyro.cli(Options, args=arguments, description=__doc__)
     torch.set_num_threads(1)
     models = {name: FrameModel(difficulty=DIFFICULTIES[name]) for name in options.difficulty}
@@ -99,14 +99,14 @@ def tune(scene: Scene, options: Options) -> None:
 
 
 def _score(outcomes: Sequence[Outcome]) -> tuple[float, float]:
-    """Right minus wrong, and on equal terms the smaller error."""
+    """Right minus wrong captures; the smaller error breaks ties."""
     share = sum({"calibrated": 1.0, "wrong": -1.0}.get(one.status, 0.0) for one in outcomes) / len(outcomes)
     px = [one.held_out_px for one in outcomes if one.held_out_px is not None and one.status == "calibrated"]
     return share, -round(median(px), 3) if px else -1e3
 
 
 def compare(scene: Scene, options: Options) -> None:
-    """Calibrate test captures, and put the outcomes beside those that are known."""
+    """Calibrate test captures, and add the outcomes to the known ones."""
     contenders = [contender(path) for path in options.detectors]
     contenders = [replace(one, pipeline=BLIND) for one in contenders]
     if options.classical:
@@ -128,7 +128,7 @@ def compare(scene: Scene, options: Options) -> None:
 
 
 def tuned(results: Path, scene: Scene) -> list[Contender]:
-    """The classical detector with the settings that were best on validation captures, difficulty by difficulty."""
+    """The classical detector with the settings that were best on validation captures, per difficulty."""
     place = results / TUNING
     if not place.is_file():
         return []
@@ -154,19 +154,19 @@ def _measured(contenders: Sequence[Contender], scene: Scene, options: Options, s
 
 
 def _order(outcome: Outcome) -> tuple[int, int]:
-    """As difficulties stand in their table, the classical detector first."""
+    """Sort key: difficulties in their usual order, the classical detector first."""
     return list(DIFFICULTIES).index(outcome.difficulty), -outcome.contender.startswith("classical")
 
 
 def write_page(results: Path) -> None:
-    """Put the tables on the page, if results lie where those of the page do."""
+    """Write the tables into the page, if the results are the committed ones."""
     place = results / COMPARISON
     if results != RESULTS or not place.is_file():
         return
     known = read_json(place)
     outcomes = sorted((Outcome(**row) for row in known["outcomes"]), key=_order)
     text = (
-        f"Rig {known['rig']}, object {known['object']}, {known['captures']} captures a difficulty of "
+        f"Rig {known['rig']}, object {known['object']}, {known['captures']} captures per difficulty with "
         f"{known['snapshots']} snapshots, drift of all 15 values of each camera."
     )
     texts = [text, *(f"{table.markdown()}".strip() for table in detector_tables(outcomes))]

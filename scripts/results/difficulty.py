@@ -1,4 +1,4 @@
-"""A picture of the named levels of difficulty: the same pose at every level, one camera.
+"""Draw the named levels of difficulty: the same pose in one camera at every level.
 
     python -m scripts.results.difficulty
 
@@ -18,12 +18,12 @@ from scripts.output import figure
 
 PICTURE = Path("docs/difficulty.png")
 CAMERA = 2
-HALF = (150, 270)  # px, rows and columns that are shown on either side of the object
+HALF = (150, 270)  # px, rows and columns shown on either side of the object
 COLUMNS = 4
 
 
 def main() -> None:
-    """Render one snapshot at each level, and draw what lies around the object."""
+    """Render one snapshot at each level, and draw the surroundings of the object."""
     rig, obj = read_rig("O10").select([CAMERA]), load_object("asymmetric8")
     truth = simulate_truth(rig, obj, 1, torch.Generator().manual_seed(0), PhysicalDrift())
     u, v = truth.uv[0, 0].mean(0).round().int().tolist()

@@ -1,10 +1,10 @@
-"""Image encoders by difficulty of the images: ViT against CNN, and both against methods that learn nothing.
+"""Compare image encoders by difficulty of the images: ViT, CNN, and methods without learning.
 
 Usage: python -m scripts.results.encoders out/runs/shipped-vit-cube8-seed{0,1,2} out/runs/shipped-cnn-cube8-seed{0,1,2}
 
 Every method sees the same images of the same rigs, at each of `imgcal.synthesis.LEVELS`. Runs of one preset are seeds
-of one family. Runs are added to what docs/results/encoders.json says of others on the same rigs; the table goes between
-the markers `encoders` of docs/results/tables.md.
+of one family. Runs are added to those on the same rigs in docs/results/encoders.json. The table goes between the
+markers `encoders` of docs/results/tables.md.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ PAGE = RESULTS / "tables.md"
 MARKER = "encoders"
 SUCCESS = 1.0  # px of RE below which a refined rig counts as found
 NEAR = 3.0  # px of the sensor below which a position counts as right
-BATCH = 10  # rigs at once
-RENDERED = 20  # rigs of a level for which rendering and comparing is tried: it is slow where it fails
-SIGMAS = (0.1, 0.5, 2.0)  # px: methods that predict no sigma get the one that suits a level best,
+BATCH = 10  # rigs per batch
+RENDERED = 20  # rigs per level for render-and-compare, which is slow where it fails
+SIGMAS = (0.1, 0.5, 2.0)  # px: methods that predict no sigma get the best of these for each level,
 # and the better of two robust refinements: graduated non-convexity, and Cauchy's loss.
 
 
@@ -64,8 +64,8 @@ class Options:
     rigs: int = 100  #: a level
     seed: int = 0
     out: Path = RESULTS  #: folder of encoders.json
-    page: Path = PAGE  #: where the table goes
-    again: bool = False  #: measure nothing: make the table of the JSON that is there
+    page: Path = PAGE  #: page with the table
+    again: bool = False  #: measure nothing: rewrite the table from the existing JSON
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Shown:
 
 
 def main(arguments: list[str]) -> None:
-    """Measure, write, print."""
+    """Measure, write and print."""
     options = tyro.cli(Options, args=arguments, description=__doc__)
     path = options.out / "encoders.json"
     if not options.again:
@@ -97,7 +97,7 @@ def main(arguments: list[str]) -> None:
 
 @torch.no_grad()
 def measured(options: Options) -> dict[str, Any]:
-    """Everything about every run, level by level."""
+    """Measure all runs at all levels."""
     files = [run / "model.safetensors" if run.is_dir() else run for run in options.runs]
     models = {str(run): load_checkpoint(file) for run, file in zip(options.runs, files, strict=True)}
     first = next(iter(models.values()))
@@ -121,13 +121,13 @@ def measured(options: Options) -> dict[str, Any]:
 
 
 def _before(path: Path, subject: dict[str, Any]) -> dict[str, Any]:
-    """What was measured before on the same rigs, which other runs are added to."""
+    """Earlier results on the same rigs, to which runs are added."""
     found = read_json(path) if path.is_file() else {}
     return found if subject.items() <= found.items() else {}
 
 
 def hue_network(like: Checkpoint) -> HueCentroidNetwork:
-    """The baseline: hues, and the trunk of the shipped point network."""
+    """Make the baseline: hue centroids, and the trunk of the shipped point network."""
     drift = like.experiment.drift.std(like.rig).to(torch.float32)
     rig = like.rig.to(torch.float32)
     network = build(NetworkConfig(preset="hue-centroids"), rig, like.obj, drift, torch.Generator().manual_seed(0))
@@ -137,7 +137,7 @@ def hue_network(like: Checkpoint) -> HueCentroidNetwork:
 
 
 def draw(model: Checkpoint, level: int, count: int, seed: int) -> Shown:
-    """Random rigs of what a model was trained for, and their images at a level."""
+    """Draw random rigs from a model's training distribution, and render them at a level."""
     generator = torch.Generator().manual_seed(seed)
     factory, experiment = model.rig.to(torch.float32), model.experiment
     made = synthesize(factory, model.obj, count, generator, drift=experiment.drift, pose_range=experiment.poses)
@@ -148,7 +148,7 @@ def draw(model: Checkpoint, level: int, count: int, seed: int) -> Shown:
 
 
 def of_network(network: ImageNetwork, shown: Shown, model: Checkpoint) -> dict[str, float]:
-    """One network at one level: positions, passes, both refinements, and the encoder shuffled."""
+    """Measure a network at one level: positions, passes, both refinements, and the encoder shuffled."""
     passes, sightings = looked(network, shown)
     last = passes[-1]
     result = of_positions(sightings, shown) | {"one_pass_px": median(passes[0], shown, model)}
@@ -157,7 +157,7 @@ def of_network(network: ImageNetwork, shown: Shown, model: Checkpoint) -> dict[s
     result |= refined("points", found, shown, model)
     few = slice(0, RENDERED)
     result |= refined("images", by_images(last[few], shown[few], model), shown[few], model)
-    cameras = model.rig.num_cameras  # rolled by so many images, each rig has the map of another one
+    cameras = model.rig.num_cameras  # rolled by this many images, each rig gets another rig's maps
     handle = network.encoder.register_forward_hook(lambda module, inputs, output: output.roll(cameras, 0))
     spoilt, _ = looked(network, shown)
     handle.remove()
@@ -165,7 +165,7 @@ def of_network(network: ImageNetwork, shown: Shown, model: Checkpoint) -> dict[s
 
 
 def of_hue(network: HueCentroidNetwork, shown: Shown, model: Checkpoint) -> dict[str, float]:
-    """Centres by hue: with the trunk, and with robust PnP, each refined with the sigma that suits the level best."""
+    """Measure centres by hue: with the trunk, and with robust PnP, each refined with the best sigma for the level."""
     passes, sightings = looked(network, shown)
     result = of_positions(sightings, shown) | {"one_pass_px": median(passes[0], shown, model)}
     result["last_pass_px"] = median(passes[-1], shown, model)
@@ -183,7 +183,7 @@ def of_hue(network: HueCentroidNetwork, shown: Shown, model: Checkpoint) -> dict
 
 
 def looked(network: ImageNetwork | HueCentroidNetwork, shown: Shown) -> tuple[list[Prediction], Positions]:
-    """Predictions of all passes, and positions; a few rigs at a time."""
+    """Run a network in batches: predictions of all passes, and positions."""
     parts, seen = [], []
     for start in range(0, len(shown.images), BATCH):
         sightings = network.sight(shown.images[start : start + BATCH])
@@ -195,7 +195,7 @@ def looked(network: ImageNetwork | HueCentroidNetwork, shown: Shown) -> tuple[li
 
 
 def of_positions(sightings: Positions, shown: Shown) -> dict[str, float]:
-    """Errors of positions, in pixels of the sensor, of dots that are there; and what is claimed wrongly."""
+    """Errors of the positions of visible dots, in pixels of the sensor; and the share of wrong claims."""
     uv, seen = shown.drawn.views.uv, shown.drawn.views.seen
     assert uv is not None and seen is not None
     error = (sightings.uv - uv).norm(dim=-1)
@@ -212,12 +212,12 @@ def of_positions(sightings: Positions, shown: Shown) -> dict[str, float]:
 def by_cauchy(
     guess: Prediction, views: Views, factory: CameraRig, obj: CalibrationObject, prior_std: Tensor, *, sigma: float
 ) -> Prediction:
-    """The refinement that image networks get, with one sigma for all points."""
+    """Refine as for image networks, with one sigma for all points."""
     return make_prediction(refine_points(guess, views, factory, obj, prior_std, sigma))
 
 
 def by_images(guess: Prediction, shown: Shown, model: Checkpoint) -> Prediction:
-    """Render and compare."""
+    """Refine by rendering and comparing images."""
     options = ImageRefinementOptions(image=model.network.image_options or ImageOptions(), position_noise=0.1)
     parts = []
     for start in range(0, len(shown.images), BATCH):
@@ -229,7 +229,7 @@ def by_images(guess: Prediction, shown: Shown, model: Checkpoint) -> Prediction:
 
 
 def pnp(views: Views, sigma: float, otherwise: Prediction, model: Checkpoint) -> Prediction:
-    """Robust PnP, rig by rig: where too few points were found for a pose, there is none."""
+    """Robust PnP for each rig; the pose of `otherwise` where too few points were found."""
     uv, seen = views.uv, views.seen
     assert uv is not None and seen is not None
     found = []
@@ -243,7 +243,7 @@ def pnp(views: Views, sigma: float, otherwise: Prediction, model: Checkpoint) ->
 
 
 def errors(found: Prediction, shown: Shown, model: Checkpoint) -> Tensor:
-    """RE of each rig on exact points, pixels; infinite where there is no number."""
+    """RE of each rig on exact points, pixels; infinite where it is not finite."""
     exact = found.to(torch.float64).cameras_from_object, shown.truth.to(torch.float64).cameras_from_object
     return reprojection_error(*exact, model.obj).nan_to_num(torch.inf)
 
@@ -260,7 +260,7 @@ def refined(name: str, found: Prediction, shown: Shown, model: Checkpoint) -> di
 
 
 def facts(model: Checkpoint) -> dict[str, Any]:
-    """Size and cost of an encoder with its heads, of one image."""
+    """Size of an encoder with its heads, and its cost per image."""
     network, experiment = model.network, model.experiment
     assert isinstance(network, ImageNetwork) and network.image_options is not None
     size = network.image_options.size
@@ -275,10 +275,10 @@ def facts(model: Checkpoint) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """Level by level, a line a family: mean over seeds, and their range."""
+    """Make a table with one line per level and family: mean over seeds, and their range."""
     head = (
-        "level", "what", "seeds", "position, px", f"within {NEAR:g} px", "one pass", "last pass",
-        "refined on positions", "success", "rendered and compared", "success", "encoder shuffled",
+        "level", "method", "seeds", "position, px", f"within {NEAR:g} px", "one pass", "last pass",
+        "refined on positions", "success", "render and compare", "success", "encoder shuffled",
     )  # fmt: skip
     families: dict[str, list[str]] = {}
     for name, one in result["models"].items():
@@ -299,7 +299,7 @@ def _sizes(result: dict[str, Any], families: dict[str, list[str]]) -> str:
     for family, names in families.items():
         first = result["models"][names[0]]
         rows.append([family, f"{first['parameters'] / 1e6:.2f} M", f"{first['flops'] / 1e9:.2f}", str(len(names))])
-    return markdown(("encoder and heads", "parameters", "GFLOP an image", "seeds"), rows)
+    return markdown(("encoder and heads", "parameters", "GFLOP per image", "seeds"), rows)
 
 
 def _cells(seeds: Sequence[dict[str, float]]) -> list[str]:
@@ -322,7 +322,7 @@ def _share(seeds: Sequence[dict[str, float]], name: str) -> str:
 
 
 def _ranged(seeds: Sequence[dict[str, float]], name: str, show: Callable[[float], str]) -> str:
-    """Mean over seeds, with the least and the most where there are several and they differ."""
+    """Mean over seeds, with the lowest and the highest if they differ."""
     values = [float("inf") if one[name] is None else one[name] for one in seeds]
     text, low, high = show(statistics.fmean(values)), show(min(values)), show(max(values))
     return text if low == high else f"{text} ({low} to {high})"

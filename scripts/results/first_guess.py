@@ -1,7 +1,7 @@
 """Does a network's first guess help `imgcal calibrate`? Run as ``python -m scripts.results.first_guess``.
 
-The same simulated captures with and without it, labelled blobs with noise: the larger the drift and the more labels are
-exchanged, the more a good start could help.
+Calibrates the same simulated captures with and without it, from labelled blobs with noise. A good start could help more
+the larger the drift is and the more labels are swapped.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from scripts.output import RESULTS, ROOT, command, fill, markdown, read_json, su
 
 NOISE = 0.05  # px, each axis
 KAPPAS = (0.025, 0.05, 0.1, 0.2)
-EXCHANGED = (0.0, 0.1)  # share of labels
+EXCHANGED = (0.0, 0.1)  # share of labels that are swapped
 SNAPSHOTS = (1, 4)
 STATUSES = ("calibrated", "refused", "wrong")
 PAGE = ROOT / "docs" / "results" / "tables.md"
@@ -37,14 +37,14 @@ PAGE = ROOT / "docs" / "results" / "tables.md"
 class Options:
     """Calibrate captures with and without a network's first guess."""
 
-    captures: int = 10  #: of each kind
+    captures: int = 10  #: captures per case
     object: str = "asymmetric8"
     guess: str = "points"  #: as for `imgcal calibrate --first-guess`
     out: Path = RESULTS / "first_guess.json"
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure, write, and put the table on the page."""
+    """Measure, write the JSON, and rewrite the table in the page."""
     options = tyro.cli(Options, args=arguments, description=__doc__)
     torch.set_num_threads(1)
     rig, obj = load_rig("O10"), load_object(options.object)
@@ -67,7 +67,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _prior_of(rig: CameraRig, kappa: float) -> Any:
-    """The prior of a rig file, as wide as the drift: a rig may be refused for nothing but its data."""
+    """Prior as wide as the drift, so that a rig is refused only because of its data."""
     prior = rig.prior
     assert prior is not None
     scale = max(1.0, kappa / 0.025)
@@ -97,7 +97,7 @@ def _tried(rig: CameraRig, obj: Any, network: Any, case: tuple[float, float, int
 
 
 def _disturbed(blobs: Detections, exchanged: float, generator: torch.Generator) -> Detections:
-    """Noise on all centres; labels of pairs within a camera and snapshot exchanged."""
+    """Add noise to all centres, and swap labels of pairs within a camera and snapshot."""
     noise = torch.randn(blobs.uv.shape, generator=generator, dtype=torch.float64).numpy()
     fiducial, place = blobs.fiducial.copy(), blobs.snapshot * len(blobs.camera_names) + blobs.camera
     for view in np.unique(place):
@@ -121,8 +121,8 @@ def _summed_up(tried: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """Markdown."""
-    head = ("drift", "labels exchanged", "snapshots", "calibrated / refused / wrong: none", "first guess", "guess used",
+    """Make the table, as Markdown."""
+    head = ("drift", "labels swapped", "snapshots", "calibrated / refused / wrong: none", "first guess", "guess used",
             "same rig (1 %)", "RE over the volume, px: none", "first guess", "ms: none", "first guess")  # fmt: skip
     rows = []
     for row in result["rows"]:

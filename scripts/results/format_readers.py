@@ -1,7 +1,7 @@
-"""The tools' own readers, each in whichever Python has it; run as a program, without imgcal.
+"""The tools' own readers, run as a program without imgcal in any Python that has the tool.
 
 Standard input: JSON with `tool`, `path` and `points` (camera -> points in the files' frame and unit). Standard output:
-where the tool, having read the files, projects them (camera -> pixels), and its version.
+the tool's projections of the points after it has read the files (camera -> pixels), and its version.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import numpy as np
 Points = dict[str, Any]  # camera -> (N, 3)
 Answer = tuple[dict[str, Any], str]  # camera -> (N, 2), and the version
 
-HALF = 0.5  # COLMAP's pixels begin there
+HALF = 0.5  # COLMAP's pixel coordinates of the first pixel's centre
 
 
 def version_of(*names: str) -> str:
-    """The first distribution that is installed."""
+    """Version of the first of these distributions that is installed."""
     for name in names:
         try:
             return f"{name} {metadata.version(name)}"
@@ -33,7 +33,7 @@ def version_of(*names: str) -> str:
 
 
 def opencv(points: Any, rotation: Any, translation: Any, k: Any, d: Any, fisheye: bool = False) -> Any:
-    """Project by OpenCV."""
+    """Project points with OpenCV."""
     import cv2
 
     rotation, translation = np.array(rotation, dtype=float), np.array(translation, dtype=float).reshape(3, 1)
@@ -45,7 +45,7 @@ def opencv(points: Any, rotation: Any, translation: Any, k: Any, d: Any, fisheye
 
 
 def storage(path: Path) -> Callable[[str], Any]:
-    """Open a FileStorage of OpenCV; a function that reads a matrix."""
+    """Open an OpenCV FileStorage; returns a function that reads a matrix."""
     import cv2
 
     opened = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
@@ -142,7 +142,7 @@ def read_pymvg(path: Path, points: Points) -> Answer:
 
 
 def read_ros(path: Path, points: Points) -> Answer:
-    """ROS rectifies: what its stereo model projects into the rectified images is turned back by its own K, D, R."""
+    """ROS: its stereo model projects into rectified images; map these back by the file's K, D, R."""
     parsers, geometry = (importlib.import_module(name) for name in ("camera_calibration_parsers", "image_geometry"))
     infos = {name: parsers.readCalibration(str(path / f"{name}.yaml"))[1] for name in points}
     left, right = infos
@@ -179,7 +179,7 @@ READERS = {
 
 
 def main() -> None:
-    """Read a request, answer it."""
+    """Read a request and answer it."""
     given = json.load(sys.stdin)
     points = {name: np.array(rows) for name, rows in given["points"].items()}
     uv, version = READERS[given["tool"]](Path(given["path"]), points)

@@ -1,8 +1,8 @@
-"""Every format against the files and the readers of its tool: `python -m scripts.results.formats --readers PYTHON ...`.
+"""Test every format with files and readers of its tool: `python -m scripts.results.formats --readers PYTHON ...`.
 
-Reading: the real files of IMGCAL_FORMATS, against pixels that other programs have computed. Writing: a rig of three
-cameras (two where a format has no more), read and projected by the tool itself (`format_readers.py`), each in the first
-of the given Pythons that has it. Writes docs/results/formats.json and the table of docs/formats.md.
+Reading: the real files of IMGCAL_FORMATS are compared with pixels that other programs computed. Writing: the tool
+itself reads and projects a rig of three cameras (two if the format allows no more), see `format_readers.py`, in the
+first of the given Pythons that has it. Writes docs/results/formats.json and the table of docs/formats.md.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ READ_BY = Path(__file__).with_name("format_readers.py")
 def main() -> None:
     """Measure, and rewrite the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--readers", nargs="*", default=[], help="Pythons that have the tools, beside this one")
+    parser.add_argument("--readers", nargs="*", default=[], help="Pythons that have the tools, besides this one")
     given = parser.parse_args()
     pythons = [sys.executable, *given.readers]
     result: dict[str, Any] = {**surroundings(), "formats": {}}
@@ -57,7 +57,7 @@ def main() -> None:
 
 
 def reading(one: Format) -> dict[str, Any]:
-    """The worst pixel over all real files of a format, and how many files and cameras that is."""
+    """Largest error in pixels over all real files of a format, and the numbers of files and cameras."""
     folder = Path(os.environ["IMGCAL_FORMATS"])
     files, cameras, worst = 0, 0, 0.0
     for path in sorted(folder.rglob("*.expected.json")):
@@ -67,7 +67,7 @@ def reading(one: Format) -> dict[str, Any]:
             continue
         expected = json.loads(path.read_text("utf-8"))
         unit = "mm" if "mm" in expected["unit_note"].split(";")[0] else "m"
-        rows = expected["cameras"][: len(rig.cameras)]  # of images without a rig: those of the first moment
+        rows = expected["cameras"][: len(rig.cameras)]  # for images without a rig: those of the first snapshot
         for camera, row in zip(in_millimetres(rig, str(source), unit).cameras, rows, strict=True):
             away = np.abs(camera.project(np.array(row["points_rig_mm"])) - np.array(row["uv"]))
             worst, cameras = max(worst, float(away.max())), cameras + 1
@@ -76,7 +76,7 @@ def reading(one: Format) -> dict[str, Any]:
 
 
 def writing(one: Format, pythons: list[str]) -> dict[str, Any]:
-    """How far off the tool itself sees known points by what was written; by our own reader, too."""
+    """Largest error of known points in a written file, as projected by the tool itself and by our own reader."""
     rig = sample(one)
     made = convert_rig(rig, one.name, "rig")
     row: dict[str, Any] = {"own_reader_px": made.round_trip, "reader": None, "worst_px": None}
@@ -101,7 +101,7 @@ def writing(one: Format, pythons: list[str]) -> dict[str, Any]:
 
 
 def ask(asked: dict[str, Any], pythons: list[str]) -> dict[str, Any] | None:
-    """The answer of the first Python that has the tool."""
+    """Answer from the first Python that has the tool."""
     for python in pythons:
         done = subprocess.run([python, READ_BY], input=json.dumps(asked), capture_output=True, text=True, check=False)
         if done.returncode == 0:
@@ -112,7 +112,7 @@ def ask(asked: dict[str, Any], pythons: list[str]) -> dict[str, Any] | None:
 
 
 def sample(one: Format) -> ForeignRig:
-    """Cameras with as many coefficients as a format can say, a fisheye where it can."""
+    """Make cameras with all coefficients that a format can express, and a fisheye if it can."""
     numbers = (-0.11, 0.04, 0.0007, -0.0004, 0.003, 0.02, -0.01, 0.002, 0.0003, -0.0002, 0.0001, 0.0004, 0.01, -0.02)
     lenses = [
         Lens((1010.5, 1012.25), (641.3, 478.9), numbers[: one.holds.opencv[-1]]),
@@ -131,17 +131,17 @@ def sample(one: Format) -> ForeignRig:
 
 
 def table(result: dict[str, Any]) -> str:
-    """What was verified, by format."""
+    """Make the table of what was verified, by format."""
     rows = []
     for name, row in result["formats"].items():
         read, write = row["read"], row["write"]
-        seen = f"{read['cameras']} in {read['files']}: {read['worst_px']:.1e}" if read["files"] else "no file at hand"
+        seen = f"{read['cameras']} in {read['files']}: {read['worst_px']:.1e}" if read["files"] else "no file available"
         if name == "caliscope-config":
             seen = "as `caliscope`"
         if write is None:
             rows.append((row["title"], f"`{name}`", seen, "only read", "–"))
             continue
-        tool = write["reader"] or ("not at hand" if name in READERS else "none on PyPI or Debian")
+        tool = write["reader"] or ("not available" if name in READERS else "none on PyPI or Debian")
         worst = f"{write['worst_px']:.1e}" if write["worst_px"] is not None else "–"
         rows.append((row["title"], f"`{name}`", seen, f"{write['own_reader_px']:.1e}", f"{tool}: {worst}"))
     head = (

@@ -1,6 +1,6 @@
-"""The network on points that ships beside Levenberg-Marquardt steps: several drifts, two ranges of views.
+"""Compare the shipped point network with Levenberg-Marquardt steps: several drifts, two ranges of views.
 
-Everything is made from files of the repository. `scripts.results.table` calls it.
+Uses only files of the repository. `scripts.results.table` calls it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ HEMISPHERE, OVERHEAD = PoseRange(), PoseRange(theta_deg=(0.0, 0.0), phi_deg=(0.0
 
 @dataclass(frozen=True)
 class Place:
-    """One column: what rigs are drawn from, and what the paper reports there for its network on points."""
+    """One column: the distribution of rigs, and the paper's result for its point network there."""
 
     name: str
     poses: PoseRange
@@ -39,7 +39,7 @@ PLACES = (
 
 
 def measure_headline(source: Source, count: int, device: str) -> dict[str, Any]:
-    """Evaluate a network and the steps at every place: three trials of `count` rigs, exact points."""
+    """Evaluate a network and the steps for every column: three trials of `count` rigs, exact points."""
     [model] = load_models([source.path], device=device)
     methods = {NETWORK: model.method} | QUICK_BASELINES
     found = []
@@ -58,21 +58,21 @@ def measure_headline(source: Source, count: int, device: str) -> dict[str, Any]:
 
 
 def time_headline(source: Source, repeats: int, device: str) -> dict[str, Any]:
-    """Milliseconds of one rig, of the network and of every number of steps."""
+    """Milliseconds per rig, for the network and for each number of steps."""
     [model] = load_models([source.path], device=device)
     methods = {NETWORK: model.method} | QUICK_BASELINES
     return {name: vars(latency(method, model.conditions, repeats)) for name, method in methods.items()}
 
 
 def headline_tables(result: Mapping[str, Any]) -> str:
-    """One table of RE, and one each of what RE does not show."""
+    """Make a table of RE, and one for each quantity that RE does not show."""
     places = [place["columns"] for place in result["places"]]
     names = sorted((name for name in places[0] if name != REFERENCE), key=_order)
     took = {name: Latency(**one) for name, one in result["latency_ms"].items()}
     head = ("RE mean (px)", *(place.name for place in PLACES), "ms, p50")
     paper = ["paper's network", *("" if place.paper is None else f"{place.paper:g}" for place in PLACES), ""]
     rows = [paper, *([_shown(name), *(_px(one[name]["mean"]) for one in places), _time(name, took)] for name in names)]
-    texts = [f"`{result['model']}`, one seed, exact points, {result['rigs']:,} rigs a column.", markdown(head, rows)]
+    texts = [f"`{result['model']}`, one seed, exact points, {result['rigs']:,} rigs per column.", markdown(head, rows)]
     for title, cell in (
         ("RE < 1 px / < 0.5 px, % of rigs", _success),
         ("RE on held-out points, median (px)", lambda one: _px(one["held_out"]["median"])),
@@ -95,7 +95,7 @@ TOLD = (
     "2 LM steps from the factory",
     "MAP from PnP",
 )
-"""Lines of the tables behind the first: what comes after two steps is MAP to the digits shown."""
+"""Lines of the other tables; more than two steps equal MAP to the digits shown."""
 
 
 def _shown(name: str) -> str:

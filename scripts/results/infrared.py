@@ -1,7 +1,7 @@
-"""Which fiducial is where in single snapshots of captured frames: networks beside blobs, level by level.
+"""Find and identify fiducials in single snapshots of captured frames: networks and blobs, by level of difficulty.
 
 `python -m scripts.results.infrared --models ir-cnn=out/ir-cnn/model.safetensors` rewrites
-`docs/results/infrared.json` and the tables of `docs/infrared.md`. All methods look at the same frames.
+`docs/results/infrared.json` and the tables of `docs/infrared.md`. All methods get the same frames.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 from scripts.output import RESULTS, ROOT, command, markdown, read_json, replaced, surroundings, write_json
 
 JSON, PAGE = RESULTS / "infrared.json", ROOT / "docs" / "infrared.md"
-NEAR = 5.0  # px within which a place is right: less than the radius of a marker
-FAR_OFF = 20.0  # px: no measurement of the right marker is so bad
-VISIBLE = 0.25  # share of a marker that must be seen for it to count
-ASIDE = 8.0  # mm, one standard deviation of each coordinate of the believed pose
-NEARLY = 1.0  # degrees that the believed pose is turned, if nothing else is said
-LOST = (45.0, 120.0)  # the same where it is no help at all
-HARDER = {  # than any named level
+NEAR = 5.0  # px within which a position is right: less than the radius of a marker
+FAR_OFF = 20.0  # px: no measurement of the right marker has such an error
+VISIBLE = 0.25  # share of a marker that must be visible for it to count
+ASIDE = 8.0  # mm, one standard deviation of each coordinate of the assumed pose
+NEARLY = 1.0  # degrees, rotation error of the assumed pose by default
+LOST = (45.0, 120.0)  # the same, for an assumed pose that does not help
+HARDER = {  # harder than any named level
     "low light, peak SNR 0.5 to 0.7": replace(DIFFICULTIES["low-light"], peak_snr=(0.5, 0.7)),
     "low light, peak SNR 0.3 to 0.4": replace(DIFFICULTIES["low-light"], peak_snr=(0.3, 0.4)),
     "combined, peak SNR 0.8 to 1.2": replace(DIFFICULTIES["combined"], peak_snr=(0.8, 1.2)),
@@ -48,15 +48,15 @@ OTHER_LEVELS = ("clean", "combined")
 
 @dataclass(frozen=True)
 class Case:
-    """One snapshot, with the truth about it."""
+    """One snapshot with its ground truth."""
 
     snapshot: Snapshot
     uv: NDArray[np.float64]  # (C, N, 2) px
     visible: NDArray[np.bool_]  # (C, N)
-    pose: RigidTransform  # (), the true one
+    pose: RigidTransform  # (), true pose
 
     def believed(self, degrees: float, seed: int) -> Snapshot:
-        """The snapshot with a pose that is turned by so much, and moved."""
+        """Return the snapshot with an assumed pose that is rotated by `degrees`, and shifted."""
         draw, obj = torch.Generator().manual_seed(seed), self.snapshot.obj
         axis = torch.nn.functional.normalize(torch.randn(3, generator=draw, dtype=torch.float64), dim=0)
         aside = ASIDE * torch.randn(3, generator=draw, dtype=torch.float64)
@@ -68,12 +68,12 @@ class Case:
 
 @dataclass
 class Tally:
-    """What a method said of some snapshots."""
+    """Counts and errors of a method over some snapshots."""
 
     visible: int = 0
     claimed: int = 0
     right: int = 0
-    squared: float = 0.0  # px^2, of the right ones
+    squared: float = 0.0  # px^2, summed over right positions
     whitened: float = 0.0  # the same over sigma^2
     declined: int = 0  # snapshots
     seconds: float = 0.0
@@ -83,7 +83,7 @@ class Tally:
         off = np.square(said.uv - case.uv[said.camera, said.fiducial]).sum(1)
         right = (off < NEAR**2) & case.visible[said.camera, said.fiducial]
         self.visible += int(case.visible.sum())
-        # What hardly shows is no fault to find, and none to miss.
+        # A barely visible marker counts neither as found nor as missed.
         self.claimed += int((right | (off >= NEAR**2)).sum())
         self.right += int(right.sum())
         self.squared += float(off[right].sum()) / 2
@@ -105,29 +105,29 @@ class Tally:
 
 
 class Shuffled(InfraredNetwork):
-    """A network that gets the encoder's output of other cameras."""
+    """A network that gets the encoder's output for other cameras."""
 
     def search(self, features: Tensor, queries: Queries, window: int | None = None) -> Any:
-        """Look at the next camera's features."""
+        """Search the next camera's features."""
         return super().search(features.roll(1, 0), queries, window)
 
 
 class Zeroed(InfraredNetwork):
-    """A network whose encoder says nothing."""
+    """A network whose encoder's output is zero."""
 
     def search(self, features: Tensor, queries: Queries, window: int | None = None) -> Any:
-        """Look at nothing."""
+        """Search features that are all zero."""
         return super().search(torch.zeros_like(features), queries, window)
 
 
 @dataclass(frozen=True)
 class Blobs:
-    """The detector, then a vote of all cameras near the believed pose."""
+    """The detector, then a vote of all cameras near the assumed pose."""
 
     name: str = "blobs"
 
     def labelled(self, snapshot: Snapshot) -> Detections:
-        """Label the blobs that identity accepts."""
+        """Label the blobs that data association accepts."""
         wide = replace(snapshot.blobs, sigma=np.hypot(snapshot.blobs.sigma, 0.3))
         found = track(wide, snapshot.rig, snapshot.obj, snapshot.prior_std, snapshot.candidates[0])
         labels = found.labels if found.accepted else np.full(len(wide), -1)
@@ -135,7 +135,7 @@ class Blobs:
 
 
 def cases(rig: CameraRig, obj: CalibrationObject, difficulty: Difficulty, count: int) -> Iterator[Case]:
-    """Make snapshots of rigs that have drifted, each of its own."""
+    """Make snapshots, each of another drifted rig."""
     draw = torch.Generator().manual_seed(20_260)
     for _ in range(count):
         truth = simulate_truth(rig, obj, 1, draw, PhysicalDrift())
@@ -152,7 +152,7 @@ Method = Callable[[Snapshot], Detections]
 
 
 def methods_of(models: dict[str, Path], measurer: Measurer | None) -> dict[str, Method]:
-    """All methods by name, broken ones last."""
+    """Make all methods by name, those with a disabled encoder last."""
 
     def proposed(proposer: Proposer) -> Method:
         return lambda snapshot: proposer.propose(snapshot).detections
@@ -169,7 +169,7 @@ def methods_of(models: dict[str, Path], measurer: Measurer | None) -> dict[str, 
 
 
 def measure(methods: dict[str, Method], judged: Mapping[str, Proposer], count: int, turned: float) -> dict[str, Any]:
-    """Ask everybody about everything."""
+    """Run all methods on all cases."""
     levels: dict[str, Any] = {}
     lost = {name: {"accepted": 0, "wrong labels": 0, "refused": 0} for name in judged}
     obj, rig = imgcal.load_object("asymmetric8"), imgcal.load_rig("O10")
@@ -196,7 +196,7 @@ def measure(methods: dict[str, Method], judged: Mapping[str, Proposer], count: i
 
 
 def measure_harder(methods: dict[str, Method], count: int, turned: float) -> dict[str, Any]:
-    """Ask where the named levels are too easy to tell methods apart."""
+    """Run all methods on cases that are hard enough to tell them apart."""
     rig, obj = imgcal.load_rig("O10"), imgcal.load_object("asymmetric8")
     made: dict[str, Any] = {}
     for level, difficulty in HARDER.items():
@@ -210,7 +210,7 @@ def measure_harder(methods: dict[str, Method], count: int, turned: float) -> dic
 
 
 def count_lost(proposer: Proposer, case: Case, number: int, counted: dict[str, int]) -> None:
-    """Let identity judge what is proposed around a pose that is no help."""
+    """Check with data association what is proposed around an unhelpful pose."""
     snapshot = case.believed(LOST[number % len(LOST)], number)
     found, blobs = judge(proposer.propose(snapshot), snapshot, IdentityOptions(), error=0.3, pose_known=False)
     counted["accepted" if found.accepted else "refused"] += 1
@@ -221,7 +221,7 @@ def count_lost(proposer: Proposer, case: Case, number: int, counted: dict[str, i
 
 
 def ask(method: Method, case: Case, degrees: float, seed: int, tally: Tally) -> None:
-    """Let a method look at a case whose pose is believed to be turned."""
+    """Run a method on a case whose assumed pose is rotated."""
     snapshot = case.believed(degrees, seed)
     started = time.process_time()
     said = method(snapshot)
@@ -237,7 +237,7 @@ def _by_name(tallies: dict[tuple[str, float], Tally]) -> dict[str, Any]:
 
 
 def tables(result: dict[str, Any]) -> dict[str, str]:
-    """What the page shows."""
+    """Make the tables of the page."""
 
     def cell(said: dict[str, Any] | None) -> str:
         return "" if said is None else f"{said['right_percent']:.1f} / {said['wrong_percent']:.1f}"
@@ -255,7 +255,7 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
             [name, *(f"{said[name]['1']['rms_px']:.2f} / {said[name]['1']['nees']:.2f}" for said in levels.values())]
             for name in names
         ]
-        return markdown(["RMS px of the right ones / NEES", *levels], rows)
+        return markdown(["RMS px of right positions / NEES", *levels], rows)
 
     harder = result["harder"]
     beyond = next(iter(harder.values()))
@@ -272,7 +272,7 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
             [[level, *(cell(row) for said in by.values() for row in said.values())] for level, by in harder.items()],
         ),
         "infrared lost": markdown(
-            ["snapshots", "refused", "accepted", "labels more than 20 px off in these"],
+            ["snapshots", "refused", "accepted", "labels more than 20 px off in accepted snapshots"],
             [
                 [name, str(said["refused"]), str(said["accepted"]), str(said["wrong labels"])]
                 for name, said in result["lost"].items()
@@ -292,10 +292,10 @@ def main(
 
     Args:
         models: NAME=FILE of query networks.
-        measurer: file of a measurer, which reads markers that it knows better than a fit; all are fitted without one.
-        count: snapshots a level.
-        turned: degrees that the believed pose is off the second time.
-        part: what to do; the rest stays as the JSON has it.
+        measurer: file of a measurer, which replaces the fit for the markers that it handles; without it, fit all.
+        count: snapshots per level.
+        turned: degrees, error of the assumed pose in the second round.
+        part: what to measure; the rest stays as it is in the JSON.
     """
     if part != "tables":
         torch.set_num_threads(1)

@@ -1,8 +1,8 @@
-"""ViT against CNN on infrared frames: what each encoder is worth, by training images, by operations, by difficulty.
+"""Compare ViT and CNN encoders on infrared frames, by training images, operations and difficulty.
 
 `python -m scripts.results.infrared_families --runs out/runs --train` trains every encoder of `ENCODERS` with every
-seed, as `imgcal train ir-cnn --set network.encoder=NAME training.seed=K` does, in RUNS/ir-NAME-seedK (what is there
-stays), then measures all, writes `docs/results/infrared_families.json` and its picture, and rewrites the tables of
+seed, as `imgcal train ir-cnn --set network.encoder=NAME training.seed=K` does, in RUNS/ir-NAME-seedK (existing runs are
+kept). It then measures all, writes `docs/results/infrared_families.json` and its picture, and rewrites the tables of
 `docs/infrared.md`.
 """
 
@@ -51,8 +51,8 @@ JSON, PICTURE, PAGE = (
     RESULTS / "infrared_families.png",
     ROOT / "docs" / "infrared.md",
 )
-EXPERIMENT = "ir-cnn"  # whose schedule and data all share
-ON_FRAMES = ("cnn", "vit", "vit-stem")  # the size that ships
+EXPERIMENT = "ir-cnn"  # its schedule and data are used for all
+ON_FRAMES = ("cnn", "vit", "vit-stem")  # in the size that is shipped
 BATCH = 12
 
 
@@ -60,16 +60,16 @@ BATCH = 12
 class Options:
     """Compare encoders of infrared crops."""
 
-    runs: Path = Path("out/runs")  #: folder of the trainings
+    runs: Path = Path("out/runs")  #: folder of the training runs
     seeds: int = 3
-    train: bool = False  #: train first what is missing
-    crops: int = 3_000  #: that no training has seen
-    count: int = 4  #: snapshots a difficulty, of ten cameras each
-    again: bool = False  #: measure nothing: make tables and picture of the JSON that is there
+    train: bool = False  #: first train missing networks
+    crops: int = 3_000  #: crops that were not used for training
+    count: int = 4  #: snapshots per difficulty, of ten cameras each
+    again: bool = False  #: measure nothing: rewrite tables and picture from the existing JSON
 
 
 def main(options: Options) -> None:
-    """Train, measure, write."""
+    """Train, measure and write the results."""
     if options.train:
         train(options)
     if not options.again:
@@ -82,7 +82,7 @@ def main(options: Options) -> None:
 
 
 def train(options: Options) -> None:
-    """Run the trainings that are not there, one after the other."""
+    """Run missing trainings, one after the other."""
     for seed in range(options.seeds):
         for name in ENCODERS:
             out = folder(options, name, seed)
@@ -93,13 +93,13 @@ def train(options: Options) -> None:
 
 
 def folder(options: Options, encoder: str, seed: int) -> Path:
-    """Where a training lies."""
+    """Folder of a training run."""
     return options.runs / f"ir-{encoder}-seed{seed}"
 
 
 @torch.no_grad()
 def measured(options: Options) -> dict[str, Any]:
-    """Everything about every training that is there."""
+    """Measure every existing training run."""
     encoders: dict[str, Any] = {}
     networks: dict[tuple[str, int], InfraredNetwork] = {}
     for name in ENCODERS:
@@ -128,7 +128,7 @@ def size_of(network: InfraredNetwork) -> dict[str, Any]:
 
 
 def on_crops(network: InfraredNetwork, crops: int) -> dict[str, float]:
-    """Right of the visible, wrong of the claimed, NEES: crops as bad as the training's, the same for all."""
+    """Right of the visible, wrong of the claimed, NEES: on crops as hard as in training, the same for all."""
     values = [f"network.encoder={network.config.encoder}", f"training.validation_rigs={crops}"]
     experiment = change_experiment(load_experiment(EXPERIMENT), *values)
     task = experiment.make_task(torch.device("cpu"), BATCH, torch.Generator(), fresh=False)
@@ -138,13 +138,13 @@ def on_crops(network: InfraredNetwork, crops: int) -> dict[str, float]:
 
 
 def curve(run: Path) -> list[tuple[int, float]]:
-    """Crops seen and the validation's share of missed and wrong, from the training's own log."""
+    """Crops seen and share of missed and wrong in validation, from the training log."""
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text("utf-8").splitlines()]
     return sorted({(BATCH * row["step"], row["validation_missed"]) for row in rows if "validation_missed" in row})
 
 
 def on_frames(networks: dict[tuple[str, int], InfraredNetwork], count: int) -> dict[str, Any]:
-    """Right and wrong in captured frames by difficulty, the pose nearly known: each network proposes by itself."""
+    """Right and wrong in captured frames by difficulty, with an approximate pose; each network alone proposes."""
     rig, obj = imgcal.load_rig("O10"), imgcal.load_object("asymmetric8")
     made: dict[str, Any] = {}
     for level, difficulty in {**DIFFICULTIES, **HARDER}.items():
@@ -165,12 +165,12 @@ def _proposed(proposer: LearnedProposer, snapshot: Snapshot) -> Detections:
 
 
 def of_level(level: dict[str, Any], name: str, what: str) -> list[float]:
-    """One value of every seed of an encoder."""
+    """One value of an encoder, for each seed."""
     return [said[what] for said in level[name].values()]
 
 
 def tables(result: dict[str, Any]) -> dict[str, str]:
-    """Markdown by the name of its markers."""
+    """Make the tables, by the names of their markers."""
     crops = []
     for name, row in result["encoders"].items():
         said = row["seeds"].values()
@@ -187,7 +187,7 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
         ]
         frames.append([level, *cells])
     names = list(next(iter(result["frames"].values())))
-    head = ["encoder", "weights", "operations a crop", "seeds", "right, % of visible", "wrong, % of claimed", "NEES"]
+    head = ["encoder", "weights", "operations per crop", "seeds", "right, % of visible", "wrong, % of claimed", "NEES"]
     return {
         "infrared families": markdown(head, crops),
         "infrared families frames": markdown(["right % of visible / wrong % of claimed", *names], frames),
@@ -195,7 +195,7 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
-    """Three panels: against crops seen, against operations, against difficulty."""
+    """Draw three panels: over crops seen, operations and difficulty."""
     encoders, frames = result["encoders"], result["frames"]
     with figure(path, panels=3, size=(11.0, 3.6)) as [learning, cost, hard]:
         for name in (name for name in ON_FRAMES if name in encoders):
@@ -215,7 +215,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
                           textcoords="offset points")  # fmt: skip
         learning.set(xlabel="crops seen in training", ylabel="missed + wrong (%)")
         learning.legend(fontsize=7)
-        cost.set(xlabel="operations a crop (M)", ylabel="missed + wrong (%)", xlim=(0, 420))
+        cost.set(xlabel="operations per crop (M)", ylabel="missed + wrong (%)", xlim=(0, 420))
         hard.set(ylabel="right (%), whole frames")
         short = [level if level in DIFFICULTIES else f"{level.partition(',')[0]} +" for level in frames]
         hard.set_xticks(range(len(frames)), short, rotation=60, ha="right", fontsize=6)

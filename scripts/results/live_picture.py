@@ -1,6 +1,6 @@
-"""The picture of the live page: a rig of ten cameras in the demonstration, after cam07 was bumped and learnt again.
+"""Take the picture of the live page: the demonstration with ten cameras, after cam07 was bumped and relearned.
 
-Run as `python -m scripts.results.live_picture`: a minute, with Debian's Chromium.
+Run as `python -m scripts.results.live_picture`; takes a minute and needs Debian's Chromium.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ COLOURS = 128
 
 @dataclass(frozen=True)
 class Options:
-    """What is pictured."""
+    """Take the picture of the live page."""
 
-    out: Path = ROOT / "docs" / "live.png"  #: file of the picture
+    out: Path = ROOT / "docs" / "live.png"  #: image file to write
     before: float = 30.0  #: s before the bump
     after: float = 30.0  #: s after it
     rate: float = 15.0  #: snapshots a second
@@ -44,7 +44,7 @@ class Options:
 
 
 def main() -> None:
-    """Run the demonstration, bump a camera, take the picture."""
+    """Run the demonstration, bump a camera and take the picture."""
     options = tyro.cli(Options, description=__doc__)
     chromium = shutil.which("chromium")
     if chromium is None:
@@ -64,7 +64,7 @@ def main() -> None:
                 page = context.new_page()
                 page.goto(shown.page.url)
                 learnt = "() => document.getElementById('detail').textContent"
-                page.wait_for_function(learnt, timeout=300_000)  # the first run on a machine compiles
+                page.wait_for_function(learnt, timeout=300_000)  # the first run on a machine compiles code
                 time.sleep(options.before)
                 page.click("[data-action=bump]")
                 time.sleep(options.after)

@@ -1,8 +1,8 @@
 """Repeat the paper's loss figure: ``python -m scripts.results.losses`` writes docs/results/losses.json and .png.
 
-Trains a point network with the paper's loss alone, and watches on fixed rigs what happens to the terms that the paper
-tried as well: they fall to what the true cameras have, without being minimized. The network is the paper's, narrower,
-so that a CPU gets somewhere; the second stage, with reprojection, begins after a third of the time.
+Trains a point network with the paper's loss alone, and tracks on fixed rigs the other terms that the paper tried: they
+fall to their values for the true cameras without being minimized. The network is a narrower version of the paper's, so
+that a CPU suffices. The second stage, with reprojection, begins after a third of the time.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ class Options:
     minutes: float = 5.0
     experiment: str = "table1-row01"
     set: tuple[str, ...] = (NETWORK, "optimizer={lr: 5.0e-4, ema: null}")  #: changes of the experiment
-    every: int = 20  #: steps between two looks
-    rigs: int = 256  #: that are looked at
+    every: int = 20  #: steps between two evaluations
+    rigs: int = 256  #: rigs in each evaluation
     out: Path = RESULTS  #: folder of losses.json and losses.png
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Train, watch, write."""
+    """Train, track the terms, and write the results."""
     options = tyro.cli(Options, args=arguments, description=__doc__)
     if not options.minutes > 0:
         raise InputError(f"--minutes: found {options.minutes:g}, expected more than 0")
@@ -69,7 +69,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def watched(experiment: RigExperiment, options: Options) -> dict[str, Any]:
-    """Train for some minutes; returns every term every few steps."""
+    """Train for some minutes; return all terms, every few steps."""
     run = prepare(experiment)
     task = cast(RigTask, run.task)
     batch = task.batch(options.rigs, torch.Generator(task.prior_std.device).manual_seed(1))
@@ -115,7 +115,7 @@ def watched(experiment: RigExperiment, options: Options) -> dict[str, Any]:
 def terms(
     predicted: Prediction, truth: Prediction, obj: CalibrationObject, scale: float, network: nn.Module
 ) -> dict[str, Tensor]:
-    """Every term, the proposed ones first."""
+    """Compute all terms, the paper's own first."""
     cameras, true_cameras = predicted.cameras_from_object, truth.cameras_from_object
     return {
         "parameter RMSE": parameter_rmse(cameras, true_cameras, scale),
@@ -131,7 +131,7 @@ def terms(
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
-    """Draw one small panel a term: proposed terms blue, the others grey, with what the true cameras have dashed."""
+    """Draw one small panel per term: the paper's own in blue, others in grey; dashed: values of the true cameras."""
     losses = result["losses"]
     with figure(path, rows=3, panels=3, size=(8.5, 6.0)) as panels:
         for axes, (name, values) in zip(panels, losses.items(), strict=True):

@@ -1,8 +1,8 @@
-"""Targets of many small dots, real and simulated: what each detector makes of them.
+"""Compare detectors on targets of many small dots, real and simulated.
 
 `IMGCAL_CAPTURES=... python -m scripts.results.many_dots` rewrites `docs/results/many-dots.json` and the tables of
-`docs/infrared.md`. Factory rigs are disturbed by some pixels in each camera; what comes out is scored on dots that
-took no part in the factory calibration (real), or on the exact places of the dots at another pose (simulated).
+`docs/infrared.md`. Factory rigs are perturbed by some pixels in each camera. The result is scored on dots that were not
+used for the factory calibration (real), or on the exact positions of the dots at another pose (simulated).
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from tests.captures.conftest import Points, as_detections, disturbed
 from tests.captures.sets import PRIOR, SIZE, cavity_two_cameras, three_cameras_dots
 
 JSON, PAGE = RESULTS / "many-dots.json", ROOT / "docs" / "infrared.md"
-NEAR = 3.0  # px within which a place is right
-WRONG = 2.0  # px: held-out RMS of a rig that is none; dots are 35 and more apart
-PIXELS = (9.0, 12.0, 14.0)  # that factory rigs are off
+NEAR = 3.0  # px within which a position is right
+WRONG = 2.0  # px: held-out RMS of a wrong rig; dots are at least 35 px apart
+PIXELS = (9.0, 12.0, 14.0)  # errors of the factory rigs
 PITCH = (((0,), (22, 0)), ((0,), (-35, 0)), ((0, 2), (0, 22)), ((1,), (30, 10)), ((0, 1, 2), (-25, 0)))
-"""Cameras of the lattice of 437 dots, and px that their images are aside: more than half of a pitch."""
-VISIBLE = 0.25  # share of a dot that must be seen for it to count
+"""Cameras of the lattice of 437 dots, and px by which their images are shifted: more than half a pitch."""
+VISIBLE = 0.25  # share of a dot that must be visible for it to count
 CLUTTER = ClutterModel(
     reflections=BlobRange(4, (6.0, 30.0), (2.0, 6.0), (0.5, 2.0)),
     blobs=BlobRange(1500, (0.6, 3.0), (1.0, 1.5), (0.1, 1.5)),
@@ -50,9 +50,9 @@ DETECTORS = ("classical", "matched", "learned, one crop a camera", "learned")
 
 @dataclass(frozen=True)
 class Case:
-    """Frames, a factory rig that is off, and what is known of the truth."""
+    """Frames, a perturbed factory rig, and the known ground truth."""
 
-    name: str  # of the table's row
+    name: str  # of the row in the table
     frames: Mapping[str, Frame]
     rig: CameraRig
     obj: CalibrationObject
@@ -61,7 +61,7 @@ class Case:
 
 
 def real(captures: Path) -> Iterator[Case]:
-    """Both real targets, each disturbed several times."""
+    """Yield both real targets, each with several perturbed factory rigs."""
     for name, read in (("cavity-two-cameras", cavity_two_cameras), ("three-cameras-dots", three_cameras_dots)):
         known = read(captures)
         frames = {camera: shots[0] for camera, shots in known.frames.items()}
@@ -78,7 +78,7 @@ def real(captures: Path) -> Iterator[Case]:
 
 
 def simulated(count: int) -> Iterator[Case]:
-    """Make two cameras that look at 90 dots amid 1500 false ones, as bright as they or dimmer, a tenth hidden."""
+    """Simulate two cameras that see 90 dots, a tenth hidden, among 1500 false ones of at most their brightness."""
     x, y = np.meshgrid(5.0 * np.arange(15) - 35, 8.0 * np.arange(6) - 20)
     xyz = np.stack((x, y, 8.0 * (np.arange(6)[:, None] % 3) + 0 * x - 8), -1).reshape(-1, 3)
     obj = CalibrationObject(torch.from_numpy(xyz), torch.zeros(90, 3, dtype=torch.float64), name="plate90")
@@ -105,7 +105,7 @@ def simulated(count: int) -> Iterator[Case]:
 
 
 def asked(name: str, case: Case) -> dict[str, Any]:
-    """Calibrate, and count what the labels of the estimate are worth, if they are this detector's own."""
+    """Calibrate, and score the labels of the estimate if they are this detector's own."""
     known, detector = ~np.isnan(case.uv[..., 0]), name.partition(",")[0]
     nothing = {"right": 0, "wrong": 0, "known": int(known.sum())}
     started = time.process_time()
@@ -129,13 +129,13 @@ def asked(name: str, case: Case) -> dict[str, Any]:
 
 
 def measure(cases: Iterator[Case], detectors: tuple[str, ...]) -> list[dict[str, Any]]:
-    """Ask all detectors about all cases."""
+    """Run all detectors on all cases."""
     outcomes: list[dict[str, Any]] = []
     for case in cases:
         for name in detectors:
             if "one crop" in name and "pitch" in case.name:
-                continue  # it finds nothing where less is asked
-            # A network that takes no marker for too small looks at one crop a camera.
+                continue  # it fails on easier cases already
+            # If no marker counts as too small for the network, it gets one crop per camera.
             least = 0.0 if "one crop" in name else 0.5
             with patch("imgcal.networks.tiles.LEAST_RADIUS", least):
                 outcomes.append({"case": case.name, "detector": name} | asked(name, case))
@@ -144,7 +144,7 @@ def measure(cases: Iterator[Case], detectors: tuple[str, ...]) -> list[dict[str,
 
 
 def table(outcomes: list[dict[str, Any]]) -> str:
-    """One row for each target and detector."""
+    """Make one row for each target and detector."""
     rows = []
     for case in dict.fromkeys(one["case"] for one in outcomes):
         for name in dict.fromkeys(one["detector"] for one in outcomes):
@@ -168,7 +168,7 @@ def main(count: int = 6, part: str = "all") -> None:
 
     Args:
         count: simulated captures.
-        part: all, simulated, real, or tables; the rest stays as the JSON has it.
+        part: all, simulated, real, or tables; the rest stays as it is in the JSON.
     """
     known = read_json(JSON)["outcomes"] if JSON.is_file() else []
     if part != "tables":

@@ -1,4 +1,4 @@
-"""The learned measurer against the fitted ellipse: errors by level of difficulty, on frames it was not trained on.
+"""Compare the learned measurer with the fitted ellipse, by level of difficulty, on frames not used for training.
 
     python -m scripts.results.measurer out/runs --snapshots 3
 
@@ -31,29 +31,29 @@ from renderers import Spots, render_crops
 from scripts.output import fill, markdown, read_json, surroundings, write_json
 
 RESULT, PAGE = Path("docs/results/measurer.json"), Path("docs/frames.md")
-SEED = 177  # rules of `LearnedMeasurer` were chosen on seed 77
-LEAST_SEEN = 0.25  # share of a marker that there must be to measure
+SEED = 177  # the thresholds of `LearnedMeasurer` were chosen on seed 77
+LEAST_SEEN = 0.25  # share of a marker that must be visible to measure it
 NEAR = 1.0  # marker radii within which a blob belongs to a marker
-WINDOW = 96  # px, each way, that a bound is computed on
-STEP = 0.02  # px, of its derivatives
+WINDOW = 96  # px, width and height of the window on which a bound is computed
+STEP = 0.02  # px, of the finite differences for a bound
 LEVELS = tuple(DIFFICULTIES)
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Blobs of one snapshot that show a marker, and that marker: K of them; and all blobs."""
+    """The K blobs of one snapshot that show a marker, with that marker's truth; and all blobs."""
 
     frames: dict[str, Frame]
     blobs: Blobs
-    row: NDArray[np.int64]  # (K,) of the blobs
+    row: NDArray[np.int64]  # (K,) index among the blobs
     uv: NDArray[np.float64]  # (K, 2) true centre
-    share: NDArray[np.float64]  # (K,) of the marker that is seen
-    bound: NDArray[np.float64]  # (K,) px, Cramer-Rao, one axis; nan where it is not defined
-    markers: int  # that there were to find
+    share: NDArray[np.float64]  # (K,) visible share of the marker
+    bound: NDArray[np.float64]  # (K,) px, Cramér-Rao, one axis; nan where it is not defined
+    markers: int  # number of markers that could be found
 
 
 def snapshots(level: str, count: int) -> Iterator[Seen]:
-    """Simulate captures of O10, detect blobs, and say which marker each one shows."""
+    """Simulate captures of O10, detect blobs, and match each one with its marker."""
     rig, obj = read_rig("O10"), load_object("asymmetric8")
     generator = torch.Generator().manual_seed(SEED)
     truth = simulate_truth(rig, obj, count, generator, PhysicalDrift())
@@ -76,9 +76,9 @@ def snapshots(level: str, count: int) -> Iterator[Seen]:
 
 
 def cramer_rao(shot: Shot) -> NDArray[np.float64]:
-    """Least error (C, N) of one axis that noise allows who knows all but centre, brightness and ground: px.
+    """Least error (C, N) px of one axis, if only centre, brightness and background are unknown.
 
-    Not defined for markers that are cut or partly hidden: what is unknown of the edge is not in it.
+    Not defined for markers that are cut or partly hidden, since the bound ignores the unknown edge.
     """
     flat = shot.markers.of_each(
         lambda values: (values.float() if values.is_floating_point() else values).flatten(0, 1)[:, None]
@@ -96,7 +96,7 @@ def cramer_rao(shot: Shot) -> NDArray[np.float64]:
     variance = level * sensor.shot_noise**2 / sensor.full_scale + sensor.read_noise**2 + 1 / 12
     rows = torch.stack([contrast * along[0], contrast * along[1], here, torch.ones_like(here)], dim=1).flatten(2)
     information = (rows / variance.flatten(1)[:, None]) @ rows.mT
-    information = information + 1e-9 * torch.eye(4, dtype=here.dtype)  # of what is not seen nothing is known
+    information = information + 1e-9 * torch.eye(4, dtype=here.dtype)  # keeps the matrix regular for invisible markers
     variances = torch.diagonal(torch.linalg.inv(information), dim1=1, dim2=2)[:, :2]
     bound = variances.mean(1).sqrt().view(shot.seen.shape)
     whole = (shot.seen > 0.98) & shot.markers.visible
@@ -104,7 +104,7 @@ def cramer_rao(shot: Shot) -> NDArray[np.float64]:
 
 
 def shuffled(network: Measurer) -> Measurer:
-    """Exchange what the network says of one patch with what it says of another one."""
+    """Make a copy of the network whose encoder outputs are swapped between patches."""
     generator = torch.Generator().manual_seed(0)
 
     def exchange(module: torch.nn.Module, arguments: Any, features: torch.Tensor) -> torch.Tensor:
@@ -115,7 +115,7 @@ def shuffled(network: Measurer) -> Measurer:
 
 
 def score(error: NDArray[np.float64], sigma: NDArray[np.float64]) -> dict[str, float]:
-    """Errors (K, 2) and their standard deviations (K,): plain numbers."""
+    """Summarize errors (K, 2) with standard deviations (K,), as plain numbers."""
     if not len(error):
         return {"count": 0}
     squared = (error**2).sum(1)
@@ -131,12 +131,12 @@ def score(error: NDArray[np.float64], sigma: NDArray[np.float64]) -> dict[str, f
 
 
 def judged(views: list[Seen], measurer: LearnedMeasurer | None, alone: bool) -> dict[str, Any]:
-    """Errors of all blobs that show markers; kinds of all blobs.
+    """Score the errors of all blobs that show markers, and the kinds of all blobs.
 
     Args:
         views: snapshots of one level.
         measurer: None = the fitted ellipse.
-        alone: centres of the network for every blob, not only for partial markers.
+        alone: use the network's centre for every blob, not only for partial markers.
     """
     errors, sigmas, flagged, false, kinds = [], [], [], [], []
     for view in views:
@@ -148,7 +148,7 @@ def judged(views: list[Seen], measurer: LearnedMeasurer | None, alone: bool) -> 
             if alone:
                 blobs = replace(blobs, uv=said.uv, sigma=said.sigma)
         unusable = (blobs.flags & int(UNUSABLE)) != 0
-        # The same blobs for all: those that the detector calls usable.
+        # The same blobs for all methods: those that the detector calls usable.
         counted = view.row[(view.blobs.flags[view.row] & int(UNUSABLE)) == 0]
         truth = view.uv[(view.blobs.flags[view.row] & int(UNUSABLE)) == 0]
         errors.append(blobs.uv[counted] - truth)
@@ -167,7 +167,7 @@ def judged(views: list[Seen], measurer: LearnedMeasurer | None, alone: bool) -> 
 
 
 def measured(folder: Path, count: int) -> dict[str, Any]:
-    """All methods on all levels."""
+    """Measure all methods on all levels."""
     runs = sorted(path.parent for path in folder.glob("measurer-*-seed*/model.safetensors"))
     networks = {run.name: load_measurer(run / "model.safetensors").network for run in runs}
     result: dict[str, Any] = {
@@ -201,7 +201,7 @@ def measured(folder: Path, count: int) -> dict[str, Any]:
 
 
 def sizes(networks: dict[str, Measurer]) -> dict[str, dict[str, int]]:
-    """Weights and operations of each family: of the whole network, for one patch."""
+    """Weights and operations of each family's whole network, for one patch."""
     families = {}
     for name, network in networks.items():
         with FlopCounterMode(display=False) as counter:
@@ -212,7 +212,7 @@ def sizes(networks: dict[str, Measurer]) -> dict[str, dict[str, int]]:
 
 
 def tables(result: dict[str, Any]) -> str:
-    """The tables of the page, as Markdown."""
+    """Make the tables of the page, as Markdown."""
     networks = [name for name in next(iter(result["levels"].values())) if "-seed" in name and " " not in name]
 
     def of(row: dict[str, Any], name: str, key: str = "rms_px") -> str:
@@ -224,7 +224,7 @@ def tables(result: dict[str, Any]) -> str:
         families[name.rpartition("-")[0]].append(name)
 
     def over(row: dict[str, Any], family: str, ending: str = "", key: str = "rms_px") -> str:
-        """Mean over the seeds of a family, and from the lowest to the highest."""
+        """Mean over the seeds of a family, and the range."""
         values = [row[f"{name}{ending}"][key] for name in families[family]]
         spread = f" ({min(values):.2g} to {max(values):.2g})" if len(values) > 1 else ""
         return f"{statistics.fmean(values):.3g}{spread}"
@@ -252,24 +252,24 @@ def tables(result: dict[str, Any]) -> str:
     ]
     return "\n\n".join(
         (
-            f"RMS error of one axis in pixels, of usable blobs that show a marker; {result['snapshots']} snapshots of"
-            " O10 a level, markers of some 11 px radius. *Bound*: Cramer-Rao, who knows all but centre, brightness and"
-            " ground; whole markers only. *Alone*: the network's centre for every blob; *shuffled*: the same with the"
-            " encoder's features exchanged between blobs. Mean over training seeds"
+            f"RMS error per axis in pixels, of usable blobs that show a marker; {result['snapshots']} snapshots of O10"
+            " per level, markers of about 11 px radius. *Bound*: Cramér-Rao, with only centre, brightness and"
+            " background unknown; whole markers only. *Alone*: the network's centre for every blob; *shuffled*: the"
+            " same with the encoder's features swapped between blobs. Mean over training seeds"
             f" ({', '.join(f'{family}: {len(names)}' for family, names in families.items())}), lowest to highest.",
             markdown(head, errors),
-            "Median distance in pixels:",
+            "Median error in pixels:",
             markdown(("level", "ellipse", *families), medians),
-            f"What {networks[0]} says of itself: NEES (1 = sigmas are right; median and, alone, mean), shares of"
-            " markers and of other blobs that end up flagged, and what it took the markers for.",
+            f"Self-assessment of {networks[0]}: NEES (1 = correct sigmas; median and, alone, mean), shares of markers"
+            " and of other blobs that are flagged, and its classification of the markers.",
             markdown(("level", "NEES, median", "NEES, alone", "flagged markers", "flagged others", "kinds"), kinds),
-            markdown(("family", "weights", "operations a patch"), sizes_of),
+            markdown(("family", "weights", "operations per patch"), sizes_of),
         )
     )
 
 
 def main() -> None:
-    """Measure, and write."""
+    """Measure, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", type=Path)
     parser.add_argument("--snapshots", type=int, default=3)

@@ -1,8 +1,8 @@
-"""The learned measurer on real frames: calibrations with and without it, scored on points that were held out.
+"""Calibrate from real frames with and without the learned measurer, and score on held-out points.
 
     IMGCAL_CAPTURES=... python -m scripts.results.measurer_captures measurer-cnn
 
-Prints one line a calibration: exit code and RMS (px) of the held-out points.
+Prints one line per calibration: exit code and RMS (px) of the held-out points.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PRIOR = RigPrior(focal_length=0.01, principal_point=20.0, distortion=0.05, rotat
 
 
 def calibrated(folder: Path, source: Path, rig: CameraRig, obj: Path, more: list[str], held_out: list[str]) -> str:
-    """Calibrate by the command, and score what comes out."""
+    """Calibrate with the command, and score the result."""
     save_rig(rig, folder / "factory.yaml")
     shutil.rmtree(folder / "out", ignore_errors=True)
     common = ["--rig", str(folder / "factory.yaml"), "--object", str(obj)]
@@ -45,7 +45,7 @@ def calibrated(folder: Path, source: Path, rig: CameraRig, obj: Path, more: list
 
 
 def dots(captures: Path, folder: Path, measurer: str) -> None:
-    """Three cameras, 437 bright dots: factory rigs that are 9 to 14 px off."""
+    """Three cameras, 437 bright dots: factory rigs with errors of 9 to 14 px."""
     source = captures / "three-cameras-dots"
     obj = source / "object.csv"
     points = read_points(source / "correspondences.csv", load_object(obj).points.numpy(), CAMERAS)
@@ -56,7 +56,7 @@ def dots(captures: Path, folder: Path, measurer: str) -> None:
         imgcal_command(["detect", str(source), "--out", str(folder / "blobs.csv"), *more])
         tables[name] = load_detections(folder / "blobs.csv")
         moved = np.linalg.norm(tables[name].uv - tables["none"].uv, axis=1) > 0
-        print(f"dots, {name}: {tables[name].usable.sum()} of {len(moved)} blobs usable, {moved.sum()} measured anew")
+        print(f"dots, {name}: {tables[name].usable.sum()} of {len(moved)} blobs usable, {moved.sum()} measured again")
     held_out, _ = at_own_centres(points.select(~half), tables["none"])
     save_detections(as_detections(held_out, CAMERAS), folder / "held_out.csv")
     for seed, pixels in enumerate((9.0, 12.0, 14.0)):
@@ -88,7 +88,7 @@ def grid(captures: Path, folder: Path, measurer: str) -> None:
 
 
 def main() -> None:
-    """Calibrate, score, print."""
+    """Calibrate, score and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("measurer")
     measurer = parser.parse_args().measurer

@@ -1,4 +1,4 @@
-"""Evaluates one trained network: everything that the tables say about it, as plain values."""
+"""Evaluate one trained network: everything that the tables show, as plain values."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ HISTORY = 60  # points of the curve over training time
 class Effort:
     """How many rigs are evaluated."""
 
-    count: int = 20_000  # rigs a trial
-    image_count: int = 20_000  # rigs a trial of image models, which take some 20 times as long
+    count: int = 20_000  # rigs per trial
+    image_count: int = 20_000  # rigs per trial of image models, which take about 20 times as long
     trials: int = 3
-    extra: int = 1000  # rigs a trial with noise, with outliers, and of methods without a network
+    extra: int = 1000  # rigs per trial with noise, with outliers, and for methods without a network
 
     def rigs(self, images: bool) -> int:
-        """Rigs of all trials."""
+        """Number of rigs in all trials."""
         return self.trials * (min(self.count, self.image_count) if images else self.count)
 
 
@@ -73,7 +73,7 @@ class Source:
 
 
 def find(runs: Path, models: Path) -> list[Source]:
-    """Look for checkpoints: of training runs, and shipped ones, which replace the runs that they come from.
+    """Find checkpoints: those of training runs, and shipped ones, which replace the runs that they come from.
 
     Raises:
         InputError: a file that cannot be used, or two of the same experiment and seed.
@@ -102,10 +102,10 @@ def measure(
     Args:
         source: its file.
         effort: how many rigs.
-        device: where it runs.
+        device: device to run it on.
         trained_on: the machine of its training, in words.
-        mapped: who measures (`imgcal.fleet.workers`).
-        known: what was measured of the same weights before: times, training and its history stay as they are.
+        mapped: runs the evaluations (`imgcal.fleet.workers`).
+        known: earlier results for the same weights; their times, training and history are kept.
     """
     [model] = load_models([source.path], device=device)
     name, images = checkpoint_experiment(model.checkpoint.experiment).name, model.method.images is not None
@@ -148,13 +148,13 @@ def measure(
 
 
 def latency_of(source: Source, device: str) -> dict[str, Any]:
-    """Milliseconds of one rig."""
+    """Milliseconds per rig."""
     [model] = load_models([source.path], device=device)
     return vars(latency(model.method, model.conditions))
 
 
 def without_network(experiment: RigExperiment, count: int) -> dict[str, Any]:
-    """Evaluate what needs no network, on exact points from what an experiment draws."""
+    """Evaluate the methods without a network, on exact points from an experiment's distribution."""
     rig, obj = experiment.load_rig(), experiment.load_object()
     conditions = Conditions(rig, obj, experiment.poses, experiment.drift)
     return columns(
@@ -163,7 +163,7 @@ def without_network(experiment: RigExperiment, count: int) -> dict[str, Any]:
 
 
 def swept(source: Source, count: int, device: str) -> dict[str, Any]:
-    """Evaluate one network against perturbation and angle, everything else as in its training."""
+    """Evaluate one network over perturbation and angle, with everything else as in training."""
     [model] = load_models([source.path], device=device)
     methods = {NETWORK: model.method, WITHOUT: BASELINES[WITHOUT]}
     drift = model.conditions.drift
@@ -182,7 +182,7 @@ def swept(source: Source, count: int, device: str) -> dict[str, Any]:
 
 
 def label(experiment: RigExperiment) -> str:
-    """Say in a few words what an experiment is about."""
+    """Describe an experiment in a few words."""
     drift, poses = experiment.drift, experiment.poses
     where = "overhead" if poses.phi_deg == (0.0, 0.0) else "hemisphere"
     kappas = "physical drift"
@@ -196,7 +196,7 @@ def label(experiment: RigExperiment) -> str:
 
 
 def training_of(model: Model, trained_on: str) -> dict[str, Any]:
-    """What a training took."""
+    """Length and conditions of a training."""
     metrics, experiment = model.checkpoint.metrics, checkpoint_experiment(model.checkpoint.experiment)
     start = experiment.training.init_from
     starts = [start] if isinstance(start, str) else start or []
@@ -221,7 +221,7 @@ def _name_of_start(path: Path) -> str:
 
 
 def _experiment_and_seed(path: Path) -> tuple[str, int] | None:
-    """Of a checkpoint; None where it was trained for another task than rigs."""
+    """Experiment and seed of a checkpoint; None if it was trained for another task than rigs."""
     with suppress(OSError, SafetensorError), safe_open(path, framework="pt") as file:
         kind = (file.metadata() or {}).get("format", "")
         if kind.startswith("imgcal-") and kind != FORMAT:
@@ -236,7 +236,7 @@ def _experiment_and_seed(path: Path) -> tuple[str, int] | None:
 
 
 def columns(evaluation: Evaluation, methods: Mapping[str, Method]) -> dict[str, Any]:
-    """Every stage of every method in plain values, and MAP from the true inliers."""
+    """Results of every stage of every method as plain values, and of MAP from the true inliers."""
     found: dict[str, Any] = {REFERENCE: _scores(evaluation.reference)}
     for name in methods:
         row = evaluation.rows[name]
@@ -261,7 +261,7 @@ def _scores(scores: Scores) -> dict[str, Any]:
 def evaluated(
     methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol, what: str, mapped: Mapper = map
 ) -> Evaluation:
-    """Evaluate, and say on standard error how far it is and how long it took."""
+    """Evaluate, and report progress and duration on standard error."""
     began = monotonic()
     found = evaluate(methods, conditions, protocol, _progress(what, protocol, len(methods)), mapped)
     print(f"\r{what}: {protocol.trials} x {protocol.count} rigs, {monotonic() - began:.0f} s", file=sys.stderr)
@@ -269,7 +269,7 @@ def evaluated(
 
 
 def _progress(what: str, protocol: Protocol, methods: int) -> Callable[[int], None]:
-    """Show how far an evaluation is, where somebody looks on."""
+    """Make a progress display for an evaluation, if standard error is a terminal."""
     total, done = protocol.count * protocol.trials * (methods + 1), [0]
 
     def show(rigs: int) -> None:

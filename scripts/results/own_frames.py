@@ -1,11 +1,11 @@
-"""Networks that learnt from frames of the same rig, on real frames that are made harder.
+"""Test networks that were adapted to frames of the same rig, on degraded real frames.
 
     IMGCAL_CAPTURES=... python -m scripts.results.own_frames --runs out/own_frames
 
-The sets and degradations are those of `scripts.results.degraded_captures`. One part of each set labels the crops that
-networks learn from (camera 1 of the lattice, camera 3 of the cavity, views 9 to 15 of the grid); every detector then
-calibrates from the rest. Who labelled the snapshots is kept: what a network proposes in vain is left to the filter, and
-where that finds nothing, to blobs.
+The sets and degradations are those of `scripts.results.degraded_captures`. One part of each set provides the labelled
+crops for training (camera 1 of the lattice, camera 3 of the cavity, views 9 to 15 of the grid); every detector then
+calibrates from the rest. The results record which method labelled the snapshots: if a network's proposal is rejected,
+the matched filter is tried, and then blobs.
 """
 
 from __future__ import annotations
@@ -40,16 +40,20 @@ from scripts.results.infrared import Shuffled
 from tests.captures.sets import dot_grid
 
 JSON, PAGE = RESULTS / "own_frames.json", ROOT / "docs" / "infrared.md"
-ADAPT = {"dots": ("cam1",), "cavity": ("cam3",), "grid": ()}  # cameras that are learnt from; of the grid, views are
+ADAPT = {
+    "dots": ("cam1",),
+    "cavity": ("cam3",),
+    "grid": (),
+}  # cameras used for training; views, for the grid
 REST = {"dots": ("cam2", "cam3"), "cavity": ("cam4",), "grid": ("cam",)}
 ENCODERS = {"ir-cnn": "cnn", "ir-vit": "vit", "ir-vit-stem": "vit-stem"}
 SEEDS = (0, 1, 2)
-EVERY = 5  # one crop of so many is held out to end a training by; what is measured are other cameras or views
+EVERY = 5  # every fifth crop is held out to stop a training; results come from other cameras or views
 
 
 @cache
 def rest(name: str) -> captures.Task:
-    """A set without what networks learn from."""
+    """A set without the part that is used for training."""
     given = captures.task(name, captures.captures_folder())
     names = REST[name]
     rig = given.rig.select([given.rig.camera_names.index(camera) for camera in names])
@@ -65,7 +69,7 @@ def of_cameras(points: Detections, names: tuple[str, ...]) -> Detections:
 
 
 def prepare(runs: Path) -> None:
-    """Cut the crops that networks learn from: labelled by the rig that these frames alone give."""
+    """Cut the training crops, labelled by the rig that is calibrated from these frames alone."""
     for name in captures.SETS:
         given = captures.task(name, captures.captures_folder())
         if name == "grid":
@@ -89,7 +93,7 @@ def prepare(runs: Path) -> None:
 
 
 def trainings(runs: Path, encoders: Iterable[str], seeds: Iterable[int]) -> list[list[str]]:
-    """Arguments of `imgcal train` of each adaptation."""
+    """Arguments of `imgcal train` for each adaptation."""
     made = []
     for encoder in encoders:
         start = [] if encoder == "ir-cnn" else [f"network.encoder={ENCODERS[encoder]}",
@@ -108,7 +112,7 @@ def adapted(runs: Path, name: str, encoder: str, seed: int) -> Path:
 
 
 def train(runs: Path, cores: int) -> None:
-    """Train what the encoders begin with, where it is not shipped, and adapt all."""
+    """Train the encoders' starting networks that are not shipped, and adapt all."""
     todo = []
     for encoder in ENCODERS:
         if encoder != "ir-cnn" and not (runs / encoder / "model.safetensors").is_file():
@@ -119,14 +123,14 @@ def train(runs: Path, cores: int) -> None:
 
 
 def run_trainings(todo: list[list[str]], cores: int) -> None:
-    """Run `imgcal train` with each of the arguments, so many at once."""
+    """Run `imgcal train` with each set of arguments, `cores` at a time."""
     waiting, running = list(todo), list[subprocess.Popen[bytes]]()
     while waiting or running:
         while waiting and len(running) < cores:
             arguments = [sys.executable, "-m", "imgcal", "train", *waiting.pop(0)]
             running.append(subprocess.Popen(arguments, env={**os.environ, "OMP_NUM_THREADS": "1"}))
         if running.pop(0).wait():
-            raise SystemExit("a training failed")
+            raise SystemExit("a training run failed")
 
 
 @dataclass(frozen=True)
@@ -136,11 +140,11 @@ class Case:
     captures: str
     kind: str
     level: float
-    detector: str  # a name, or ENCODER seed K, with or without "shuffled" behind it
+    detector: str  # a name, or "ENCODER seed K", optionally followed by "shuffled"
     runs: str
 
     def proposer(self) -> Detector:
-        """Who looks at the frames."""
+        """Make the detector."""
         encoder, _, more = self.detector.partition(" seed ")
         if encoder not in ENCODERS:
             return self.detector
@@ -161,7 +165,7 @@ def shipped_measurer() -> Any:
 
 
 def measured(case: Case) -> dict[str, Any]:
-    """Calibrate from the rest of a set, and score."""
+    """Calibrate from the rest of a set, and score the result."""
     torch.set_num_threads(1)
     given = rest(case.captures)
     frames = given.degraded(case.kind, case.level, 0)
@@ -176,7 +180,7 @@ def measured(case: Case) -> dict[str, Any]:
 
 
 def cases(runs: Path, detectors: Iterable[str]) -> list[Case]:
-    """All cases of some detectors, those that take longest first."""
+    """All cases of some detectors, the slowest first."""
     return [
         Case(name, kind, level, detector, str(runs))
         for name in ("grid", "dots", "cavity")
@@ -193,7 +197,7 @@ def detectors() -> list[str]:
 
 
 def measure(runs: Path, cores: int, todo: list[Case]) -> None:
-    """Measure what the JSON has not yet."""
+    """Measure the cases that are not in the JSON yet."""
     known = read_json(JSON)["outcomes"] if JSON.is_file() else []
     there = {key(row) for row in known}
     todo = [case for case in todo if key(asdict(case)) not in there]
@@ -206,12 +210,12 @@ def measure(runs: Path, cores: int, todo: list[Case]) -> None:
 
 
 def key(row: dict[str, Any]) -> tuple[Any, ...]:
-    """What a result depends on."""
+    """Everything that a result depends on."""
     return tuple(row[name] for name in ("captures", "kind", "level", "detector"))
 
 
 def tables(rows: list[dict[str, Any]]) -> str:
-    """Calibrated, refused and wrong of each detector; and of what each network labelled itself."""
+    """Count calibrated, refused and wrong cases of each detector, and those that each network labelled itself."""
     references = captures.references_of(rows)
     count = len({row["kind"] + str(row["level"]) for row in rows})
     lines = []
@@ -219,7 +223,7 @@ def tables(rows: list[dict[str, Any]]) -> str:
         mine = {
             each: [row for row in rows if (row["detector"], row["captures"]) == (name, each)] for each in captures.SETS
         }
-        whole = {each: found for each, found in mine.items() if len(found) == count}  # others are under way
+        whole = {each: found for each, found in mine.items() if len(found) == count}  # skip unfinished ones
         if not whole:
             continue
         cells = [_outcomes(whole.get(each, []), references) for each in captures.SETS]
@@ -242,13 +246,13 @@ def main(
     cores: int = 1,
     only: tuple[str, ...] = (),
 ) -> None:
-    """Adapt, calibrate, write the JSON and the table.
+    """Adapt, calibrate, and write the JSON and the table.
 
     Args:
-        runs: folder of data sets and trainings.
+        runs: folder of data sets and training runs.
         steps: prepare, train, measure, page.
         cores: processes at once.
-        only: detectors that are measured; none = all.
+        only: detectors to measure; none = all.
     """
     if "prepare" in steps:
         prepare(runs)

@@ -1,6 +1,6 @@
-"""Turns results into the tables of docs/results/tables.md, between its markers.
+"""Turn results into the tables of docs/results/tables.md, between its markers.
 
-One line is one experiment: all its training seeds together, mean and spread over them, or the words "one seed".
+Each line is one experiment: mean and spread over its training seeds, or the words "one seed".
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from scripts.output import markdown
 from scripts.results.measuring import FACTORY, NETWORK, ONE_PASS, ROBUST, WITHOUT, label
 
 Runs = Sequence[Mapping[str, Any]]
-"""Results of one experiment, a training seed each."""
+"""Results of one experiment, one per training seed."""
 Results = Mapping[str, Runs]
 
 MISSING = "not trained yet"
@@ -30,10 +30,10 @@ PARAMETERS = {
 
 
 def accuracy_table(experiments: Sequence[RigExperiment], results: Results) -> str:
-    """Table 1, our networks: what is comparable with the paper first, and steps from the factory beside it."""
+    """Table 1, our networks: the columns comparable with the paper first, then steps from the factory."""
     stages = {ONE_PASS: "one pass", NETWORK: "all passes", REFINED: "refined", FACTORY: FACTORY}
     stages |= {name: name.replace(" from the factory", "") for name in STEPS}
-    head = ("row", "what", "paper's RE", *stages.values(), "RE < 1 px, one pass / all", "encoder", "seeds")
+    head = ("row", "experiment", "paper's RE", *stages.values(), "RE < 1 px, one pass / all", "encoder", "seeds")
 
     def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
         row = [str(row_of(experiment)), _what(experiment, runs), _paper(experiment)]
@@ -44,9 +44,9 @@ def accuracy_table(experiments: Sequence[RigExperiment], results: Results) -> st
 
 
 def parameters_table(experiments: Sequence[RigExperiment], results: Results) -> str:
-    """Table 1, what RE does not show: factory / one pass / all passes / MAP."""
+    """Table 1, quantities that RE does not show: factory / one pass / all passes / MAP."""
     stages = (FACTORY, ONE_PASS, NETWORK, WITHOUT)
-    head = ("row", "what", *PARAMETERS.values(), "RE on held-out points, median (px)")
+    head = ("row", "experiment", *PARAMETERS.values(), "RE on held-out points, median (px)")
 
     def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
         row = [str(row_of(experiment)), _what(experiment, runs)]
@@ -58,8 +58,8 @@ def parameters_table(experiments: Sequence[RigExperiment], results: Results) -> 
 
 
 def background_table(experiments: Sequence[RigExperiment], results: Results) -> str:
-    """Table 1, last part: noise, and what each training took."""
-    head = ("row", "what", "0.1 px noise: alone", "refined", "refined / Cramer-Rao bound", "rigs", *TRAINING)
+    """Table 1, last part: noise, and the length of each training."""
+    head = ("row", "experiment", "0.1 px noise: alone", "refined", "refined / Cramér-Rao bound", "rigs", *TRAINING)
 
     def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
         row = [str(row_of(experiment)), _what(experiment, runs)]
@@ -74,7 +74,7 @@ def paper_table(experiments: Sequence[RigExperiment], results: Results) -> str:
     """Trained networks of the paper's own design."""
     head = (
         "row",
-        "what",
+        "experiment",
         "paper's RE",
         "network alone",
         REFINED,
@@ -96,8 +96,8 @@ def paper_table(experiments: Sequence[RigExperiment], results: Results) -> str:
 
 
 def comparison_table(experiments: Sequence[RigExperiment], results: Results) -> str:
-    """What single decisions are worth, in equal minutes from nothing."""
-    head = ("what", "network alone", "median", "seeds", "rigs", "parameters", *TRAINING)
+    """Effect of single design decisions, in equal training time from scratch."""
+    head = ("experiment", "network alone", "median", "seeds", "rigs", "parameters", *TRAINING)
 
     def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
         row = [experiment.description.partition(":")[0], mean(runs, NETWORK), _px(_mean(runs, NETWORK, "median"))]
@@ -107,7 +107,7 @@ def comparison_table(experiments: Sequence[RigExperiment], results: Results) -> 
 
 
 def shipped_table(experiments: Sequence[RigExperiment], results: Results) -> str:
-    """Accuracy, speed and size of the models that ship."""
+    """Accuracy, speed and size of the shipped models."""
     head = (
         "model", "one pass", "all passes", REFINED, *STEPS[:2], "RE < 1 px, one pass / all / refined", "encoder",
         "rises by", "seeds", "rigs", "alone, ms p50 / p99", "refined, ms p50 / p99", "parameters", "file, MB",
@@ -132,7 +132,7 @@ def shipped_table(experiments: Sequence[RigExperiment], results: Results) -> str
 
 
 def robustness_table(experiments: Sequence[RigExperiment], results: Results) -> str:
-    """With outliers, everybody on the same rigs: how often it succeeds, and the median."""
+    """Success rate and median with outliers, all methods on the same rigs."""
     columns = ("MAP, true inliers", NETWORK, REFINED, ROBUST, WITHOUT, "5 LM steps from the factory", FACTORY)
 
     def cells(experiment: RigExperiment, runs: Runs) -> list[str]:
@@ -148,7 +148,7 @@ def robustness_table(experiments: Sequence[RigExperiment], results: Results) -> 
 
 
 def mean(runs: Runs, stage: str) -> str:
-    """Mean RE, and its spread over training seeds, or of one seed over trials; empty where it was not measured."""
+    """Mean RE and its spread over training seeds, or over trials for one seed; empty if it was not measured."""
     found = [run["exact"][stage] for run in runs if stage in run["exact"]]
     if not found:
         return ""
@@ -162,7 +162,7 @@ def mean(runs: Runs, stage: str) -> str:
 
 
 def seeds(runs: Runs) -> str:
-    """How many trainings a line stands for, and whether what was measured is still there to be measured again."""
+    """Number of trainings behind a line, and whether the measured networks still exist."""
     count = "one seed" if len(runs) == 1 else f"{len(runs)} seeds"
     if any(run["shipped"] for run in runs):
         return f"{count}, shipped"
@@ -170,7 +170,7 @@ def seeds(runs: Runs) -> str:
 
 
 def encoder(runs: Runs) -> str:
-    """Whether the network needs its encoder, of every seed; empty where it has none."""
+    """Whether the network of each seed needs its encoder; empty if it has none."""
     checks = [run.get("encoder") for run in runs]
     used = [check["used"] for check in checks if check is not None]
     if not used:
@@ -179,14 +179,14 @@ def encoder(runs: Runs) -> str:
 
 
 def training_cells(runs: Runs) -> list[str]:
-    """What a training took: minutes, steps, start, machine; of the first seed."""
+    """Minutes, steps, start and machine of the first seed's training."""
     training = runs[0]["training"]
     steps = f"{training['steps']:,} x {training['batch_size']}"
     return [f"{training['minutes']:.0f}", steps, training["started_from"] or "", training["machine"]]
 
 
 def _rigs(runs: Runs) -> str:
-    """Rigs that each seed was measured on: where they differ, the fewest."""
+    """Number of rigs that each seed was measured on; the fewest if they differ."""
     return f"{min(run['rigs'] for run in runs):,}"
 
 
@@ -196,7 +196,7 @@ def row_of(experiment: RigExperiment) -> int:
 
 
 def _what(experiment: RigExperiment, runs: Runs) -> str:
-    """What it is about: as it was trained, which may be at a reduced size."""
+    """Describe an experiment as it was trained, perhaps at a reduced size."""
     return str(runs[0].get("label") or label(experiment))
 
 
@@ -205,7 +205,7 @@ def _paper(experiment: RigExperiment) -> str:
 
 
 def _mean(runs: Runs, stage: str, *keys: str, part: str = "exact") -> float | None:
-    """Mean over seeds of a number of a stage; None where one lacks it."""
+    """Mean of a stage's number over seeds; None if a seed lacks it."""
     found = []
     for run in runs:
         value: Any = run.get(part, {}).get(stage)
@@ -226,7 +226,7 @@ def _of_trained(
     results: Results,
     cells: Callable[[RigExperiment, Runs], list[str]],
 ) -> str:
-    """A table of the experiments that have results, and the names of those that have none."""
+    """Make a table of the experiments that have results, and list those that have none."""
     rows = [cells(experiment, results[experiment.name]) for experiment in experiments if experiment.name in results]
     missing = [experiment.name for experiment in experiments if experiment.name not in results]
     note = f"{MISSING.capitalize()}: {', '.join(missing)}." if missing else ""

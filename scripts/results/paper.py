@@ -1,8 +1,8 @@
-"""Train the paper's own networks, row after row of its tables, in chunks: python -m scripts.results.paper [row ...].
+"""Train the paper's own networks, row by row of its tables, in chunks: python -m scripts.results.paper [row ...].
 
-Trains what is not done yet, for at most the given minutes; the next call goes on exactly there. `scripts/results/gpu`
-is this at full size, `scripts/results/train --reduced` at a size and length for minutes of a CPU core. Runs are
-RUNS/<experiment>-seed<K>, of a reduced size RUNS/<experiment>-reduced-seed<K>.
+Trains unfinished networks for at most the given minutes; the next call resumes exactly there. `scripts/results/gpu`
+runs this at full size, `scripts/results/train --reduced` at a size and length for minutes on a CPU core. Runs are
+RUNS/<experiment>-seed<K>, or RUNS/<experiment>-reduced-seed<K> at reduced size.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ ROWS = tuple(
     if name.startswith("ablation-row") or (name.startswith("table1-row") and name.endswith("-paper"))
 )
 
-# What is changed for a graphics processor: rounding, memory order, compilation; nothing of the method.
+# Changes for a GPU: rounding, memory order, compilation; the method stays the same.
 FULL = {
     "points": ("training.compile=true", "training.tf32=true"),
     "images": ("training.compile=true", "training.tf32=true", "training.channels_last=true"),
 }
 EVERY = ("training.log_every=500", "training.validate_every=5000", "training.save_every=5000")
 
-# For minutes of a CPU core: an eighth of the width and fewer layers, float32, and a schedule for so few steps.
+# For minutes on a CPU core: an eighth of the width, fewer layers, float32, and a schedule for few steps.
 SHORT = (
     "optimizer.lr=0.003",
     "schedule={kind: cosine, warmup: 0.05}",
@@ -54,7 +54,7 @@ REDUCED = {
         "network.change.backbone=vit_tiny_patch16_224",
         f"network.change.options={SMALL_VIT}",
         "images={size: 112, dot: 1.0}",
-        "optimizer.lr=3e-4",  # at the convolutions' 3e-3 it hardly begins to learn
+        "optimizer.lr=3e-4",  # at the CNN's 3e-3 it hardly learns
     ),
     "cnn": (
         "network.change.backbone=resnet10t",
@@ -81,26 +81,26 @@ class Options:
     """Train the paper's own networks."""
 
     rows: Annotated[tuple[str, ...], tyro.conf.Positional] = ()  #: experiments; none = all of the paper's rows
-    size: Size = "reduced"  #: of the networks, and how long they are trained
+    size: Size = "reduced"  #: of the networks, and the length of their training
     runs: Path = Path("out/runs")  #: folder of training runs
     seeds: int = 1  #: trainings of each row, seeds 1 and up
-    steps: int | None = None  #: of every training, instead of what the size says
-    minutes: float | None = None  #: end after so long; None = when all is trained
-    device: Literal["auto", "cpu"] = "auto"  #: where networks run; "auto" = on a GPU if there is one
+    steps: int | None = None  #: of every training, instead of the number for its size
+    minutes: float | None = None  #: time limit; None = until all are trained
+    device: Literal["auto", "cpu"] = "auto"  #: device of the networks; "auto" = a GPU if there is one
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Train, and say what is not done."""
+    """Train, and list what is unfinished."""
     options = tyro.cli(Options, args=arguments, description=__doc__)
     for row in options.rows:
         if row not in ROWS:
             raise InputError(f"found {row}, expected some of {', '.join(ROWS)}")
     for name in train(options):
-        print(f"not done: {name}", file=sys.stderr)
+        print(f"unfinished: {name}", file=sys.stderr)
 
 
 def train(options: Options) -> list[str]:
-    """Go on with the trainings, seed by seed; returns the names of those that are not done."""
+    """Resume the trainings, seed by seed; return the names of the unfinished ones."""
     began = monotonic()
 
     def out_of_time() -> bool:
@@ -127,12 +127,12 @@ def train(options: Options) -> list[str]:
 
 
 def folder_of(experiment: RigExperiment, runs: Path) -> Path:
-    """Where a training run lies."""
+    """Folder of a training run."""
     return runs / f"{experiment.name}-seed{experiment.training.seed}"
 
 
 def name_of(row: str, size: Size) -> str:
-    """What the experiment of a row is called at a size."""
+    """Name of a row's experiment at a size."""
     return row if size == "full" else f"{row}-{size}"
 
 

@@ -1,7 +1,7 @@
-"""Calibrations of other tools as their formats are described, read by general parsers and projected by OpenCV.
+"""Independent readers: calibrations of other tools, read by general parsers and projected by OpenCV.
 
-Nothing of imgcal takes part: YAML, TOML, JSON and XML parsers, OpenCV's FileStorage, pycolmap. What `write_back.py`
-writes is checked against these.
+They use no code of imgcal, only YAML, TOML, JSON and XML parsers, OpenCV's FileStorage and pycolmap, and follow the
+descriptions of the formats. The output of `write_back.py` is checked with them.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ import yaml
 
 Projection = Callable[
     [Any], Any
-]  # (N, 3) points in the file's frame and unit -> (N, 2) pixels, (0, 0) a pixel's centre
-HALF = 0.5  # COLMAP's pixels begin there
+]  # (N, 3) points in the file's frame and unit -> (N, 2) pixels, (0, 0) = centre of the first pixel
+HALF = 0.5  # COLMAP's pixel coordinates of the first pixel's centre
 
 
 def pinhole(turn: Any, shift: Any, k: Any, d: Any, fisheye: bool = False, half: float = 0.0) -> Projection:
-    """An OpenCV camera; `turn` is a rotation vector or matrix of camera_from_world."""
+    """Make an OpenCV camera; `turn` is the rotation vector or matrix of camera_from_world."""
     turn, shift = np.array(turn, dtype=float), np.array(shift, dtype=float).reshape(3, 1)
     vector = turn.reshape(3, 1) if turn.size == 3 else cv2.Rodrigues(turn.reshape(3, 3))[0]
     k, d = np.array(k, dtype=float).reshape(3, 3), np.array(d, dtype=float).ravel()
@@ -39,14 +39,14 @@ def matrix_of(fx: float, fy: float, cx: float, cy: float) -> Any:
 
 
 def rotation_of(w: float, x: float, y: float, z: float) -> Any:
-    """Of a unit quaternion."""
+    """Rotation matrix of a unit quaternion."""
     scalar, vector = w, np.array([x, y, z])
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return (scalar**2 - vector @ vector) * np.eye(3) + 2 * np.outer(vector, vector) + 2 * scalar * cross
 
 
 def storage(path: Path) -> Callable[[str], Any]:
-    """Open a FileStorage of OpenCV; a function that reads a matrix."""
+    """Open an OpenCV FileStorage; returns a function that reads a matrix."""
     opened = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     return lambda key: opened.getNode(key).mat()
 
@@ -99,7 +99,7 @@ def ros(path: Path) -> dict[str, Projection]:
 
 
 def toml_cameras(path: Path) -> dict[str, Projection]:
-    """A table a camera: anipose, FreeMoCap, Pose2Sim; caliscope's stand under `cameras` in newer files."""
+    """One table per camera: anipose, FreeMoCap, Pose2Sim, caliscope (under `cameras` in newer files)."""
     text = "\n".join(line for line in path.read_text().splitlines() if not line.startswith("CreationDate"))
     values = tomllib.loads(text)
     values = values.get("cameras", values)
@@ -141,7 +141,7 @@ def pymvg(path: Path) -> dict[str, Projection]:
 
 
 def colmap_camera(model: str, numbers: Any) -> tuple[Any, list[float], bool]:
-    """K, distortion, and whether it is a fisheye."""
+    """K, distortion, and whether the camera is a fisheye."""
     if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
         f, cx, cy, *ks = numbers
         return matrix_of(f, f, cx, cy), [*ks, 0, 0, 0, 0][:4] if model != "SIMPLE_PINHOLE" else [0.0] * 4, False
@@ -152,7 +152,7 @@ def colmap_camera(model: str, numbers: Any) -> tuple[Any, list[float], bool]:
 
 
 def colmap(path: Path) -> dict[str, Projection]:
-    """The rig of a model, by pycolmap; the comma-separated variant of kapture, which that refuses, by hand."""
+    """The rig of a model, by pycolmap; kapture's comma-separated variant, which pycolmap rejects, by hand."""
     if not (path / "rigs.txt").is_file() and not (path / "rigs.bin").is_file():
         return kapture(path)
     import pycolmap
@@ -179,7 +179,7 @@ def kapture(path: Path) -> dict[str, Projection]:
             continue
         name = cells[9].split("/")[0]
         w, x, y, z, *shift = map(float, cells[1:8])
-        if name not in found:  # images of the first moment come first
+        if name not in found:  # images of the first snapshot come first
             k, d, fisheye = lenses[cells[8]]
             found[name] = pinhole(rotation_of(w, x, y, z), shift, k, d, fisheye, HALF)
     return found
@@ -200,7 +200,7 @@ def vicon(path: Path) -> dict[str, Projection]:
 
 
 def vicon_camera(camera: ElementTree.Element) -> Projection:
-    """A quaternion and a centre; the lens takes image points to ideal ones, and is inverted by repetition."""
+    """A quaternion and a centre; the lens maps image points to ideal ones, and is inverted by iteration."""
     frame = next(camera.iter("KeyFrame"))
     x, y, z, w = map(float, frame.attrib["ORIENTATION"].split())
     turn = rotation_of(w, x, y, z) / (w * w + x * x + y * y + z * z)

@@ -1,8 +1,8 @@
 """Measure the paper's runtime figure: ``python -m scripts.results.runtime`` writes docs/results/runtime.json and .png.
 
-One camera calibrated by OpenCV, against the number of images and of Levenberg-Marquardt iterations; beside it a whole
-rig of 2 to 1024 cameras from one snapshot: networks, and network + MAP refinement. Networks are untrained: the time
-does not depend on weights. Refinement starts 10 px off, about where a trained network leaves off.
+Left: one camera calibrated by OpenCV, over the numbers of images and of Levenberg-Marquardt iterations. Right: a whole
+rig of 2 to 1024 cameras from one snapshot, by networks and by network + MAP refinement. Networks are untrained, since
+the time does not depend on weights. Refinement starts with an error of 10 px, about that of a trained network.
 """
 
 from __future__ import annotations
@@ -40,16 +40,24 @@ class Options:
     """Measure calibration and inference times."""
 
     images: tuple[int, ...] = (10, 20, 50, 100, 200, 300, 1000, 3000)  #: numbers of images for OpenCV
-    iterations: tuple[int, ...] = (1, 2, 5, 10, 20, 30, 50)  #: of OpenCV, on the images of `iteration_images`
+    iterations: tuple[int, ...] = (
+        1,
+        2,
+        5,
+        10,
+        20,
+        30,
+        50,
+    )  #: for OpenCV, on `iteration_images` images
     iteration_images: int = 100
-    cameras: tuple[int, ...] = tuple(2**i for i in range(1, 11))  #: of our rigs
+    cameras: tuple[int, ...] = tuple(2**i for i in range(1, 11))  #: numbers of cameras in our rigs
     limit: float = 20.0  #: s; a curve ends with the first point that takes longer
-    repeats: int = 20  #: of our measurements, fewer where one takes long
+    repeats: int = 20  #: repetitions of our measurements, fewer for slow ones
     out: Path = RESULTS  #: folder of runtime.json and runtime.png
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure, print, write."""
+    """Measure, print and write the results."""
     options = tyro.cli(Options, args=arguments, description=__doc__)
     result: dict[str, Any] = surroundings("cuda" if torch.cuda.is_available() else "cpu")
     views = opencv_views(max(*options.images, options.iteration_images))
@@ -66,17 +74,17 @@ def main(arguments: list[str] | None = None) -> None:
 
 @dataclass(frozen=True)
 class CameraViews:
-    """What one camera sees, for OpenCV."""
+    """Views of one camera, for OpenCV."""
 
     points: NDArray[np.float32]  # (N, 3) mm
-    uv: list[NDArray[np.float32]]  # of each image, (N, 2) pixels
+    uv: list[NDArray[np.float32]]  # (N, 2) pixels for each image
     size: tuple[int, int]
     matrix: NDArray[np.float64]  # factory camera matrix
     distortion: NDArray[np.float64]  # (5,) factory values
 
 
 def opencv_views(images: int) -> CameraViews:
-    """Let one drifted camera of O10 look at cube8 from all over the hemisphere."""
+    """Simulate views of cube8 by one drifted camera of O10 from all over the hemisphere."""
     rig, obj, generator = read_rig("O10"), load_object("cube8"), torch.Generator().manual_seed(0)
     drifted = DRIFT.apply(rig, generator)
     made = synthesize(drifted, obj, images, generator, drift=None)
@@ -90,7 +98,7 @@ def opencv_views(images: int) -> CameraViews:
 
 
 def opencv(views: CameraViews, images: int, iterations: int | None = None) -> dict[str, float]:
-    """Calibrate one camera; a given number of iterations is not cut short by convergence."""
+    """Calibrate one camera; with a given number of iterations, do not stop at convergence."""
     kind = cv2.TERM_CRITERIA_COUNT if iterations else cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS
     criteria = (kind, iterations or 30, 0.0 if iterations else float(np.finfo(np.float64).eps))  # OpenCV's default
     given = ([views.points] * images, views.uv[:images], views.size)
@@ -147,13 +155,13 @@ def ours(cameras: int, device: str, repeats: int) -> dict[str, float]:
 
 
 def unhindered(rig: CameraRig, obj: CalibrationObject) -> Snapshots:
-    """Draw one rig that sees the whole object, by small drift: the time is the same."""
+    """Draw one rig with small drift that sees the whole object; the time is the same."""
     few = replace(DRIFT, principal_point=1.0, rotation_deg=0.05)
     return synthesize(rig, obj, 1, torch.Generator().manual_seed(0), drift=few)
 
 
 def nearby(made: Snapshots) -> Prediction:
-    """Start of a refinement: the object some millimetres away from where it is, 10 px or so in the images."""
+    """Start of a refinement: the object is shifted by a few millimetres, about 10 px in the images."""
     pose = made.rig_from_object
     return Prediction(made.rig, RigidTransform(pose.rotation, pose.translation + 5.0))
 
@@ -166,7 +174,7 @@ def forward(network: nn.Module, views: Views) -> None:
 
 
 def median(run: Callable[[], object], repeats: int, patience: float = 5.0) -> float:
-    """Median time of some calls after warming up; fewer when they would take longer than `patience` (s)."""
+    """Median time of `repeats` calls after a warm-up, fewer if they would take longer than `patience` (s)."""
     took: list[float] = []
     began = time.perf_counter()
     for number in range(repeats + 2):

@@ -1,8 +1,8 @@
-"""What do encoders of infrared crops look at? The pixels on which the evidence for a fiducial's true place hangs.
+"""Show what encoders of infrared crops look at: the pixels that the probability of a fiducial's true cell depends on.
 
-`python -m scripts.results.saliency out/runs/ir-cnn-seed0 out/runs/ir-vit-seed0 ...` draws crops with what each network
-makes of them: how much the logarithm of the probability of the true cell changes with each pixel, for one fiducial. The
-table says how far from the fiducial half, and nine tenths, of that lie: means over all fiducials of many crops.
+`python -m scripts.results.saliency out/runs/ir-cnn-seed0 out/runs/ir-vit-seed0 ...` draws crops with a map for each
+network: the gradient of the log probability of the true cell of one fiducial with respect to each pixel. The table
+gives the radii around the fiducial that contain half, and nine tenths, of it: means over all fiducials of many crops.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ SHARES = (0.5, 0.9)
 
 @dataclass(frozen=True)
 class Options:
-    """Draw and count what networks look at."""
+    """Show what infrared networks look at."""
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]  #: folders of trainings of infrared networks
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]  #: folders of training runs of infrared networks
     crops: int = 96
     shown: int = 5  #: crops in the picture
 
 
 def main(options: Options) -> None:
-    """Measure, draw, write."""
+    """Measure, draw and write the results."""
     networks = {
         run.name.partition("-seed")[0]: load_infrared(run / "model.safetensors").network for run in options.runs
     }
     batch = crops_of(next(iter(networks.values())), options.crops)
-    fiducial = (batch.seen & batch.queries.asked).float().argmax(1)  # (P,) the first one that is to be seen
+    fiducial = (batch.seen & batch.queries.asked).float().argmax(1)  # (P,) the first visible one
     rows = torch.arange(len(fiducial))
     rows = rows[(batch.seen & batch.queries.asked)[rows, fiducial]]
     maps = {name: saliency(network, batch, fiducial) for name, network in networks.items()}
@@ -56,7 +56,7 @@ def main(options: Options) -> None:
 
 
 def crops_of(network: InfraredNetwork, count: int) -> CropBatch:
-    """Crops that no training has seen."""
+    """Draw crops that were not used for training."""
     experiment = change_experiment(load_experiment("ir-cnn"), f"network.encoder={network.config.encoder}")
     task = experiment.make_task(torch.device("cpu"), count, torch.Generator(), fresh=False)
     assert isinstance(task, InfraredTask)
@@ -64,7 +64,7 @@ def crops_of(network: InfraredNetwork, count: int) -> CropBatch:
 
 
 def saliency(network: InfraredNetwork, batch: CropBatch, fiducial: Tensor) -> Tensor:
-    """Size of the gradient of one fiducial's log probability at its true cell by each pixel: (P, S, S)."""
+    """Absolute gradient of a fiducial's log probability at its true cell with respect to each pixel: (P, S, S)."""
     crops = batch.crops.detach().clone().requires_grad_()
     evidence = network(crops, batch.queries, batch.window)
     rows = torch.arange(len(fiducial))
@@ -87,7 +87,7 @@ def reaches(maps: Tensor, place: Tensor) -> list[Tensor]:
 
 
 def draw(batch: CropBatch, maps: dict[str, Tensor], rows: Tensor, fiducial: Tensor) -> None:
-    """One column a crop: the crop with the place that is asked about, then one row a network."""
+    """Draw one column per crop: the crop with the fiducial marked, then one row per network."""
     columns = len(rows)
     with figure(PICTURE, columns, 1 + len(maps), (2.0 * columns, 2.0 * (1 + len(maps)))) as panels:
         for column, row in enumerate(rows.tolist()):

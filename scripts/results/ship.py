@@ -1,4 +1,4 @@
-"""Put trained networks where the package ships them: bf16 weights in data/models, named by kind, rig and object.
+"""Copy trained networks into data/models, which ships with the package: bf16 weights, named by kind, rig and object.
 
 Usage: python -m scripts.results.ship out/runs/shipped-points-asymmetric8 out/runs/shipped-vit-asymmetric8 ...
 """
@@ -27,15 +27,15 @@ RIGS = 64  # on which both precisions are compared
 
 @dataclass(frozen=True)
 class Options:
-    """Put trained networks where the package ships them."""
+    """Copy trained networks into the folder that the package ships."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]  #: folders of training runs of shipped-*
     out: Path = MODELS  #: folder of the shipped networks
-    trust: tuple[str, ...] = ()  #: encoders of yours, package.module:Class, that runs may name: their code runs
+    trust: tuple[str, ...] = ()  #: your own encoders, package.module:Class, that runs may name; their code is executed
 
 
 def main(arguments: list[str]) -> None:
-    """Write each network with bf16 weights, and print what that costs."""
+    """Write each network with bf16 weights, and print the loss of accuracy."""
     options = tyro.cli(Options, args=arguments, description=__doc__)
     if not options.runs:
         raise InputError("found no folder of a training run, expected at least one")
@@ -51,7 +51,7 @@ def main(arguments: list[str]) -> None:
 
 
 def portable(experiment: RigExperiment) -> RigExperiment:
-    """Say where a warm start came from by the name of that experiment or network, not by a path of this machine."""
+    """Replace the path of a warm start by the name of its experiment or network."""
     start = experiment.training.init_from
     if start is None:
         return experiment
@@ -60,7 +60,7 @@ def portable(experiment: RigExperiment) -> RigExperiment:
 
 
 def _name(path: str) -> str:
-    """Folder of the run that made a file; a shipped network's own name."""
+    """Name of the run that made a file, or of a shipped network."""
     if "/" not in path and not path.endswith(".safetensors"):
         return path
     file = Path(path)

@@ -1,8 +1,8 @@
 """Evaluate trained networks and rewrite docs/results/tables.md: ``python -m scripts.results.table out/runs``.
 
-Reads out/runs/*/model.safetensors, as `imgcal train` writes them, and data/models. The figures of a network are kept in
-docs/results/<experiment>-seed<K>.json under the hash of its file: another call evaluates only what is new. All seeds of
-an experiment make one line.
+Reads out/runs/*/model.safetensors, as written by `imgcal train`, and data/models. The results of a network are kept in
+docs/results/<experiment>-seed<K>.json with the hash of its file, so another call evaluates only new networks. All seeds
+of an experiment make one line.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from scripts.results.pages import (
 )
 
 REDUCED = "-reduced"
-"""Ending of the names of experiments that were trained at another size than their file's."""
+"""Suffix of the names of experiments that were trained at another size than that in their file."""
 HEADLINE, BASELINES = "headline.json", "baselines.json"
 
 
@@ -50,21 +50,21 @@ class Options:
     results: Path = RESULTS  #: folder of JSON results and plots
     effort: Annotated[Effort, tyro.conf.arg(name="")] = field(default_factory=Effort)
     only: tuple[str, ...] = ()  #: evaluate these experiments only; the page gets all known ones
-    headline: str = "points-O10-cube8"  #: shipped network that stands beside Levenberg-Marquardt steps at every drift
-    sweep: str = "shipped-points-cube8"  #: experiment whose error is drawn against perturbation and angle
-    times: bool = False  #: measure how long everything takes anew, and nothing else: for a machine that is idle at last
+    headline: str = "points-O10-cube8"  #: shipped network to compare with Levenberg-Marquardt steps at every drift
+    sweep: str = "shipped-points-cube8"  #: experiment whose error is drawn over perturbation and angle
+    times: bool = False  #: only repeat the timings, on an idle machine
     sweep_count: int = 1000  #: rigs at each point of those curves
-    machine: str = "2 CPU cores shared, 1 thread a training"  #: what new runs were trained on
-    device: str = "cpu"  #: where networks run; refinement is always on the CPU
-    address: str | None = None  #: running Ray cluster that measures; none = this machine
-    cores: int = 1  #: of this machine; 1 = this process alone
-    work: Path = WORK / "table"  #: what a stopped call has done
+    machine: str = "2 CPU cores shared, 1 thread a training"  #: machine that new runs were trained on
+    device: str = "cpu"  #: device of the networks; refinement always runs on the CPU
+    address: str | None = None  #: running Ray cluster to measure on; None = this machine
+    cores: int = 1  #: cores of this machine; 1 = this process alone
+    work: Path = WORK / "table"  #: progress of a call that was stopped
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Evaluate what is new, then write the page and the plots."""
+    """Evaluate new networks, then write the page and the plots."""
     options = tyro.cli(Options, args=arguments, description=__doc__)
-    _read(options.page)  # one that cannot be read is refused now, not when all is measured
+    _read(options.page)  # fail now, not after all measurements, if it cannot be read
     shipped = {name: load_experiment(name) for name in shipped_names("experiments", ".yaml")}
     experiments = {name: one for name, one in shipped.items() if isinstance(one, RigExperiment)}
     sources = find(options.runs, options.models)
@@ -94,7 +94,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def sections(experiments: list[RigExperiment], results: dict[str, list[dict[str, Any]]]) -> dict[str, str]:
-    """Make all tables, by the name of their markers."""
+    """Make all tables, by the names of their markers."""
     reduced = [one.model_copy(update={"name": f"{one.name}{REDUCED}"}) for one in experiments]
     experiments = [*experiments, *(one for one in reduced if one.name in results)]
     table1 = [e for e in experiments if e.paper is not None and e.paper.table == "1"]
@@ -115,7 +115,7 @@ def sections(experiments: list[RigExperiment], results: dict[str, list[dict[str,
 
 
 def pictures(folder: Path) -> dict[str, str]:
-    """Show the figures that there are, by the name of their markers."""
+    """Link the existing figures, by the names of their markers."""
     texts = {"training": "RE over training time", "sweep": "RE against kappa and phi"}
     there = {name: (folder / f"{name}.png").is_file() for name in texts}
     return {name: f"![{text}]({name}.png)" if there[name] else "Not made yet." for name, text in texts.items()}
@@ -126,7 +126,7 @@ def _order(experiment: RigExperiment) -> tuple[int, str]:
 
 
 def _measure(options: Options, source: Source, place: Path) -> None:
-    """Evaluate a network; what a stopped call has done is kept beside the runs until all is."""
+    """Evaluate a network; the progress of a stopped call is kept until the evaluation is complete."""
     known = read_json(place) if place.is_file() else {}
     same = known if known.get("sha256") == source.sha256 else {}
     kept = StoredResults(options.work / source.sha256[:16], source.sha256)
@@ -136,7 +136,7 @@ def _measure(options: Options, source: Source, place: Path) -> None:
 
 
 def _known(place: Path, source: Source, effort: Effort) -> bool:
-    """Tell whether a network has been evaluated already, on no fewer rigs."""
+    """Tell whether a network has already been evaluated, on at least as many rigs."""
     if not place.is_file():
         return False
     found = read_json(place)
@@ -144,7 +144,7 @@ def _known(place: Path, source: Source, effort: Effort) -> bool:
 
 
 def _runs(folder: Path, name: str) -> list[dict[str, Any]]:
-    """Results of an experiment, seed by seed; where there are none, what was measured before seeds were told apart."""
+    """Results of an experiment by seed; if there are none, results from before seeds were distinguished."""
     places = sorted(folder.glob(f"{name}-seed*.json")) or [folder / f"{name}.json"]
     return [read_json(place) for place in places if place.is_file()]
 
@@ -152,7 +152,7 @@ def _runs(folder: Path, name: str) -> list[dict[str, Any]]:
 def _complete(
     results: dict[str, list[dict[str, Any]]], experiments: dict[str, RigExperiment], options: Options
 ) -> None:
-    """Put steps from the factory beside networks that were measured before there were any, and are gone."""
+    """Add steps from the factory to older results of networks that no longer exist."""
     place = options.results / BASELINES
     known = read_json(place) if place.is_file() else {}
     for name, runs in results.items():
@@ -166,7 +166,7 @@ def _complete(
 
 
 def _time_anew(options: Options, source: Source, place: Path) -> None:
-    """Replace the times of a network that has been evaluated, and of the steps beside it."""
+    """Repeat the timings of an evaluated network, and of the steps beside it."""
     if place.is_file() and (known := read_json(place))["sha256"] == source.sha256:
         write_json(place, known | {"latency_ms": latency_of(source, options.device)})
     place = options.results / HEADLINE

@@ -1,11 +1,11 @@
-"""Markers that no rendering shows: what networks find before and after they have learnt from some frames.
+"""Test networks on markers unlike those in training, before and after adaptation to some frames.
 
     python -m scripts.results.unlike_markers --runs out/unlike
 
-Rig O10 and object asymmetric8 with squares, rings, bars, dark discs or bloomed lamps as markers, among round discs that
-are no markers. The rig is known, as after a calibration; `imgcal harvest` labels 3 to 100 frames (ten are a snapshot),
-`imgcal train --from` adapts network and measurer, and other snapshots are measured, in which the believed pose is
-1 degree and 8 mm off. Right and wrong are those of `scripts.results.infrared`.
+Rig O10 and object asymmetric8 with squares, rings, bars, dark discs or bloomed lamps as markers, among false round
+discs. The rig is known, as after a calibration. `imgcal harvest` labels 3 to 100 frames (ten per snapshot), `imgcal
+train --from` adapts network and measurer, and other snapshots are measured, with an assumed pose that is wrong by
+1 degree and 8 mm. Right and wrong are defined as in `scripts.results.infrared`.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ from scripts.results.infrared import Case, Tally, ask
 
 JSON, PAGE = RESULTS / "unlike_markers.json", ROOT / "docs" / "infrared.md"
 MARKERS = ("squares", "rings", "bars", "dark", "bloomed")
-FRAMES = {3: (0,), 10: (0,), 30: (0, 1, 2), 100: (0,)}  # and the seeds of each
-CLUTTER = 15  # round discs a frame that are no markers
-SNAPSHOTS = 3  # that are measured
+FRAMES = {3: (0,), 10: (0,), 30: (0, 1, 2), 100: (0,)}  # numbers of frames, and the seeds of each
+CLUTTER = 15  # false round discs per frame
+SNAPSHOTS = 3  # snapshots to measure
 GROUND, LIGHT, NOISE = 25.0, 130.0, 4.0  # grey levels
-MEASURER = "-measurer"  # what the folders of adapted measurers end in
+MEASURER = "-measurer"  # suffix of the folders of adapted measurers
 DRAWN = 24  # px, half of the window that a marker is drawn in
 
 
 def draw(frame: NDArray[np.float64], place: NDArray[np.float64], radius: float, shape: str, angle: float) -> None:
-    """Add the light of one marker, each pixel's the mean of nine places in it."""
+    """Add the light of one marker; each pixel is the mean of nine samples."""
     middle = np.rint(place).astype(int)
     low, high = np.maximum(middle - DRAWN, 0), np.minimum(middle + DRAWN + 1, frame.shape[::-1])
     if (low >= high).any():
@@ -79,7 +79,7 @@ def draw(frame: NDArray[np.float64], place: NDArray[np.float64], radius: float, 
 
 
 def snapshots(rig: CameraRig, shape: str, count: int, seed: int) -> Iterator[tuple[CameraRig, Case]]:
-    """Make snapshots of rigs that have drifted: the rig as it is, and the case."""
+    """Make snapshots of drifted rigs: the true rig, and the case."""
     obj, generator = imgcal.load_object("asymmetric8"), torch.Generator().manual_seed(seed)
     truth = simulate_truth(rig, obj, count, generator, PhysicalDrift())
     random, options = np.random.default_rng(seed), DetectionOptions(polarity="dark" if shape == "dark" else "bright")
@@ -110,7 +110,7 @@ def snapshots(rig: CameraRig, shape: str, count: int, seed: int) -> Iterator[tup
 
 
 def prepare(runs: Path, markers: Sequence[str] = MARKERS) -> None:
-    """Harvest from so many frames of each kind of marker, the rig being known."""
+    """Harvest labels from frames of each kind of marker, with the known rig."""
     rig, obj = imgcal.load_rig("O10"), imgcal.load_object("asymmetric8")
     for shape in markers:
         for count in FRAMES:
@@ -136,7 +136,7 @@ def prepare(runs: Path, markers: Sequence[str] = MARKERS) -> None:
 
 
 def trainings(runs: Path, markers: Sequence[str] = MARKERS) -> list[list[str]]:
-    """Arguments of `imgcal train` of each adaptation."""
+    """Arguments of `imgcal train` for each adaptation."""
     return [
         [name, "--from", f"{runs}/data/{shape}-{count}", "--out", f"{runs}/{shape}-{count}-{seed}{suffix}",
          "--set", f"training.seed={seed}"]
@@ -147,7 +147,7 @@ def trainings(runs: Path, markers: Sequence[str] = MARKERS) -> list[list[str]]:
 
 
 def measured(shape: str, runs: Path) -> dict[str, Any]:
-    """Ask the filter, the shipped network and the adapted ones about the same snapshots."""
+    """Run the filter, the shipped network and the adapted ones on the same snapshots."""
     torch.set_num_threads(1)
     models = ROOT / "data" / "models"
     file = "model.safetensors"
@@ -173,7 +173,7 @@ def _detections(method: Proposer, snapshot: Snapshot) -> Detections:
 
 
 def tables(found: dict[str, Any]) -> str:
-    """Right and wrong of each method, by marker; of several seeds the mean."""
+    """Make a table of right and wrong by marker and method; mean over seeds."""
     measured_names = {name.partition(", seed")[0] for methods in found.values() for name in methods}
     columns = [
         name for name in ("matched filter", "ir-cnn", *(f"{n} frames" for n in FRAMES)) if name in measured_names
@@ -191,10 +191,10 @@ def tables(found: dict[str, Any]) -> str:
 
 
 def main(runs: Path, steps: tuple[str, ...] = ("prepare", "train", "measure", "page"), cores: int = 1) -> None:
-    """Harvest, adapt, measure, write the JSON and the table.
+    """Harvest, adapt, measure, and write the JSON and the table.
 
     Args:
-        runs: folder of data sets and trainings.
+        runs: folder of data sets and training runs.
         steps: prepare, train, measure, page.
         cores: processes at once.
     """

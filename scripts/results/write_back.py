@@ -1,10 +1,10 @@
-"""A recalibrated rig goes back into the user's own file: `python -m scripts.results.write_back`.
+"""Write recalibrated rigs back into the user's own files: `python -m scripts.results.write_back`.
 
-Originals are the real files of IMGCAL_FORMATS, and one written by hand for the formats of which there is none. Each is
-read and its rig drifts. A simulated capture of that is calibrated, and the rig goes back into the file; where the
-cameras see nothing together, the drift itself is taken for the result. The new file is read by imgcal and by readers
-that share nothing with it (`plain_readers.py`), and compared with the original byte by byte. Then originals are damaged
-until 300 of them have been refused. Writes docs/results/write_back.json and the table of docs/formats.md.
+Originals are the real files of IMGCAL_FORMATS, and a handwritten one for each format without a real file. Each is read,
+and its rig drifts. A simulated capture of the drifted rig is calibrated, and the result is written back into the file;
+if the cameras have no common view, the drifted rig itself is the result. The new file is read by imgcal and by
+independent readers (`plain_readers.py`), and compared with the original byte by byte. Then originals are damaged until
+300 of them have been refused. Writes docs/results/write_back.json and the table of docs/formats.md.
 """
 
 from __future__ import annotations
@@ -54,38 +54,38 @@ from tests.imgcal.formats import originals, rigs
 
 RESULT, PAGE = RESULTS / "write_back.json", ROOT / "docs" / "formats.md"
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
-ROUNDING = 1e-3  # px that the digits of a file may cost beside the loss of its lens model
-LIMIT, ALLOWED = 0.05, 0.5  # px that a lens may be off: as imgcal has it, and where a user allows more
+ROUNDING = 1e-3  # px, allowed rounding error of a file besides the loss of its lens model
+LIMIT, ALLOWED = 0.05, 0.5  # px, allowed error of a lens: imgcal's default, and where a user allows more
 CALIBRATED, CALIBRATED_HELD, DRIFTED = "calibration", "calibration, distortion held", "drift"
 DAMAGED = 300
-SNAPSHOTS, NOISE = 40, 0.05  # of the simulated capture; px
+SNAPSHOTS, NOISE = 40, 0.05  # of the simulated capture; noise in px
 ASSUMED_SIZE = {"opencv-stereo": (1280, 720), "easymocap": (1920, 1080), "colmap-rig-config": (2048, 1088)}
 
 
 @dataclass(frozen=True)
 class Original:
-    """A calibration that a user has."""
+    """A user's calibration."""
 
-    name: str  # of its format
+    name: str  # name of its format
     path: Path
-    unit: str | None  # where the file does not say
+    unit: str | None  # if the file does not give it
     is_real: bool
 
     @property
     def files(self) -> list[Path]:
-        """All that belongs to it."""
+        """All files that belong to it."""
         return sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
 
     @property
     def label(self) -> str:
-        """For tables."""
+        """Name it for tables."""
         return self.path.name if self.is_real else "written by hand"
 
 
 def main() -> None:
     """Measure, and rewrite the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--damaged", type=int, default=DAMAGED, help="damaged originals that have to be refused")
+    parser.add_argument("--damaged", type=int, default=DAMAGED, help="number of damaged originals that must be refused")
     given = parser.parse_args()
     result: dict[str, Any] = {**surroundings(), "snapshots": SNAPSHOTS, "noise_px": NOISE, "files": []}
     with tempfile.TemporaryDirectory() as place:
@@ -105,7 +105,7 @@ def main() -> None:
 
 
 def every_original(folder: Path) -> Iterator[Original]:
-    """The real files, and one written by hand for the formats that have none."""
+    """Yield the real files, and a handwritten one for each format without any."""
     found = set()
     for expected in sorted(Path(os.environ["IMGCAL_FORMATS"]).rglob("*.expected.json")):
         path = expected.with_name(expected.name.removesuffix(".expected.json"))
@@ -123,7 +123,7 @@ def every_original(folder: Path) -> Iterator[Original]:
 
 
 def by_hand(name: str) -> bytes:
-    """A file of a format: four cameras that look at one place."""
+    """Write a file of a format by hand: four cameras that look at one point."""
     lens = Lens((1010.5, 1010.5), (641.3, 478.9), (-0.05, 0.02, 1e-4, -2e-4, 0.003))
     rig = rigs.rig_of(*[lens] * 4, names=("0", "1", "2", "3"))
     if name == "vicon":
@@ -132,7 +132,7 @@ def by_hand(name: str) -> bytes:
 
 
 def write_and_compare(one: Original, folder: Path) -> dict[str, Any]:
-    """Drift, calibrate, write back, read again: a row of the table; leaves the recalibrated rig in `rig.yaml`."""
+    """Drift, calibrate, write back and read again: a row of the table. Leaves the recalibrated rig in `rig.yaml`."""
     old = read_foreign_rig(one.path, one.name)
     known = in_millimetres(old, str(one.path), one.unit)
     known = fill_image_sizes(known, str(one.path), sizes_of(one, known))
@@ -164,13 +164,12 @@ def write_and_compare(one: Original, folder: Path) -> dict[str, Any]:
 
 
 def recalibrate_into(one: Original, rig: CameraRig, folder: Path) -> tuple[Updated, str, float]:
-    """Do what a user does until the file's lens model can say the new rig.
+    """Do what a user would until the file's lens model can express the new rig.
 
-    He calibrates and writes back; where the lens is refused, he calibrates with the distortion held, and at last allows
-    a larger loss.
+    Calibrate and write back. If the lens is refused, calibrate with fixed distortion, and finally allow a larger loss.
 
     Returns:
-        The new files, where their rig comes from, and the limit. The rig is in `rig.yaml`.
+        The new files, the origin of their rig, and the limit. The rig is in `rig.yaml`.
     """
     held = replace(rig, prior=replace(rig.prior or RigPrior(), distortion=HELD_DISTORTION))
     refused = ""
@@ -192,21 +191,21 @@ def put_back(one: Original, folder: Path, limit: float) -> Updated:
     """Write `rig.yaml` into the original.
 
     Raises:
-        RefusedError: the lens of the file is off by more than the limit.
+        RefusedError: the file's lens model is wrong by more than the limit.
     """
     ours = from_camera_rig(load_rig(folder / "rig.yaml"))
     return write_into(ours, [one.path], datetime.now(), name=one.name, unit=one.unit, limit=limit)
 
 
 def converted_lenses(rig: ForeignRig) -> ForeignRig:
-    """The rig with lenses that a rig file of ours can say, as `imgcal convert` makes it."""
+    """Convert the lenses to those of imgcal's rig files, as `imgcal convert` does."""
     from imgcal.formats.conversion import NATIVE, fit_to_target
 
     return fit_to_target(rig, NATIVE, "imgcal rig").rig
 
 
 def sizes_of(one: Original, rig: ForeignRig) -> dict[str, tuple[int, int]]:
-    """Image sizes where the file does not have them."""
+    """Image sizes, if the file does not give them."""
     return {"": ASSUMED_SIZE[one.name]} if any(camera.image_size is None for camera in rig.cameras) else {}
 
 
@@ -214,7 +213,7 @@ def recalibrate(rig: CameraRig) -> CameraRig:
     """Let a rig drift, and calibrate a simulated capture of it.
 
     Raises:
-        InputError, RefusedError: the cameras see nothing together that would decide, or are but one.
+        InputError, RefusedError: there is only one camera, or the common views do not determine the rig.
     """
     generator = torch.Generator().manual_seed(0)
     obj = load_object("asymmetric8")
@@ -225,32 +224,32 @@ def recalibrate(rig: CameraRig) -> CameraRig:
 
 
 def drift_of(rig: CameraRig) -> PhysicalDrift:
-    """How far cameras wander: a tenth of a degree, a thousandth of the rig's size and of the focal length."""
+    """Drift of a tenth of a degree, and a thousandth of the rig's size and of the focal length."""
     centres = rig.cam_from_rig.inverse().translation
     size = float((centres - centres.mean(0)).norm(dim=-1).max()) or 1000.0
     return PhysicalDrift(0.1, 1e-3 * size, 1e-3, 0.5, distortion=0.0)
 
 
 def drifted(rig: CameraRig) -> CameraRig:
-    """The rig after such a drift, as if it had been found without an error."""
+    """Rig after such a drift, as if it had been calibrated without error."""
     return drift_of(rig).apply(rig, torch.Generator().manual_seed(0))
 
 
 def again(one: Original, out: Path, ours: ForeignRig) -> ForeignRig:
-    """What imgcal reads from the new file, in millimetres."""
+    """Read the new file with imgcal, in millimetres."""
     back = in_millimetres(read_foreign_rig(out, one.name), str(out), one.unit)
     sizes = {camera.name: camera.image_size for camera in ours.cameras}
     return replace(back, cameras=tuple(replace(camera, image_size=sizes[camera.name]) for camera in back.cameras))
 
 
 def moved(before: ForeignRig, after: ForeignRig) -> float:
-    """How far the images of known points have moved, so that something had to be written: px."""
+    """Largest motion (px) of the images of known points; positive if there was something to write."""
     return worst_difference(before, after)[0]
 
 
 def by_plain_reader(one: Original, out: Path, old: ForeignRig, ours: ForeignRig) -> float:
-    """The worst distance between where an independent reader and the rig project known points: px."""
-    alone = len(old.cameras) == 1  # and has no pose
+    """Largest distance (px) between the projections of known points by an independent reader and by the rig."""
+    alone = len(old.cameras) == 1  # and then has no pose
     placed = ours.in_camera_frame(old.root or 0) if alone or old.root is not None else ours
     scale = 1.0 / millimetres(one.unit or old.unit or "mm")
     projections = READERS[one.name][1](out)
@@ -262,10 +261,10 @@ def by_plain_reader(one: Original, out: Path, old: ForeignRig, ours: ForeignRig)
 
 
 def compare_bytes(one: Original, out: Path) -> int:
-    """Count the numbers that have changed.
+    """Count the changed numbers.
 
     Raises:
-        InputError: something else has.
+        InputError: something else changed.
     """
     count = 0
     for file in one.files:
@@ -283,7 +282,7 @@ def compare_bytes(one: Original, out: Path) -> int:
 
 
 def different_doubles(before: bytes, after: bytes) -> int:
-    """Runs of bytes that differ, each within the eight of a number."""
+    """Count runs of different bytes, each within the eight bytes of a number."""
     places = np.flatnonzero(np.frombuffer(before, np.uint8) != np.frombuffer(after, np.uint8))
     count, end = 0, -1
     for place in places.tolist():
@@ -293,9 +292,9 @@ def different_doubles(before: bytes, after: bytes) -> int:
 
 
 def damage(recalibrated: Sequence[tuple[Original, Path]], enough: int, folder: Path) -> dict[str, Any]:
-    """Damage originals until enough of them are refused, and judge how the command ends.
+    """Damage originals until enough of them are refused, and check how the command ends.
 
-    What is still sound after the damage must be written, and be right.
+    An original that is still valid after the damage must be written correctly.
     """
     counts = {"refused": 0, "lens_refused": 0, "sound_and_right": 0}
     faults: list[str] = []
@@ -328,7 +327,7 @@ def damage(recalibrated: Sequence[tuple[Original, Path]], enough: int, folder: P
 
 
 def wrong(one: Original, folder: Path) -> str:
-    """Tell what is wrong with a file that was written from a damaged original, or nothing."""
+    """Describe the fault of a file that was written from a damaged original; empty if there is none."""
     ours = from_camera_rig(load_rig(folder / "rig.yaml"))
     try:
         back = again(one, folder / "out", ours)
@@ -339,7 +338,7 @@ def wrong(one: Original, folder: Path) -> str:
 
 
 def table(result: dict[str, Any]) -> str:
-    """What was compared, file by file."""
+    """Make the table of comparisons, one row per file."""
     rows = []
     for row in result["files"]:
         loss = f"{row['loss_px']:.1e}" if row["loss_px"] else "exact"
@@ -357,8 +356,8 @@ def table(result: dict[str, Any]) -> str:
             markdown(head, rows),
             "",
             f"Damaged originals: {damaged['tried']} tried, {damaged['refused']} refused with one line and exit code 2, "
-            f"{damaged['sound_and_right']} still sound and written right, {damaged['lens_refused']} refused for the "
-            f"lens (exit code 3), {len(damaged['faults'])} faults. Nothing was written where one was refused.",
+            f"{damaged['sound_and_right']} still valid and written correctly, {damaged['lens_refused']} refused for "
+            f"the lens (exit code 3), {len(damaged['faults'])} faults. Nothing was written for refused ones.",
         )
     )
 

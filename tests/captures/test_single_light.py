@@ -1,4 +1,4 @@
-"""One real light before five cameras of which only rough focal lengths are known: as good as a careful adjustment."""
+"""One real light in front of five cameras with rough focal lengths calibrates as well as careful adjustment."""
 
 from dataclasses import replace
 

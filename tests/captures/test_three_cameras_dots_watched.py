@@ -65,7 +65,7 @@ def test_the_bump_is_told_with_its_camera_time_and_size(stream, score, tmp_path,
         assert moves[-1]["size"] == pytest.approx(TURN_DEG, rel=0.25)
     said = capsys.readouterr().out
     assert "cam2 moved" in said
-    assert "beside its time stamps" not in said  # what stands still says nothing of clocks
+    assert "off its time stamps" not in said  # what stands still says nothing of clocks
     # The rig at the end explains the published dots of all cameras, those of the bumped one from its new place.
     after = replace(points, uv=points.uv + predicted(bumped, points) - predicted(factory, points))
     save_detections(as_detections(after, CAMERAS), tmp_path / "after.csv")

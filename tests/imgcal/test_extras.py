@@ -1,4 +1,4 @@
-"""A slim core: who did not install an extra calibrates, and is told in one line what else would need."""
+"""A core install calibrates, and says in one line which extra other features need."""
 
 import json
 import os

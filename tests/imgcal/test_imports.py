@@ -1,4 +1,4 @@
-"""What is imported when: nobody waits for a library that he does not use."""
+"""Imports: commands do not wait for libraries that they do not use."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The compiled loops by themselves: windows, threads, what is not drawn. Gradients: test_additive_splatting."""
+"""The compiled loops alone: windows, threads, undrawn splats. For gradients, see test_additive_splatting."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Clutter: it is where its truth says, and drapes cut what lies beside them."""
+"""Clutter is where its ground truth says, and drapes cut spots next to them."""
 
 import math
 from dataclasses import replace

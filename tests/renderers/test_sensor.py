@@ -1,4 +1,4 @@
-"""Grey levels: their means, their noise, and what low light means."""
+"""Grey levels: means, noise, and low light."""
 
 import dataclasses
 import math

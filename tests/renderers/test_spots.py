@@ -1,4 +1,4 @@
-"""Rolling rows and crops: what they show against the whole frame."""
+"""Rolling shutters and crops agree with the whole frame."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Cells of benchmarks beside the committed ones: made-up results of two machines."""
+"""Comparison of benchmark cells with committed ones: made-up results of two machines."""
 
 import copy
 import json

@@ -1,4 +1,4 @@
-"""The benchmark of frames to a rig runs, on next to nothing; what OpenCV does there is right."""
+"""The benchmark from frames to a rig runs at a minimal size, and OpenCV's results are correct."""
 
 import json
 from dataclasses import replace

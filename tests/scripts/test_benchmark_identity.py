@@ -1,4 +1,4 @@
-"""The benchmark of identity runs, on next to nothing; the baseline finds what is there."""
+"""The benchmark of identity runs at a minimal size, and the baseline finds the object."""
 
 import json
 

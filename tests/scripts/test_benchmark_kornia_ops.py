@@ -1,4 +1,4 @@
-"""kornia's operations beside ours: the comparison runs, and where both do the same, they agree."""
+"""The comparison with kornia's operations runs, and equivalent operations agree."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The projection benchmark runs, and what it compares agrees on pixels and derivatives."""
+"""The projection benchmark runs, and all tools agree on pixels and derivatives."""
 
 from pathlib import Path
 

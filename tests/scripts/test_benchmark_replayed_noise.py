@@ -1,4 +1,4 @@
-"""Noise that is replayed keeps what the recorded noise has, and the simulated room does what it says."""
+"""Replayed noise keeps the statistics of the recording, and the simulated room behaves as described."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The splatting benchmark runs, and what it compares draws the same images and finds the same gradients."""
+"""The splatting benchmark runs, and all methods draw the same images and find the same gradients."""
 
 from pathlib import Path
 

@@ -61,7 +61,7 @@ def test_a_full_run_takes_less_than_thirty_minutes():
 
 
 def test_unknown_names_are_refused():
-    with pytest.raises(InputError, match="blob: found no such benchmark, expected one of recalibration"):
+    with pytest.raises(InputError, match="blob: not a benchmark, expected one of recalibration"):
         suite.main(["blob"])
 
 

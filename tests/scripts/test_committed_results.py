@@ -1,4 +1,4 @@
-"""The tables on the pages are those that the scripts write from the committed results."""
+"""The tables on the pages show the committed results."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Every numbered example says what it promises; those that speak to other programs are understood by them."""
+"""Every numbered example prints what it promises; other programs understand those that talk to them."""
 
 import os
 import re

@@ -32,7 +32,7 @@ def test_every_row_of_the_paper_has_a_size_for_everybody():
 def test_chunks_train_what_is_not_done(tmp_path, capsys):
     runs = ["--runs", str(tmp_path / "runs")]
     paper.main([*TOY, *runs, "--minutes", "0"])
-    assert capsys.readouterr().err.count("not done: ") == 4 and not (tmp_path / "runs").exists()
+    assert capsys.readouterr().err.count("unfinished: ") == 4 and not (tmp_path / "runs").exists()
     paper.main([*TOY, *runs])
     assert "not done" not in capsys.readouterr().err
     folders = sorted(folder.name for folder in (tmp_path / "runs").iterdir())

@@ -1,4 +1,4 @@
-"""The tests that a short run leaves out are chosen by what they took, and the list names tests that exist."""
+"""Slow tests are chosen by their durations, and the list names existing tests."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The two short pages say what the committed results say."""
+"""The two short pages agree with the committed results."""
 
 import pytest
 

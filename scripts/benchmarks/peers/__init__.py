@@ -1,1 +1,1 @@
-"""Adapters to the peers: arrays in, arrays out."""
+"""Adapters for the peers: arrays in, arrays out."""

@@ -1,6 +1,6 @@
 """Blob finders of other projects: a frame (H, W) uint8 in, centres (K, 2) px out.
 
-Each is set as its users would set it for bright discs whose radius and contrast are known; imgcal is told neither.
+Each is configured as its users would for bright discs of known radius and contrast; imgcal is given neither.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ Centres = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Known:
-    """What a finder is told of the discs."""
+    """Properties of the discs that a finder is given."""
 
     radius: float  # px
     contrast: float  # grey levels above the background, clipped
     noise: float  # grey levels
-    background: float  # grey level, of most of the frame
+    background: float  # grey level of most of the frame
 
     @property
     def sigma(self) -> float:
-        """Standard deviation (px) of the Gaussian of equal moments, of a disc blurred by 0.75 px."""
+        """Standard deviation (px) of the Gaussian with the moments of a disc that is blurred by 0.75 px."""
         return float(np.hypot(self.radius / 2, 0.75))
 
     @property
     def half(self) -> int:
-        """Half size (px) of a cutout that holds the disc, its blurred edge and little else."""
+        """Half size (px) of a cutout that contains the disc, its blurred edge and little else."""
         return int(np.ceil(self.radius + 2.5))
 
 
@@ -47,13 +47,13 @@ Finder = Callable[[Frame, Known], Centres]
 
 
 def imgcal(frame: Frame, known: Known) -> Centres:
-    """Imgcal with its defaults, without the blobs that it flags as unusable."""
+    """imgcal with its defaults, without the blobs that it flags as unusable."""
     blobs = detect_frame(frame, DetectionOptions())
     return blobs.uv[(blobs.flags & int(UNUSABLE)) == 0]
 
 
 def threshold_centroid(frame: Frame, known: Known) -> Centres:
-    """Centres of the components above half of the contrast, all pixels counting the same."""
+    """Centres of the components above half of the contrast, with equal weight for all pixels."""
     level = known.background + known.contrast / 2
     _, _, stats, centres = cv2.connectedComponentsWithStats((frame > level).astype(np.uint8))
     area = stats[1:, cv2.CC_STAT_AREA]
@@ -63,7 +63,7 @@ def threshold_centroid(frame: Frame, known: Known) -> Centres:
 
 
 def simple_blob_detector(frame: Frame, known: Known) -> Centres:
-    """cv2.SimpleBlobDetector: contours at 16 thresholds, their centres averaged; selected by area and inertia."""
+    """cv2.SimpleBlobDetector: averages centres of contours at 16 thresholds; selects by area and inertia."""
     parameters = cv2.SimpleBlobDetector.Params()
     parameters.blobColor = 255
     step = known.contrast / 20
@@ -103,7 +103,7 @@ def star_finder(frame: Frame, known: Known, name: str) -> Centres:
         0.3 * known.contrast, fwhm, min_separation=2 * known.radius, sharpness_range=None, roundness_range=roundness
     )
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # sources that do not pass
+        warnings.simplefilter("ignore")  # rejected sources
         found = find(_without_median(frame))
     if found is None:
         return np.zeros((0, 2))
@@ -121,18 +121,18 @@ def star_centroid(frame: Frame, known: Known, name: str) -> Centres:
     given: dict[str, Any] = {"footprint": disc} if name == "centroid_com" else {"box_size": len(offsets)}
     source = partial(centroids.centroid_sources, footprint=disc, centroid_func=centroids.centroid_com)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # fits that fail are NaN
+        warnings.simplefilter("ignore")  # failed fits are NaN
         for _ in range(2):
             start = np.stack(source(data, *start[_inside(start, frame)].T), 1)
         start = start[_inside(start, frame)]
-        if name == "centroid_quadratic":  # of a flat top only once it is smoothed
+        if name == "centroid_quadratic":  # works on a flat top only after smoothing
             data = np.asarray(cv2.GaussianBlur(data, (0, 0), known.sigma), np.float64)
         found = np.stack(centroids.centroid_sources(data, *start.T, centroid_func=getattr(centroids, name), **given), 1)
     return found[np.isfinite(found).all(1)]
 
 
 def trackpy_locate(frame: Frame, known: Known, bandpass: bool = True) -> Centres:
-    """trackpy.locate, which moves a round mask until the centroid is in its middle.
+    """trackpy.locate, which moves a round mask until it is centred on the centroid.
 
     Without its bandpass filter, the median is subtracted instead.
     """
@@ -141,7 +141,7 @@ def trackpy_locate(frame: Frame, known: Known, bandpass: bool = True) -> Centres
 
 
 def trackpy_fit(frame: Frame, known: Known) -> Centres:
-    """trackpy.refine_leastsq: Gaussians fitted to what trackpy.locate has found."""
+    """trackpy.refine_leastsq: Gaussians fitted to the features of trackpy.locate."""
     trackpy, found = _module("trackpy"), _locate(frame, known, True, characterize=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -169,7 +169,7 @@ SLOW = ("trackpy.refine_leastsq",)  # seconds for a hundred blobs
 
 
 def present(name: str) -> bool:
-    """Tell whether what a finder needs is installed."""
+    """Tell whether the packages of a finder are installed."""
     package = name.split()[0].split(".")[0]
     return package in ("imgcal", "cv2", "threshold") or peer(package) is not None
 
@@ -188,14 +188,14 @@ def _without_median(frame: Frame) -> NDArray[np.float64]:
 
 
 def _inside(centres: Centres, frame: Frame) -> NDArray[np.bool_]:
-    """Which centres lie in the frame: photutils refuses others."""
+    """Tell which centres lie in the frame; photutils rejects others."""
     height, width = frame.shape
     inside = (centres > 0) & (centres < (width - 1, height - 1))
     return np.asarray(inside.all(1))
 
 
 def _diameter(known: Known) -> int:
-    """Odd diameter (px) of trackpy's mask: the disc and its blurred edge; what is best for it with radii 1.5 to 10."""
+    """Odd diameter (px) of trackpy's mask: the disc and its blurred edge; the best choice for radii from 1.5 to 10."""
     return 2 * int(np.ceil(known.radius + 3)) + 1
 
 

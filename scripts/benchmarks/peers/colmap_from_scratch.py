@@ -1,4 +1,4 @@
-"""COLMAP's incremental mapping: every fiducial of every snapshot is a point of one still scene, seen once a camera."""
+"""COLMAP's incremental mapping: every fiducial of every snapshot is a point of one static scene."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from scripts.benchmarks.peer import peer
 from scripts.benchmarks.peers.rig_task import Array, RigAnswer
 
 Rows = NDArray[np.int64]
-CENTRE = 0.5  # px, of the top-left pixel
+CENTRE = 0.5  # px, COLMAP's coordinate of the top-left pixel's centre
 
 
 def solve(uv: Array, seen: Array, points: Array, focal: Array, image_size: Array) -> RigAnswer:
-    """Calibrate from scratch; the object gives the scale in the end, and nothing else.
+    """Calibrate from scratch; the object is only used at the end, for the scale.
 
     Args:
         uv: (S, C, N, 2) pixels.
@@ -29,7 +29,7 @@ def solve(uv: Array, seen: Array, points: Array, focal: Array, image_size: Array
         image_size: (C, 2) pixels.
 
     Raises:
-        ValueError: it places fewer than all cameras.
+        ValueError: not all cameras were registered.
     """
     pycolmap = peer("pycolmap")
     assert pycolmap is not None
@@ -55,7 +55,7 @@ def solve(uv: Array, seen: Array, points: Array, focal: Array, image_size: Array
 
 
 def _database(pycolmap: Any, path: Path, uv: Array, seen: Array, focal: Array, image_size: Array) -> list[Rows]:
-    """Write keypoints and matches; returns which point each keypoint of each camera is of."""
+    """Write keypoints and matches; return the point of each keypoint of each camera."""
     cameras = seen.shape[1]
     flat_seen, flat_uv = seen.swapaxes(1, 2).reshape(-1, cameras), uv.swapaxes(1, 2).reshape(-1, cameras, 2)
     index = [np.flatnonzero(flat_seen[:, c]) for c in range(cameras)]
@@ -85,14 +85,14 @@ def _database(pycolmap: Any, path: Path, uv: Array, seen: Array, focal: Array, i
                 continue
             database.write_matches(a + 1, b + 1, matches)
             options = pycolmap.TwoViewGeometryOptions()
-            options.ransac.max_error = 20.0  # px: the lenses are not known
+            options.ransac.max_error = 20.0  # px, since the lenses are unknown
             geometry = pycolmap.estimate_calibrated_two_view_geometry(*known[a], *known[b], matches, options)
             database.write_two_view_geometry(a + 1, b + 1, geometry)
     return index
 
 
 def _answer(scene: Any, index: list[Rows], seen: Array, points: Array, seconds: float) -> RigAnswer:
-    """Scale the scene so that the object has its size."""
+    """Scale the scene to the size of the object."""
     snapshots, cameras, fiducials = seen.shape
     place = np.full((snapshots * fiducials, 3), np.nan)
     for point in scene.points3D.values():

@@ -1,7 +1,7 @@
-"""pycolmap's bundle adjustment of a rig with constant points; with Gaussian priors of pyceres if asked for.
+"""pycolmap's bundle adjustment of a rig with constant points, optionally with Gaussian priors by pyceres.
 
-Both minimize by Ceres with COLMAP's analytic costs, one thread. Camera model FULL_OPENCV, of which k4, k5, k6 stay
-zero: the same five distortion coefficients as everybody's.
+Both minimize with Ceres and COLMAP's analytic costs on one thread. In the camera model FULL_OPENCV, k4, k5 and k6 stay
+zero, which leaves the same five distortion coefficients as in the other methods.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from scripts.benchmarks.peer import peer
 from scripts.benchmarks.peers.rig_task import Array, RigAnswer, RigTask
 
-AXIS = 1_000_000  # id of a sensor without images: the rig's own frame, in which a prior holds for every camera
+AXIS = 1_000_000  # id of a sensor without images that defines the rig's frame, so that every camera can have a prior
 DISTORTION = [4, 5, 6, 7, 8]
 RATIONAL = [9, 10, 11]
 
@@ -23,9 +23,9 @@ def solve(task: RigTask, *, prior: bool, distortion: bool = True) -> RigAnswer:
     """Adjust the rig.
 
     Args:
-        task: what is given.
-        prior: pull every factory value by its spread, as imgcal does (needs pyceres); False leaves all of them free,
-            the frame of the rig is that of its first camera.
+        task: the rig's task.
+        prior: add a Gaussian prior on every factory value, as imgcal does (needs pyceres); False leaves all values
+            free, in the frame of the first camera.
         distortion: whether to adjust it.
     """
     pycolmap, pyceres = peer("pycolmap"), peer("pyceres")
@@ -34,7 +34,7 @@ def solve(task: RigTask, *, prior: bool, distortion: bool = True) -> RigAnswer:
     config, options = _settings(pycolmap, scene)
     begin = time.perf_counter()
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, scene)
-    problem = adjuster.problem  # to be held: what is added below lives as long as this
+    problem = adjuster.problem  # keep a reference: what is added below lives only as long as this
     fixed = RATIONAL if distortion else [*DISTORTION, *RATIONAL]
     for camera in range(len(task.uv[0])):
         problem.set_manifold(scene.cameras[camera + 1].params, pyceres.SubsetManifold(12, fixed))
@@ -109,12 +109,12 @@ def _settings(pycolmap: Any, scene: Any) -> tuple[Any, Any]:
     options.print_summary = False
     solver = options.ceres.solver_options
     solver.num_threads = 1
-    solver.function_tolerance = 1e-6  # Ceres' own default; COLMAP's zero would go on to 100 iterations
+    solver.function_tolerance = 1e-6  # Ceres' own default; with COLMAP's zero it would run all 100 iterations
     return config, options
 
 
 def _add_prior(problem: Any, scene: Any, task: RigTask) -> None:
-    """Add a Gaussian for every value, in pixels: COLMAP's residuals are not divided by sigma."""
+    """Add a Gaussian prior for every value, scaled to pixels, since COLMAP's residuals are not divided by sigma."""
     pyceres: Any = peer("pyceres")
     costs: Any = peer("pycolmap.cost_functions")
     pycolmap: Any = peer("pycolmap")
@@ -127,7 +127,7 @@ def _add_prior(problem: Any, scene: Any, task: RigTask) -> None:
         factory = _rigid(pycolmap, task.rotation[c], task.translation[c])
         cost = costs.AbsolutePosePriorCost(np.diag(variance[:6]), factory)
         problem.add_residual_block(cost, None, [cam_from_rig])
-        problem.set_parameter_block_variable(cam_from_rig)  # COLMAP holds it, for want of images of the rig's own frame
+        problem.set_parameter_block_variable(cam_from_rig)  # COLMAP fixes it, because the rig's frame has no images
 
 
 def _answer(scene: Any, cameras: int, seconds: float) -> RigAnswer:

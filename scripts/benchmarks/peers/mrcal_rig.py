@@ -1,7 +1,7 @@
-"""mrcal, in a process of Debian's Python that waits for tasks, so that it can be timed in turn with the others.
+"""mrcal, in a process with Debian's Python that waits for tasks, so that it can be timed in turn with the others.
 
-mrcal knows fixed points, but no rig that moves as a whole: each camera has a pose of its own in each snapshot, shared
-are the intrinsics. With one snapshot that is the same problem; with more, the extrinsics are averaged afterwards.
+mrcal supports fixed points, but not a moving rig: each camera has a separate pose in each snapshot, and only the
+intrinsics are shared. With one snapshot this is the same problem; with more, the extrinsics are averaged afterwards.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ WORKER = Path(__file__).with_name("mrcal_worker.py")
 
 
 class Mrcal:
-    """Tasks of one size, solved on demand; answers can be read once the block has ended."""
+    """Tasks of one size, solved on demand; answers can be read after the `with` block."""
 
     def __init__(self, tasks: Sequence[RigTask], folder: Path, *, distortion: bool = True) -> None:
         self._path = folder / "answers.npz"
@@ -48,7 +48,7 @@ class Mrcal:
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def solve(self, index: int) -> float:
-        """Solve one task; returns the seconds that mrcal took."""
+        """Solve one task; return the seconds that mrcal took."""
         assert self._process.stdin is not None and self._process.stdout is not None
         print(index, file=self._process.stdin, flush=True)
         self._seconds[index] = float(self._process.stdout.readline())
@@ -66,7 +66,7 @@ class Mrcal:
                 self._found = (found["intrinsics"], found["extrinsics"])
 
     def answers(self) -> list[RigAnswer]:
-        """One for each task; the factory values where a task was not solved."""
+        """Return one answer for each task; the factory values for unsolved tasks."""
         answers = []
         for index, (lens, poses) in enumerate(zip(*self._found, strict=True)):
             rig = mean_extrinsics(rotation_matrices(poses[..., :3]), 1000 * poses[..., 3:])

@@ -1,8 +1,8 @@
-"""Runs mrcal, by Debian's Python, without imgcal: tasks from an npz; one index a line in, seconds out; then an npz.
+"""Run mrcal with Debian's Python, without imgcal: reads tasks from an npz, then an index per line; writes seconds.
 
     /usr/bin/python3 mrcal_worker.py TASKS.npz ANSWERS.npz
 
-Convention: millimetres become metres, in which mrcal's scales are meant.
+The answers go into another npz. Convention: millimetres become metres, the unit that mrcal's scales assume.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 
 def stated(tasks: dict[str, Any], index: int) -> dict[str, Any]:
-    """Arguments of mrcal.optimize: the object is the world, each camera of each snapshot has a pose of its own."""
+    """Arguments of mrcal.optimize: the object is the world, and each camera in each snapshot has a separate pose."""
     uv = tasks["uv"][index]
     snapshots, cameras, fiducials, _ = uv.shape
     place, camera, fiducial = (
@@ -46,7 +46,7 @@ def stated(tasks: dict[str, Any], index: int) -> dict[str, Any]:
 
 
 def main(given: str, answers: str) -> None:
-    """Solve what is asked for, keep the last answer of each task."""
+    """Solve requested tasks, and write the last answer of each."""
     tasks = dict(np.load(given))
     intrinsics, extrinsics = tasks["intrinsics"].copy(), tasks["extrinsics"].copy()
     for line in sys.stdin:

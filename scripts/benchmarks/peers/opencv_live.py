@@ -1,6 +1,6 @@
-"""Frames to a rig as one writes it with OpenCV: blobs, labels by the nearest projection, PnP, calibrateCamera.
+"""From frames to a rig, as commonly written with OpenCV: blobs, labels by the nearest projection, PnP, calibrateCamera.
 
-Cameras are worked on one by one. For intrinsics that one view cannot give, they keep what they had before.
+Cameras are processed one by one. Intrinsics that one view cannot determine keep their previous values.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from numpy.typing import NDArray
 from scripts.benchmarks.peers.rig_task import Array, RigAnswer, rotation_matrices
 
 LENS = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_TANGENT_DIST
-FLAGS = cv2.CALIB_USE_INTRINSIC_GUESS | LENS  # eight points of one view do not give the lens too
-NEAR = 10.0  # px, of a blob from its fiducial's projection
-LARGEST = 1.0  # px, of a labelled blob from its fiducial's projection by the last intrinsics
-LEAST = 6  # labelled blobs of a camera that is calibrated
+FLAGS = cv2.CALIB_USE_INTRINSIC_GUESS | LENS  # eight points in one view do not determine the lens
+NEAR = 10.0  # px, largest distance of a blob from its fiducial's projection
+LARGEST = 1.0  # px, the same for a labelled blob, with the last intrinsics
+LEAST = 6  # least number of labelled blobs to calibrate a camera
 
-Seen = tuple[NDArray[np.int64], Array]  # fiducials (K,), places (K, 2)
+Seen = tuple[NDArray[np.int64], Array]  # fiducials (K,), positions (K, 2)
 
 
 @dataclass(frozen=True)
 class View:
-    """What is known of one camera: intrinsics, and where it was when the snapshot before was taken."""
+    """Current intrinsics of one camera, and its pose in the previous snapshot."""
 
     matrix: Array  # (3, 3)
     distortion: Array  # (5,)
@@ -40,10 +40,10 @@ class View:
 
 
 def detector(radius: tuple[float, float], thresholds: int) -> Any:
-    """Tuned for bright markers of a radius between these (px), of some 180 grey levels over a dark ground.
+    """Make a detector for bright markers with radii in this range (px), about 180 grey levels above a dark background.
 
-    A blob's centre is the mean over the thresholds at which it was found: more are more exact and slower. One is enough
-    to find them.
+    A blob's centre is the mean over the thresholds at which it was found: more thresholds are more accurate and slower.
+    One is enough to find the blobs.
     """
     settings = cv2.SimpleBlobDetector.Params()
     settings.minThreshold, settings.maxThreshold, settings.thresholdStep = 100, 101, 10
@@ -63,17 +63,17 @@ def detector(radius: tuple[float, float], thresholds: int) -> Any:
 def update(
     frames: Sequence[NDArray[np.uint8]], points: Array, views: Sequence[View], finder: Any, pool: Executor
 ) -> tuple[list[View], list[Seen]]:
-    """Calibrate every camera from its frame of this moment.
+    """Calibrate every camera from its current frame.
 
     Args:
         frames: of each camera.
         points: (N, 3) object.
-        views: from the snapshot before.
+        views: from the previous snapshot.
         finder: from `detector`.
-        pool: threads, which take a camera each.
+        pool: threads, one per camera.
 
     Returns:
-        The cameras, and the fiducials (K,) and places (K, 2) of the blobs of each that fit.
+        The cameras, and for each the fiducials (K,) and positions (K, 2) of the blobs that fit.
     """
     size = (frames[0].shape[1], frames[0].shape[0])
 
@@ -86,7 +86,7 @@ def update(
 
 
 def labelled(uv: Array, points: Array, view: View) -> Seen:
-    """Give each blob (M, 2) the fiducial whose projection is nearest, where that is mutual."""
+    """Label each blob (M, 2) with the nearest projected fiducial, if both are mutually nearest."""
     if len(uv) == 0:
         return np.empty(0, dtype=np.int64), uv
     distance = np.linalg.norm(uv[:, None] - view.project(points), axis=-1)
@@ -96,7 +96,7 @@ def labelled(uv: Array, points: Array, view: View) -> Seen:
 
 
 def without_outliers(labels: NDArray[np.int64], uv: Array, points: Array, view: View) -> Seen:
-    """Keep the labels that fit the last intrinsics, by solvePnPRansac; all of them where too few do."""
+    """Keep the labels that fit the last intrinsics, by solvePnPRansac; keep all if too few fit."""
     if len(labels) < LEAST:
         return labels, uv
     pose = (view.rotation[:, None].copy(), view.translation[:, None].copy())
@@ -108,7 +108,7 @@ def without_outliers(labels: NDArray[np.int64], uv: Array, points: Array, view: 
 
 
 def calibrated(labels: NDArray[np.int64], uv: Array, points: Array, view: View, size: tuple[int, int]) -> View:
-    """Find the pose by solvePnP, from the last one, then pose, focal length and principal point together."""
+    """Fit the pose by solvePnP, starting from the last one, then pose, focal length and principal point together."""
     if len(labels) < LEAST:
         return view
     shown = points[labels]
@@ -116,14 +116,14 @@ def calibrated(labels: NDArray[np.int64], uv: Array, points: Array, view: View, 
         shown, uv, view.matrix, view.distortion, view.rotation[:, None].copy(), view.translation[:, None].copy(), True
     )
     view = replace(view, rotation=np.asarray(vector[:, 0], float), translation=np.asarray(shift[:, 0], float))
-    calibrate: Any = cv2.calibrateCamera  # its stubs know half of what it takes
+    calibrate: Any = cv2.calibrateCamera  # its stubs lack half of its arguments
     given = ([shown.astype(np.float32)], [uv.astype(np.float32)], size)
     _, matrix, distortion, vectors, shifts = calibrate(*given, view.matrix.copy(), view.distortion.copy(), flags=FLAGS)
     return View(matrix, np.ravel(distortion)[:5], np.ravel(vectors[0]), np.ravel(shifts[0]))
 
 
 def answer(views: Sequence[View]) -> RigAnswer:
-    """Express the cameras in the object's frame: as if that were the rig's."""
+    """Express the cameras in the object's frame, as if it were the rig's."""
     rotation = rotation_matrices(np.array([view.rotation for view in views]))
     return RigAnswer(
         np.array([view.matrix[[0, 1], [0, 1]] for view in views]),

@@ -1,4 +1,4 @@
-"""OpenCV 5's `calibrateMultiview` of cameras of which only rough focal lengths are known."""
+"""OpenCV 5's `calibrateMultiview`, for cameras with approximately known focal lengths."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from scripts.benchmarks.peers.rig_task import Array, RigAnswer
 
-VIEWS = 50  # of a camera, for its lens by itself
-METRES = 1e-3  # it takes objects of hundreds of units for points on one line
+VIEWS = 50  # views per camera to calibrate its lens alone
+METRES = 1e-3  # OpenCV treats objects of hundreds of units as collinear
 
 
 def solve(uv: Array, seen: Array, points: Array, focal: Array, image_size: Array) -> RigAnswer:
@@ -18,16 +18,16 @@ def solve(uv: Array, seen: Array, points: Array, focal: Array, image_size: Array
 
     Args:
         uv: (S, C, N, 2) pixels.
-        seen: (S, C, N); a camera takes part in a snapshot where it sees all of the object.
+        seen: (S, C, N); a camera is used in a snapshot only if it sees the whole object.
         points: (N, 3) mm.
         focal: (C, 2) pixels, rough.
         image_size: (C, 2) pixels.
 
     Raises:
-        cv2.error: it gives up.
+        cv2.error: OpenCV gives up.
     """
     spread = np.linalg.norm(np.cross(points - points[0], points[-1] - points[0]), axis=1)
-    order = [0, len(points) - 1, int(spread.argmax())]  # the first three must not be on one line
+    order = [0, len(points) - 1, int(spread.argmax())]  # the first three must not be collinear
     order += [n for n in range(len(points)) if n not in order]
     uv, seen, points = uv[:, :, order], seen[:, :, order], points[order]
     cameras = seen.shape[1]
@@ -40,7 +40,7 @@ def solve(uv: Array, seen: Array, points: Array, focal: Array, image_size: Array
     begin = time.perf_counter()
     flat = (points * METRES).astype(np.float32)
     known = []
-    for c in range(cameras):  # it takes solid objects only where the lenses are known, roughly
+    for c in range(cameras):  # solid objects require approximately known lenses
         rows = np.flatnonzero(whole[:, c])
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, VIEWS).astype(int))]
         images, size = [uv[s, c].astype(np.float32) for s in rows], tuple(int(v) for v in image_size[c])

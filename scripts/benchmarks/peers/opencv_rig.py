@@ -1,4 +1,4 @@
-"""OpenCV's calibrateCamera for each camera by itself, from its factory intrinsics; then the mean of the extrinsics."""
+"""OpenCV's calibrateCamera for each camera alone, from its factory intrinsics; then the mean of the extrinsics."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ HELD = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_TA
 
 
 def solve(task: RigTask, *, distortion: bool = True) -> RigAnswer:
-    """Calibrate; OpenCV finds its start poses by itself and knows neither a rig nor a prior."""
+    """Calibrate; OpenCV finds its own start poses, and supports neither a rig nor a prior."""
     snapshots, cameras = task.uv.shape[:2]
-    calibrate: Any = cv2.calibrateCamera  # its stubs know half of what it takes
+    calibrate: Any = cv2.calibrateCamera  # its stubs lack half of its arguments
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | (0 if distortion else HELD)
     shown = [task.points.astype(np.float32)] * snapshots
     seen = [[task.uv[s, c].astype(np.float32) for s in range(snapshots)] for c in range(cameras)]

@@ -1,6 +1,6 @@
-"""What people write who need to know which blob is which fiducial: P3P in each camera, Hungarian assignment, a gate.
+"""A typical self-written data association: P3P in each camera, Hungarian assignment, a gate.
 
-P3P is PoseLib's, the assignment SciPy's, lens and fit of a pose OpenCV's. Intrinsics are the factory's.
+P3P comes from PoseLib, the assignment from SciPy, lens and pose fit from OpenCV. Intrinsics are the factory values.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ CONFIDENCE = 0.99
 
 @dataclass(frozen=True)
 class Settings:
-    """Tuned on snapshots that take no part in the benchmark, 5 % off, 6 visible and 2 false blobs a camera."""
+    """Tuned on other snapshots than the benchmark's: 5 % factory error, 6 visible and 2 false blobs per camera."""
 
-    coarse: float = 20.0  # px, while poses from three points are ranked
-    gate: float = 8.0  # px, after the pose has been fitted to all its blobs
-    least: int = 5  # blobs that a camera's answer must explain
+    coarse: float = 20.0  # px, to rank poses from three points
+    gate: float = 8.0  # px, after the pose is fitted to all its blobs
+    least: int = 5  # blobs that a camera's pose must explain
     most_triples: int = 60  # of blobs
-    polished: int = 3  # poses of each, that are fitted
-    kept: int = 5  # answers of a camera that the rig chooses from
-    near_deg: float = 15.0  # between poses that two cameras agree on
+    polished: int = 3  # best poses per camera that are fitted
+    kept: int = 5  # poses per camera that take part in the vote
+    near_deg: float = 15.0  # degrees between poses on which two cameras agree
     near_mm: float = 80.0
-    known_gate: float = 90.0  # px, to the projection of a known pose by the factory rig
+    known_gate: float = 90.0  # px, to the projection with a known pose and the factory rig
 
 
 @dataclass(frozen=True)
@@ -63,10 +63,10 @@ class Answer:
 def one_camera(
     uv: Array, points: Array, camera: Pinhole, generator: np.random.Generator, settings: Settings = Settings()
 ) -> list[Answer]:
-    """Find poses of the object from the blobs (M, 2) of one camera, those that explain most first.
+    """Find poses of the object from the blobs (M, 2) of one camera, sorted by the number of explained blobs.
 
-    Random triples of blobs against all triples of fiducials (N, 3), until a triple of fiducials has been among them
-    with a probability of 99 %, judged by the best answer so far, as RANSAC does.
+    Tries random triples of blobs with all triples of fiducials (N, 3) until, as in RANSAC, a triple of true markers has
+    been drawn with a probability of 99 % according to the best pose so far.
     """
     xy, focal = _ideal(uv, camera), float(camera.matrix[[0, 1], [0, 1]].mean())
     fiducials = list(points[list(permutations(range(len(points)), 3))])
@@ -92,7 +92,7 @@ def one_camera(
 
 
 def each_camera(answers: list[list[Answer]], blobs: list[int], settings: Settings = Settings()) -> list[Labels]:
-    """Take each camera's best answer, where it explains enough."""
+    """Take each camera's best pose if it explains enough blobs."""
     return [
         found[0].labels if found and found[0].inliers >= settings.least else np.full(count, -1)
         for found, count in zip(answers, blobs, strict=True)
@@ -106,18 +106,18 @@ def by_vote(
     symmetries: list[tuple[Array, Labels]],
     settings: Settings = Settings(),
 ) -> list[Labels]:
-    """Take the pose that most blobs of all cameras agree on, and of each camera the answer that is near to it.
+    """Take the pose that the most blobs of all cameras agree on, and for each camera its nearest pose.
 
     Args:
-        answers: of each camera.
-        blobs: number of blobs of each camera.
+        answers: poses of each camera.
+        blobs: number of blobs in each camera.
         cameras: the factory rig.
         symmetries: rotations (3, 3) about the origin of the object that map it onto itself, and where each fiducial
             goes (N,); at least the identity.
-        settings: what counts as near.
+        settings: thresholds.
 
     Returns:
-        Labels of each camera's blobs; none at all unless half of the cameras agree.
+        Labels of each camera's blobs; no labels unless half of the cameras agree.
     """
     none = [np.full(count, -1) for count in blobs]
     every = [(c, answer) for c, found in enumerate(answers) for answer in found]
@@ -139,7 +139,7 @@ def by_vote(
     for c in range(len(cameras)):
         chosen = [j for j in np.flatnonzero(near[winner]) if owner[j] == c]
         if chosen:  # answers are in order
-            # The winner turns the object first: what looked like a fiducial is the one that is turned onto it.
+            # The winning symmetry rotates the object first, so map each label to the fiducial that is rotated onto it.
             renamed = np.append(np.argsort(symmetries[best[winner, chosen[0]]][1]), -1)
             none[c] = renamed[every[chosen[0]][1].labels]
     return none
@@ -161,7 +161,7 @@ def _ideal(uv: Array, camera: Pinhole) -> Array:
 
 
 def _p3p(xy: Array, fiducials: list[Array]) -> tuple[Array, Array]:
-    """Find all poses (K, 3, 3), (K, 3) of triples of fiducials (3, 3) that look like three blobs (3, 2)."""
+    """Find all poses (K, 3, 3), (K, 3) that project triples of fiducials (3, 3) to three blobs (3, 2)."""
     solver: Any = peer("poselib")
     rays = np.c_[xy, np.ones(3)]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -171,7 +171,7 @@ def _p3p(xy: Array, fiducials: list[Array]) -> tuple[Array, Array]:
 
 
 def _explained(xy: Array, points: Array, rotation: Array, translation: Array, reach: float) -> Array:
-    """Sum over fiducials of their nearness to a blob, at depth 1, of K poses: (K,)."""
+    """Score K poses by the sum over fiducials of their proximity to a blob at depth 1: (K,)."""
     x, y, z = ((rotation[:, i] @ points.T + translation[:, i, None]).astype(np.float32) for i in range(3))
     z = np.where(z > 0, z, np.float32(1e-9))
     x, y = x / z, y / z
@@ -182,7 +182,7 @@ def _explained(xy: Array, points: Array, rotation: Array, translation: Array, re
 
 
 def _assigned(distance: Array, gate: float) -> Labels:
-    """Assign fiducials to blobs (N, M) by the Hungarian method; beyond the gate nothing is."""
+    """Assign fiducials to blobs (N, M) by the Hungarian method, within the gate."""
     cost = np.minimum(distance, gate) ** 2
     fiducial, blob = linear_sum_assignment(cost)
     labels = np.full(distance.shape[1], -1)
@@ -192,7 +192,7 @@ def _assigned(distance: Array, gate: float) -> Labels:
 
 
 def _polished(uv: Array, points: Array, camera: Pinhole, labels: Labels, settings: Settings) -> Answer | None:
-    """Fit the pose to all labelled blobs, and assign again, twice."""
+    """Fit the pose to all labelled blobs and assign again, twice."""
     rotation = translation = None
     for _ in range(2):
         named = np.flatnonzero(labels >= 0)

@@ -1,7 +1,7 @@
-"""Projection with Brown-Conrady distortion by other tools: cameras and points in, pixels out, all in float64.
+"""Projection with Brown-Conrady distortion by other tools: cameras and points in, pixels out, in float64.
 
-Every function prepares what its users would keep (camera objects, matrices, rotation vectors), and returns what is to
-be timed.
+Every function prepares what users would reuse (camera objects, matrices, rotation vectors), and returns a function to
+time.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Run = Callable[[], Any]
 
 @dataclass(frozen=True)
 class Views:
-    """Points before cameras."""
+    """Points in front of cameras."""
 
     points: Array  # (B, N, 3) mm
     rotation: Array  # (B, C, 3, 3)
@@ -46,7 +46,7 @@ class Views:
 
 
 def numpy_arrays(views: Views) -> Run:
-    """Plain NumPy over all rigs and cameras at once, components apart."""
+    """Plain NumPy over all rigs and cameras at once, with separate components."""
     k1, k2, p1, p2, k3 = np.moveaxis(views.distortion[..., None], 2, 0)  # (B, C, 1)
     (fx, fy), (cx, cy) = (np.moveaxis(x[..., None], 2, 0) for x in (views.focal_length, views.principal_point))
 
@@ -79,9 +79,9 @@ def opencv(views: Views) -> Run:
 
 
 def opencv_jacobian(views: Views, upstream: Array) -> Run:
-    """The same with its Jacobian by rotation, translation, focal length, principal point, distortion.
+    """The same with its Jacobian with respect to rotation, translation, focal length, principal point, distortion.
 
-    What is timed returns upstream (B, C, N, 2) times the Jacobians: (B * C, 15).
+    The timed function returns upstream (B, C, N, 2) times the Jacobians: (B * C, 15).
     """
     given = _opencv_cameras(views)
     pulls = upstream.reshape(len(given), -1)
@@ -128,7 +128,7 @@ def kornia_camera(views: Views) -> Run:
 
 
 def kornia_gradient(views: Views, upstream: Array) -> Run:
-    """The same, and gradients of the pixels times `upstream` by camera matrices, extrinsics, distortion, points."""
+    """The same, and gradients of pixels times `upstream` for camera matrices, extrinsics, distortion and points."""
     cameras, points, _, distortion = _kornia_inputs(views)
     leaves = [x.clone().requires_grad_() for x in (cameras.intrinsics, cameras.extrinsics, distortion, points)]
     pull = torch.from_numpy(upstream).flatten(0, 1)

@@ -1,4 +1,4 @@
-"""What every peer that recalibrates a rig is given, and what it answers: plain arrays, mm and pixels."""
+"""Input and output of every peer that recalibrates a rig: plain arrays, mm and pixels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RigTask:
-    """Labelled observations of a known object, a factory calibration, and the poses that everybody starts from."""
+    """Labelled observations of a known object, a factory calibration, and start poses."""
 
     points: Array  # (N, 3) object, about its own origin
     uv: Array  # (S, C, N, 2)
@@ -29,19 +29,19 @@ class RigTask:
         Array  # (C, 15) standard deviation of the factory values, in the order of imgcal.types.rig.PARAMETER_NAMES
     )
     image_size: tuple[int, int]  # width, height
-    seen: NDArray[np.bool_] | None = None  # (S, C, N), None = all; only scipy_rig looks at it
+    seen: NDArray[np.bool_] | None = None  # (S, C, N), None = all; only used by scipy_rig
 
 
 @dataclass(frozen=True)
 class RigAnswer:
-    """A calibrated rig; its frame may be any, only relations between cameras are judged."""
+    """A calibrated rig in any frame; only relations between cameras are scored."""
 
     focal_length: Array  # (C, 2)
     principal_point: Array  # (C, 2)
     distortion: Array  # (C, 5)
     rotation: Array  # (C, 3, 3) cam_from_rig
     translation: Array  # (C, 3)
-    seconds: float  # of the solver alone, from inputs in its own structures
+    seconds: float  # solver time, with inputs already in its own structures
 
 
 def rotation_matrices(vectors: Array) -> Array:
@@ -57,9 +57,9 @@ def rotation_vectors(matrices: Array) -> Array:
 
 
 def mean_extrinsics(rotation: Array, translation: Array) -> tuple[Array, Array]:
-    """Average over the snapshots where each camera is, seen from the first one.
+    """Average each camera's pose relative to the first one over the snapshots.
 
-    For tools that know no rig, only one camera at a time.
+    For tools without rigs, which calibrate one camera at a time.
 
     Args:
         rotation: (S, C, 3, 3) cam_from_object.

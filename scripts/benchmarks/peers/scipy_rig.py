@@ -1,6 +1,6 @@
-"""scipy's least_squares on imgcal's MAP cost: analytic Jacobian in NumPy, solved dense or sparse, whichever is faster.
+"""scipy's least_squares with imgcal's MAP cost: analytic Jacobian in NumPy, dense or sparse, whichever is faster.
 
-Written anew from the formulas, so that it also checks imgcal's.
+Written independently from the formulas, so that it also checks imgcal's code.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.sparse import csr_matrix
 from scripts.benchmarks.peers.rig_task import Array, RigAnswer, RigTask
 
 CAMERA, POSE = 15, 6
-MOST_DENSE = 20  # snapshots; beyond, the singular value decomposition takes minutes
+MOST_DENSE = 20  # snapshots; with more, the singular value decomposition takes minutes
 LSMR = {"atol": 1e-8, "btol": 1e-8, "maxiter": 2000}  # its own tolerances stop far from the minimum
 
 
@@ -37,7 +37,7 @@ def solve(task: RigTask) -> RigAnswer:
 
 
 def _pattern(shape: tuple[int, ...]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Columns and row starts of the Jacobian: 15 camera and 6 pose entries a row, then the prior's unit matrix."""
+    """Columns and row starts of the Jacobian: 15 camera and 6 pose entries per row, then the prior's unit matrix."""
     cameras = shape[1]
     s, c, _, _ = np.indices(shape)
     camera = CAMERA * c[..., None] + np.arange(CAMERA)
@@ -49,7 +49,7 @@ def _pattern(shape: tuple[int, ...]) -> tuple[NDArray[np.int32], NDArray[np.int3
 
 @dataclass(frozen=True)
 class _Cost:
-    """Whitened residuals by whitened offsets (C, 15) and, for each snapshot, rotation and shift (S, 6)."""
+    """Whitened residuals as a function of whitened offsets (C, 15) and, per snapshot, rotation and shift (S, 6)."""
 
     task: RigTask
     pattern: tuple[NDArray[np.int32], NDArray[np.int32]]
@@ -86,7 +86,7 @@ class _Cost:
         xy, cam = _seen(points, rotation, position)
         by_xy, by_distortion = _lens_jacobian(xy, distortion[:, None])
         depth = cam[..., 2]
-        by_point = np.empty((*xy.shape, 3))  # (S, C, N, 2, 3) of a pixel by the point in the camera
+        by_point = np.empty((*xy.shape, 3))  # (S, C, N, 2, 3) d pixel / d point in the camera's frame
         by_point[..., :2] = by_xy / depth[..., None, None]
         by_point[..., 2] = -np.einsum("scnij,scnj->scni", by_xy, xy) / depth[..., None]
         by_point *= focal[:, None, :, None]
@@ -106,7 +106,7 @@ class _Cost:
         return csr_matrix((data, *self.pattern), shape=(len(self.pattern[1]) - 1, self.size))
 
     def _points(self, x: Array) -> tuple[Array, Array]:
-        """Fiducials of every snapshot in the rig frame (S, N, 3): turned only, and with their place."""
+        """Fiducials of every snapshot in the rig frame (S, N, 3): only rotated, and rotated and translated."""
         task = self.task
         poses = x[task.prior_std.size :].reshape(-1, POSE)
         centroid = task.points.mean(0)
@@ -116,7 +116,7 @@ class _Cost:
 
 
 def _seen(points: Array, rotation: Array, position: Array) -> tuple[Array, Array]:
-    """Points (S, N, 3) on the z = 1 planes (S, C, N, 2), and in the cameras (S, C, N, 3)."""
+    """Points (S, N, 3) on the z = 1 planes (S, C, N, 2), and in the camera frames (S, C, N, 3)."""
     cam = (points[:, None] - position[:, None]) @ rotation.swapaxes(-1, -2)
     return cam[..., :2] / cam[..., 2:], cam
 
@@ -132,7 +132,7 @@ def _distorted(xy: Array, distortion: Array) -> Array:
 
 
 def _lens_jacobian(xy: Array, distortion: Array) -> tuple[Array, Array]:
-    """Derivatives of the distorted point by the point (..., 2, 2) and by the coefficients (..., 2, 5)."""
+    """Derivatives of the distorted point with respect to the point (..., 2, 2) and coefficients (..., 2, 5)."""
     x, y = xy[..., 0], xy[..., 1]
     k1, k2, p1, p2, k3 = np.moveaxis(distortion, -1, 0)
     rr = x * x + y * y

@@ -1,7 +1,7 @@
 """Coloured Gaussian splats by other tools: the same points in, images out.
 
-Every function takes a `Scene` and returns images (M, 3, H, W), or (M, H, W, 3) where the tool draws that way. All are
-tuned to what `renderers.splat` draws, a Gaussian integrated over each pixel, as far as the tool can draw that.
+Every function takes a `Scene` and returns images (M, 3, H, W), or (M, H, W, 3) if the tool uses that layout. All are
+tuned to match `renderers.splat`, a Gaussian integrated over each pixel, as far as the tool allows.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from scipy.special import erf
 from torch import Tensor
 
 Images = NDArray[np.float32]
-# Standard deviations that windows reach: beyond, a splat is a tenth of a grey level of 8 bit.
+# Reach of windows in standard deviations, beyond which a splat is below a tenth of an 8-bit grey level.
 REACH = 4.0
 SUPERSAMPLING = 4
-FRACTION_BITS = 4  # of coordinates that cv2.circle takes
+FRACTION_BITS = 4  # in the coordinates of cv2.circle
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What is drawn."""
+    """Splats to draw."""
 
     uv: Images  # (M, N, 2) pixels
     colours: Images  # (N, 3)
@@ -40,9 +40,9 @@ class Scene:
 
 
 def kornia_dense(scene: Scene, uv: Tensor) -> Tensor:
-    """Sum whole images of every splat: kornia's, which samples a Gaussian that is normalized to sum 1.
+    """Sum whole images of every splat with kornia, which samples Gaussians normalized to sum 1.
 
-    A pixel's integral is close to a sample of a Gaussian whose variance is larger by that of a pixel, 1/12.
+    The integral over a pixel is close to a sample of a Gaussian with the pixel's variance, 1/12, added.
     """
     std = torch.full_like(uv, math.sqrt(scene.sigma**2 + 1 / 12)).flatten(0, 1)
     each = render_gaussian2d(uv.flatten(0, 1), std, (scene.side, scene.side), normalized_coordinates=False)
@@ -70,7 +70,7 @@ def numpy_windows(scene: Scene, images: Images) -> Images:
 def opencv_blur(scene: Scene, images: Images) -> Images:
     """Blur impulses in images (M, H, W, 3), each shared among the four pixels around it.
 
-    Sharing adds a variance that depends on the place in the pixel, 1/6 on average: the blur is that much narrower.
+    Sharing adds a variance that depends on the subpixel position, 1/6 on average; the blur is narrower by that.
     """
     side = scene.side
     sigma = math.sqrt(scene.sigma**2 + 1 / 12 - 1 / 6)

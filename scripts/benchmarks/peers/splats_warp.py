@@ -1,7 +1,7 @@
 """Coloured Gaussian splats as kernels of NVIDIA Warp, on the CPU, with Warp's own derivatives."""
 
-# Warp reads annotations as types of its own, which a type checker cannot: hence neither the usual import of
-# annotations from __future__ nor checks here.
+# Warp interprets annotations as its own types, which a type checker does not understand. So annotations are not
+# imported from __future__, and types are not checked here.
 # mypy: ignore-errors
 
 from collections.abc import Callable
@@ -18,14 +18,14 @@ Colours = wp.array(dtype=wp.vec3, ndim=1)
 
 @wp.func
 def integral(edge: float, sigma: float) -> float:
-    """Integrate a Gaussian of peak 1 over the pixel that begins at an edge."""
+    """Integrate a Gaussian of peak 1 over the pixel that starts at an edge."""
     scale = 1.0 / (1.4142135623730951 * sigma)
     return 1.2533141373155001 * sigma * (wp.erf((edge + 1.0) * scale) - wp.erf(edge * scale))
 
 
 @wp.kernel
 def draw_profiles(uv: Points, sigma: float, reach: int, profiles: Profiles) -> None:
-    """Fill in both profiles of each splat: a thread a pixel of a profile."""
+    """Fill in both profiles of each splat, with one thread per pixel of a profile."""
     m, n, axis, j = wp.tid()
     centre = uv[m, n][axis]
     profiles[m, n, axis, j] = integral(float(int(wp.round(centre)) - reach + j) - 0.5 - centre, sigma)
@@ -39,7 +39,7 @@ def draw_windows(
     profiles: Profiles,
     images: Profiles,
 ) -> None:
-    """Add splats to images (M, 3, H, W): a thread a row of a window."""
+    """Add splats to images (M, 3, H, W), with one thread per window row."""
     m, n, i = wp.tid()
     row = int(wp.round(uv[m, n][1])) - reach + i
     if row >= 0 and row < images.shape[2]:
@@ -62,9 +62,9 @@ def draw_pixels(
     reach: int,
     images: Profiles,
 ) -> None:
-    """Add all splats that reach a pixel to images (M, 3, H, W): a thread a pixel.
+    """Add all splats that reach a pixel to images (M, 3, H, W), with one thread per pixel.
 
-    Added, not assigned: the derivative of an assignment clears the gradient by the images, which is kept here.
+    Splats are added, not assigned: the derivative of an assignment would clear the gradient of the images.
     """
     m, row, column = wp.tid()
     light = wp.vec3(0.0, 0.0, 0.0)
@@ -80,15 +80,15 @@ def draw_pixels(
 
 
 class WarpSplats:
-    """Launches that are recorded once, over arrays that are allocated once."""
+    """Launches that are recorded once, with arrays that are allocated once."""
 
     def __init__(self, scene: Scene, *, windows: bool, upstream: Images | None = None) -> None:
-        """Prepare.
+        """Prepare the arrays and launches.
 
         Args:
-            scene: What is drawn.
+            scene: Splats to draw.
             windows: Draw window by window, else pixel by pixel.
-            upstream: (M, 3, H, W) gradient by the images, for `backward`.
+            upstream: (M, 3, H, W) gradient with respect to the images, for `backward`.
 
         """
         wp.config.log_level = wp.LOG_WARNING
@@ -123,7 +123,7 @@ class WarpSplats:
                 wp.launch(kernel, dim, inputs, outputs, device="cpu")
 
     def forward(self) -> Images:
-        """Draw."""
+        """Draw the images."""
         self.images.zero_()
         for launch in self._launches:
             launch()
@@ -131,7 +131,7 @@ class WarpSplats:
         return images
 
     def backward(self) -> Images:
-        """Return the gradient by the points (M, N, 2), of what `forward` drew."""
+        """Return the gradient (M, N, 2) of the images from `forward` with respect to the points."""
         for gradient in self._gradients:
             gradient.zero_()
         self._tape.backward()

@@ -1,4 +1,4 @@
-"""Blobs as arrays against the table they come from, and what the prior lets them be off against sampled rigs."""
+"""Blobs as arrays agree with their table, and the shifts that the prior allows with sampled rigs."""
 
 from dataclasses import replace
 

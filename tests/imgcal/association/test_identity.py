@@ -1,4 +1,4 @@
-"""Which way round a symmetric object is: only what was given decides it."""
+"""Only given information decides the orientation of a symmetric object."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""One camera that sees four fiducials: what is clear is accepted, and no wrong label is."""
+"""One camera that sees four fiducials: clear labellings are accepted, and no wrong label is."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Rounds of a search: what they find, what they count, and when they find nothing."""
+"""Rounds of the pose search: their results and counts, and searches that find nothing."""
 
 from dataclasses import replace
 

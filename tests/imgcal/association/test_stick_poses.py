@@ -1,4 +1,4 @@
-"""Sticks among false blobs, without labels: nothing is labelled wrongly, and what cannot be is refused."""
+"""Unlabelled sticks among false blobs: no wrong labels, and impossible cases are refused."""
 
 import pytest
 import torch

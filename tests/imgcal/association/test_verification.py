@@ -1,4 +1,4 @@
-"""Labellings of one snapshot: fitted, judged and compared, against the truth and against what cannot matter."""
+"""Labellings of one snapshot are fitted, checked and compared correctly."""
 
 from dataclasses import fields, replace
 

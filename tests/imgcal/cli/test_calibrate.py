@@ -369,7 +369,7 @@ def test_the_previous_rig_may_be_the_one_to_start_from(workplace, blind, tmp_pat
     assert main(["calibrate", str(workplace.capture), *arguments, "--out", str(out)]) == 0
     capsys.readouterr()
     assert main(["calibrate", str(workplace.capture), *arguments, "--out", str(out)]) == 2
-    assert "previous/rig.yaml is what --rig reads" in one_line(capsys)
+    assert "previous/rig.yaml is also the input of --rig" in one_line(capsys)
 
 
 def test_the_rig_to_start_from_is_not_overwritten(workplace, blind, tmp_path, capsys):
@@ -378,7 +378,7 @@ def test_the_rig_to_start_from_is_not_overwritten(workplace, blind, tmp_path, ca
     shutil.copy(workplace.rig, out / "rig.yaml")
     arguments = ["calibrate", str(blind), "--rig", str(out / "rig.yaml"), "--object", str(workplace.object)]
     assert main([*arguments, "--out", str(out)]) == 2
-    assert "rig.yaml is what --rig reads" in one_line(capsys)
+    assert "rig.yaml is also the input of --rig" in one_line(capsys)
     assert (out / "rig.yaml").read_bytes() == workplace.rig.read_bytes()
 
 

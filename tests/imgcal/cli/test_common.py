@@ -1,4 +1,4 @@
-"""What commands share: ranges, start poses, cameras left out, folders to write to."""
+"""Code shared by the commands: ranges, start poses, excluded cameras, output folders."""
 
 import math
 from pathlib import Path

@@ -48,7 +48,7 @@ def test_a_file_of_one_camera_is_named(tmp_path: Path, capsys: pytest.CaptureFix
     code = main(["score", str(tmp_path), "--rig", str(tmp_path / "ros" / "cam01.yaml"), "--object", "asymmetric8"])
     said = capsys.readouterr().err
     assert code == 2
-    assert "this is a ROS camera_info file of one camera, without its place in the rig" in said
+    assert "this is a ROS camera_info file of one camera, without its pose in the rig" in said
     assert run(capsys, tmp_path / "ros" / "cam01.yaml", "--out", tmp_path / "one.yaml")[0] == 0
     assert read_rig(tmp_path / "one.yaml").num_cameras == 1
 
@@ -98,7 +98,7 @@ def test_the_source_survives(camchain: Path, tmp_path: Path, capsys: pytest.Capt
     before = camchain.read_bytes()
     code, _, error = run(capsys, camchain, "--to", "kalibr", "--out", camchain)
     assert code == 2
-    assert "is what SOURCE holds" in error
+    assert "would overwrite SOURCE" in error
     assert camchain.read_bytes() == before
     code, _, error = run(capsys, camchain, "--to", "mrcal", "--out", camchain)
     assert code == 2

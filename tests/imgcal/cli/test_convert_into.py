@@ -44,7 +44,7 @@ def test_the_success_line(recalibrated: tuple[Path, Path], tmp_path: Path, capsy
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--into", "original.qca.txt", "--out", "original.qca.txt"], "is what --into holds, expected another place"),
+        (["--into", "original.qca.txt", "--out", "original.qca.txt"], "would overwrite --into, expected another path"),
         (["--into", "rig.yaml", "--out", "new.xml"], "expected"),
         (["--into", "missing.xcp", "--out", "new.xcp"], "missing.xcp: no such file"),
         (["--into", "original.qca.txt", "--to", "imgcal", "--out", "new.xcp"], "--to: found imgcal"),
@@ -93,7 +93,7 @@ def test_a_calibration_that_holds_the_distortion_goes_back_where_another_is_refu
     assert "or convert the file with --hold-distortion and calibrate again" in outcomes[1][2]
     for more in (["--into", original, "--out", tmp_path / "x.xcp"], ["--to", "kalibr", "--out", tmp_path / "x.yaml"]):
         code, _, err = run(capsys, held, "--hold-distortion", *more)
-        assert code == 2 and "--hold-distortion: only when writing an imgcal rig file" in err
+        assert code == 2 and "--hold-distortion: needs an imgcal rig file as output" in err
 
 
 def test_into_without_a_file_or_into_a_rig_file_of_ours_is_told(tmp_path, capsys):

@@ -20,7 +20,7 @@ def test_a_shipped_network_is_written_and_described(export, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("more", "out", "said"),
     [
-        ((), "x.pt2", "expected a file .onnx"),
+        ((), "x.pt2", "expected a name that ends in .onnx"),
         (("--count", "0"), "x.onnx", "--count: found 0"),
         (("--fiducials", "5000"), "x.onnx", "--fiducials: found 5000"),
     ],
@@ -33,7 +33,7 @@ def test_what_cannot_be_done_is_one_line(export, capsys, more, out, said, tmp_pa
 def test_nothing_is_written_that_says_something_else(export, capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(module, "save_exported", lambda program, path: 0.1)
     assert export("--to", "pt2", out="x.pt2") == 2
-    assert "gives other numbers (by 1.0e-01" in capsys.readouterr().err and not list(tmp_path.iterdir())
+    assert "gives different numbers (by 1.0e-01" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
 def test_a_library_that_is_missing_is_named(export, capsys, monkeypatch):

@@ -31,5 +31,5 @@ def test_train_from_a_folder_that_is_no_dataset_is_one_line(tmp_path, capsys):
 def test_of_unknown_markers_nothing_can_be_harvested(workplace, tmp_path, capsys):
     given = ["harvest", str(workplace.capture), "--rig", str(workplace.rig), "--object", "lights"]
     assert main([*given, "--out", str(tmp_path / "dataset")]) == 2
-    said = "object lights: found markers of which nothing is known, expected the file of an object to harvest crops"
+    said = "object lights: found unknown markers, expected the file of an object to harvest crops"
     assert capsys.readouterr().err == f"imgcal: {said}\n" and not (tmp_path / "dataset").exists()

@@ -1,4 +1,4 @@
-"""Every option of every command says what it is for."""
+"""Every option of every command has a help text."""
 
 import re
 

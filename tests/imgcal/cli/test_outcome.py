@@ -56,4 +56,4 @@ def test_results_go_to_standard_output_and_notes_to_standard_error(capsys: pytes
     assert all(note.startswith("note: ") for note in notes) and len(notes) == 5
     assert "guess was no better" in notes[0] and notes.pop(1) == "note: 3 blobs are listed twice"
     assert "focal length drifted 2.3 times" in notes[1]
-    assert "fiducial 3 of the object is 1.23 +- 0.1 mm off" in notes[2] and "fiducial 6" in notes[3]
+    assert "fiducial 3 of the object is 1.23 +- 0.1 mm from its place" in notes[2] and "fiducial 6" in notes[3]

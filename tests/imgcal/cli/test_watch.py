@@ -78,7 +78,7 @@ def test_a_table_of_blobs_is_watched_once(blobs, stream, tmp_path, capsys):
     known = (out / "rig.yaml").read_bytes()
     assert watch(tmp_path / "blobs.csv.gz", out, "--rate", "60") == 0
     said = capsys.readouterr()
-    read = f"all 60 snapshots of {tmp_path}/blobs.csv.gz had been read before; --fresh begins from the factory rig"
+    read = f"all 60 snapshots of {tmp_path}/blobs.csv.gz had been read before; --fresh starts from the factory rig"
     assert said.out.endswith(f"{read} | 0 snapshots, 1 events: {out}/rig.yaml\n")
     assert not said.err and (out / "rig.yaml").read_bytes() == known
     assert watch(tmp_path / "blobs.csv.gz", out, "--rate", "60", "--fresh") == 0
@@ -92,9 +92,7 @@ def test_lines_on_standard_input_and_garbage_among_them(blobs, tmp_path, monkeyp
         monkeypatch.setattr(sys, "stdin", file)
         assert watch("-", tmp_path / "out") == 0
     said = capsys.readouterr().out
-    assert (
-        "20 snapshots" in said and " | 2 unreadable | the latest that could not be read: " in said and "cam09" in said
-    )
+    assert "20 snapshots" in said and " | 2 unreadable | latest unreadable input: " in said and "cam09" in said
     assert json.loads((tmp_path / "out" / "state.json").read_text())["progress"]["time"] == pytest.approx(19 / 60)
 
 
@@ -135,7 +133,7 @@ def test_a_killed_process_goes_on_and_ctrl_c_ends_it_cleanly(blobs, tmp_path):
         said, complaint = process.communicate(timeout=30)
     assert process.returncode == 130
     (line,) = [text for text in complaint.splitlines() if "compiling" not in text]
-    assert line.startswith("imgcal: interrupted after ") and line.endswith("the same command goes on from there")
+    assert line.startswith("imgcal: interrupted after ") and line.endswith("the same command resumes from there")
     assert [event["event"] for event in events(out)].count("restart") == 1 and "restart: started again" in said
     assert read_rig(out / "rig.yaml").num_cameras == 4
 
@@ -163,16 +161,20 @@ def test_a_missing_source_is_reported_before_any_note(tmp_path, monkeypatch, cap
         (["-", "--hook", "no-such-program"], 2, "--hook: found 'no-such-program'"),
         (["-", "--metrics", "nowhere"], 2, "found 'nowhere', expected [HOST:]PORT"),
         (["bag.mcap", "--topic", "cam01"], 2, "--topic: found 'cam01', expected CAMERA=TOPIC"),
-        (["bag.mcap", "--topic", "a=/x", "a=/y"], 2, "--topic: found camera a twice, expected one topic of each"),
-        (["empty", "--rate", "0"], 2, "--rate: found it with a folder of frames (empty), expected a table of blobs"),
-        (["empty", "--topic", "a=b"], 2, "--topic: found it with a folder of frames (empty), expected a recording"),
-        (["-", "--until-idle", "3"], 2, "--until-idle: found it with standard input (-), expected a folder of frames"),
+        (["bag.mcap", "--topic", "a=/x", "a=/y"], 2, "--topic: found camera a twice, expected one topic per camera"),
+        (["empty", "--rate", "0"], 2, "--rate: needs a table of blobs, found a folder of frames (empty)"),
+        (["empty", "--topic", "a=b"], 2, "--topic: needs a recording, found a folder of frames (empty)"),
+        (["-", "--until-idle", "3"], 2, "--until-idle: needs a folder of frames, found standard input (-)"),
         (
             ["absent.csv", "--remove"],
             2,
-            "--remove: found it with a table of blobs (absent.csv), expected a folder of f",
+            "--remove: needs a folder of frames, found a table of blobs (absent.csv)",
         ),
-        (["tcp://a:1", "--videos-differ"], 2, "--videos-differ: found it with an address (tcp://a:1), expected a fold"),
+        (
+            ["tcp://a:1", "--videos-differ"],
+            2,
+            "--videos-differ: needs a folder of videos, found an address (tcp://a:1)",
+        ),
         (["empty", "--until-idle", "0.1"], 3, "watch: no snapshot came: empty: found no folder frames in it"),
         (["typing", "--until-idle", "0.1"], 3, "nearest: cam01"),
     ],
@@ -238,8 +240,8 @@ def test_what_is_known_of_another_rig_or_object_is_not_gone_on_with(given, messa
     words = [word for pair in ({"--rig": "T4", "--object": "asymmetric8"} | {option: path}).items() for word in pair]
     assert main(["watch", str(known), *map(str, words), "--out", str(known / "out")]) == 2
     error = capsys.readouterr().err
-    assert f"another than {option} {path} (" in error and message in error
-    assert error.endswith("; --fresh begins anew\n") and error.count("\n") == 1
+    assert f"does not belong to {option} {path} (" in error and message in error
+    assert error.endswith("; --fresh starts over\n") and error.count("\n") == 1
 
 
 def test_a_recording_is_gone_on_with_by_its_names_and_rate_and_another_one_is_not_taken_for_it(blobs, tmp_path, capsys):
@@ -277,7 +279,7 @@ def test_what_was_left_and_cannot_be_used_is_told_with_the_way_out(tmp_path, mon
         monkeypatch.setattr(sys, "stdin", file)
         assert watch("-", tmp_path / "out") == 2
     error = capsys.readouterr().err
-    assert name in error and error.endswith("; --fresh begins anew\n") and error.count("\n") == 1
+    assert name in error and error.endswith("; --fresh starts over\n") and error.count("\n") == 1
 
 
 def test_the_state_of_another_version_is_told_and_nothing_is_lost(blobs, tmp_path, capsys):
@@ -292,7 +294,7 @@ def test_the_state_of_another_version_is_told_and_nothing_is_lost(blobs, tmp_pat
     error = capsys.readouterr().err
     assert (
         "State files from earlier versions cannot be resumed" in error
-        and error.endswith("; --fresh begins anew\n")
+        and error.endswith("; --fresh starts over\n")
         and error.count("\n") == 1
     )
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before

@@ -48,7 +48,7 @@ def test_what_did_not_go_as_it_should_is_told_at_the_end(monkeypatch):
         tally.snapshots, tally.refused = 5, 2
         shown._intake.dropped = 3
         shown._hook = SimpleNamespace(failed=4, dropped=0)
-    wrong = "2 refused | 3 dropped | 1 unreadable | 4 hooks failed | the latest that could not be read: junk"
+    wrong = "2 refused | 3 dropped | 1 unreadable | 4 hooks failed | latest unreadable input: junk"
     assert shown.result(Path("out/rig.yaml")) == f"5 snapshots, 0 events: out/rig.yaml | {wrong}"
 
 
@@ -65,8 +65,8 @@ def test_cameras_whose_stamps_go_with_no_other_are_named(monkeypatch):
     shown, _, tally = display(monkeypatch, False)
     shown._intake.synchronizer.alone, shown._intake.synchronizer.leaps = ("cam02",), 3
     with shown.show_tally(tally):
-        said = "cam02: time stamps more than 5 ms (--tolerance) beside the other cameras': set their clocks"
-        assert "| 3 leaps of all clocks |" in shown.line() and shown.line().endswith(f"| {said}")
+        said = "cam02: time stamps more than 5 ms (--tolerance) off the other cameras': set their clocks"
+        assert "| 3 jumps of all clocks |" in shown.line() and shown.line().endswith(f"| {said}")
 
 
 def test_a_camera_that_trembles_is_named(monkeypatch):
@@ -82,4 +82,4 @@ def test_a_clock_that_is_off_is_named(monkeypatch):
     tally.latest = replace(some_state(), clock_offset=offset, clock_offset_sigma=sigma)
     tally.stamps = {"cam02": -0.0005}
     with shown.show_tally(tally):
-        assert shown.line().endswith("| cam02 exposes +4.5 ms beside its time stamps")
+        assert shown.line().endswith("| cam02 exposes +4.5 ms off its time stamps")

@@ -1,4 +1,4 @@
-"""What the compiled functions of the detector compute, in plain NumPy and SciPy: slow, obvious, whole windows."""
+"""NumPy and SciPy references for the detector's compiled functions: slow, obvious, on whole windows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Moments in a window against NumPy's sums, and what a shape is said to be against shapes that are known."""
+"""Moments in a window agree with NumPy's sums, and estimated shapes with known ones."""
 
 import numpy as np
 import pytest

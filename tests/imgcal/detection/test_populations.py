@@ -1,4 +1,4 @@
-"""Markers apart from what is far dimmer, and no real marker lost."""
+"""Markers are separated from much dimmer blobs, and no real marker is lost."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""What the flat posterior leaves out: even in the step, of fourth order, never negative. Honesty: test_covariance."""
+"""The correction for curvature is even in the step, of fourth order, and never negative."""
 
 from dataclasses import replace
 

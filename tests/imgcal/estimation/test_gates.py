@@ -1,4 +1,4 @@
-"""What the estimation must reach: exactness, efficiency, honesty of the covariance, convergence."""
+"""Targets of the estimation: accuracy, efficiency, correct covariance, convergence."""
 
 import pytest
 import torch

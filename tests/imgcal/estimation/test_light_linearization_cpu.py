@@ -1,4 +1,4 @@
-"""Normal equations of lights against those of derivatives taken numerically, with the covariance of what shakes."""
+"""Normal equations of lights agree with numerical derivatives, including the covariance of shaking cameras."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The operator by PyTorch's own checks; `imgcal.nn.MapEstimate` has tests of what it computes."""
+"""PyTorch's own checks of the operator; `imgcal.nn.MapEstimate` has tests of its results."""
 
 import pytest
 import torch

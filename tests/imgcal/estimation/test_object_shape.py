@@ -1,4 +1,4 @@
-"""Tests of the object by its residuals: they keep still for a right object, and find what is wrong with another one."""
+"""Residual tests of the object: silent for a correct object, and they identify the errors of a wrong one."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Who has moved, when no camera is known to have stood still."""
+"""Find the cameras that moved when no camera is known to be steady."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Errors of a rig: their inverse, their derivative, and what makes them the right ones for a filter."""
+"""Errors of a rig: inverse, derivative, and invariance for the filter."""
 
 import torch
 

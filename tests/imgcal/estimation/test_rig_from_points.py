@@ -1,4 +1,4 @@
-"""Rigs from one point that was moved: right up to scale, whatever the focal lengths are said to be, and robust."""
+"""Rigs from one moved point are correct up to scale, for any assumed focal lengths, and robust."""
 
 from dataclasses import replace
 

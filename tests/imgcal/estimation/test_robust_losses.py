@@ -1,4 +1,4 @@
-"""Robust losses: derivatives, and what they agree on near zero and far away."""
+"""Robust losses: derivatives, and limits near zero and far away."""
 
 import pytest
 import torch

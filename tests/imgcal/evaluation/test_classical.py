@@ -1,4 +1,4 @@
-"""What others use, against the truth where nothing is in the way, and held back where it cannot know; speed aside."""
+"""Classical methods reach the truth in easy cases, and decline where they cannot."""
 
 import math
 

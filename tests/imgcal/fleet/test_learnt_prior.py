@@ -1,4 +1,4 @@
-"""Devices made of Gaussians alone: what is learnt is compared with what they were made from."""
+"""Devices drawn from Gaussians: the learned prior agrees with the true one."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Kornia's distortions: batches, gradients, and what they do near the axis."""
+"""Kornia's distortions: batches, gradients, and values near the axis."""
 
 import pytest
 import torch

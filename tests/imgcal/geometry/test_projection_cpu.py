@@ -1,4 +1,4 @@
-"""The compiled projection against the tensors' and OpenCV's; it shares no memory with what it is given."""
+"""The compiled projection agrees with the tensor version and OpenCV, and shares no memory with its inputs."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Files of printed boards: written and read back, and one line for what is wrong in them."""
+"""Files of printed boards: round trips, and one-line errors."""
 
 from dataclasses import replace
 from pathlib import Path

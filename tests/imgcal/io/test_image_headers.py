@@ -1,4 +1,4 @@
-"""What is decided before anything is decoded: no test here may need the memory that a header announces."""
+"""Checks before decoding: no test here may need the memory that a header announces."""
 
 import struct
 import zlib

@@ -1,4 +1,4 @@
-"""Keys with their types, defaults and meanings, which stand beside the fields and nowhere else."""
+"""Tables of keys with types, defaults and meanings, taken from the fields alone."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal

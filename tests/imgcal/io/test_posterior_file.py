@@ -1,4 +1,4 @@
-"""The file beside rig.yaml: exact, attached by read_rig, and damage is one line."""
+"""The posterior file next to rig.yaml: exact, attached by read_rig, and one-line errors for damage."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a rig file holds; what it may not hold is said in one line: the file, the camera, what was expected."""
+"""Rig files: content, and one-line errors that name the file, the camera and the expected value."""
 
 import re
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What native libraries write to file descriptor 2, which no setting of Python reaches."""
+"""Output of native libraries to file descriptor 2, which Python settings do not affect."""
 
 import os
 import threading

@@ -1,4 +1,4 @@
-"""Strict YAML: what is written comes back, and what is wrong is told in one line with its place."""
+"""Strict YAML: round trips, and one-line errors with their place."""
 
 import subprocess
 import sys

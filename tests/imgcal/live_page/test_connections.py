@@ -1,4 +1,4 @@
-"""Whoever opens connections and says nothing keeps nobody out."""
+"""Idle connections do not block other viewers."""
 
 import contextlib
 import socket

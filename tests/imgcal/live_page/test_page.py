@@ -1,4 +1,4 @@
-"""The page as text, and in a real browser: what it shows, what its buttons do, and that nothing can be put into it."""
+"""The page as text and in a real browser: content, buttons, and no injection."""
 
 import base64
 import contextlib

@@ -1,4 +1,4 @@
-"""A stream that a filter follows while nobody asks whether something has changed."""
+"""A stream that a filter follows without tests for changes."""
 
 from dataclasses import dataclass
 

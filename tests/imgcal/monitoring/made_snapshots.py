@@ -1,4 +1,4 @@
-"""Snapshots of a drifted rig for tests of what is learnt of it, and the batch estimate that says what it must be."""
+"""Snapshots of a drifted rig, and the batch estimate as the expected result of learning from them."""
 
 import torch
 

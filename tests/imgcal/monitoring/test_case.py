@@ -1,4 +1,4 @@
-"""A case: since when something may have been so, of which cameras, and whether it is too early to say."""
+"""A case: its start, its cameras, and whether it is too early to decide."""
 
 from dataclasses import replace
 

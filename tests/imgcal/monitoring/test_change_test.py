@@ -1,4 +1,4 @@
-"""Tests for changes: chi-squared while nothing changes, what a change adds, how probable each kind is."""
+"""Tests for changes: chi-squared without a change, its growth with one, and probabilities of the kinds."""
 
 import math
 

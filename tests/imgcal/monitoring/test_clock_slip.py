@@ -1,4 +1,4 @@
-"""A clock that slips and a camera that moves are told apart, where the object moves."""
+"""A clock that slips is distinguished from a camera that moves while the object moves."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""All explanations of a case are compared in the same measure; what cannot be decided waits."""
+"""All explanations of a case are compared on the same scale; undecided cases wait."""
 
 import math
 from collections.abc import Callable, Sequence

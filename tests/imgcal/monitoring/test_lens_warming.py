@@ -1,4 +1,4 @@
-"""Lenses that warm up explain what an object of another size would, at their own pace."""
+"""Warming lenses explain what looks like an object of another size, at their own pace."""
 
 import pytest
 import torch

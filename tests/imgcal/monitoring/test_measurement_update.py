@@ -1,4 +1,4 @@
-"""What is learnt from some snapshots at once, against the batch estimate."""
+"""Learning from several snapshots at once agrees with the batch estimate."""
 
 from dataclasses import replace
 

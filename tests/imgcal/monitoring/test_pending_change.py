@@ -1,4 +1,4 @@
-"""What was seen since a camera changed decides how it changed, and how far."""
+"""Snapshots after a change determine its kind and size."""
 
 import torch
 

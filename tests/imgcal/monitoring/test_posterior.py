@@ -1,4 +1,4 @@
-"""What a running rig begins with is what the calibration knows, no more and no less."""
+"""A running rig starts with exactly the calibration's information."""
 
 from dataclasses import replace
 

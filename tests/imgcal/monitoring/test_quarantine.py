@@ -1,4 +1,4 @@
-"""Cameras of which nothing is learnt for the time being: what they see is kept, and asked at times."""
+"""Cameras in quarantine teach nothing; their blobs are kept and tested from time to time."""
 
 from imgcal.estimation import EstimationOptions
 from imgcal.monitoring.quarantine import CASE_AFTER, CASE_EVERY, CASE_SNAPSHOTS, SETTLE_SECONDS, Quarantine

@@ -1,4 +1,4 @@
-"""What is kept of the latest snapshots says what was known before any of them, and tests what came since."""
+"""Recent snapshots: the belief before each of them, and tests on those after it."""
 
 from dataclasses import replace
 

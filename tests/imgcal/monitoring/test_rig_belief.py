@@ -1,4 +1,4 @@
-"""What is believed of a rig: what it must never learn, what time does to it."""
+"""Belief about a rig: what it must never learn, and the effect of time."""
 
 import pytest
 import torch

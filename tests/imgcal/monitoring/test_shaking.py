@@ -1,4 +1,4 @@
-"""Cameras that shake: what is supposed of them, and how much they are found to."""
+"""Shaking cameras: the model, and the estimated amplitude."""
 
 import math
 from dataclasses import replace

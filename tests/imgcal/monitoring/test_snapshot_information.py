@@ -1,4 +1,4 @@
-"""What snapshots say by themselves: their information, and where it points."""
+"""Information from single snapshots: the gain of the belief, and its balance at the estimate."""
 
 from dataclasses import replace
 

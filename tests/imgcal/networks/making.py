@@ -1,4 +1,4 @@
-"""Networks of every preset, rigs and what they see."""
+"""Networks of every preset, rigs and their views."""
 
 import torch
 

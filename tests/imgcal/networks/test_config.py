@@ -1,4 +1,4 @@
-"""Presets and what may be changed in them."""
+"""Presets, and the values that may be changed in them."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""What every network is: trainable throughout, rig by rig, and moved as a whole."""
+"""Every network: all parameters train, batches do not mix, and the network moves between devices as a whole."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Networks of points: what they see, and in which precision."""
+"""Point networks: their inputs and precision."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""What a keeper remembers after some snapshots, for tests of what is done with it."""
+"""The memory of a keeper after some snapshots, for other tests."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""States of a rig that is known, for tests of what watches them."""
+"""States of a known rig, for tests of the watching code."""
 
 from __future__ import annotations
 

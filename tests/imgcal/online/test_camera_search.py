@@ -1,4 +1,4 @@
-"""Cameras that are looked for: how often that is tried, what is remembered, and whose labels are believed."""
+"""Search for lost cameras: its schedule, its memory, and which labels are accepted."""
 
 import numpy as np
 import pytest

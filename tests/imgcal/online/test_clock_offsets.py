@@ -1,4 +1,4 @@
-"""A camera that exposes late is told; one that was bumped is not."""
+"""A late camera is reported; a bumped one is not."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What watches a keeper where nothing is asked for: it finds what is wrong with the object, and says so."""
+"""The default checks of a keeper report a wrong object, and blame no camera."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Drift is told when it is sure and worth it, of the right camera, and once."""
+"""Drift is reported once, for the right camera, when it is certain and large enough."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What is seen is not the object: told once, after seconds; an absent object is none."""
+"""A foreign object is reported once, after seconds; an absent object is not."""
 
 from dataclasses import replace
 

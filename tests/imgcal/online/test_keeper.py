@@ -408,7 +408,7 @@ def test_a_small_turn_during_a_long_pause_is_decided_within_a_second(degrees: fl
 
 
 def lights(count: int, bumped: int | None = None) -> tuple[CameraRig, list[Detections]]:
-    """A rig of ten cameras, and snapshots of four markers of which nothing is known; camera 2 is bumped at one."""
+    """A rig of ten cameras, and snapshots of four unknown markers; camera 2 is bumped at one."""
     rig, wand = imgcal.load_rig("room10"), imgcal.load_object("wand4")
     rig = replace(rig, prior=RigPrior(0.001, 0.5, 0.002, 0.0005, 0.5))
     seen = true_detections(simulate_volume(rig, wand, count, torch.Generator().manual_seed(4), None))

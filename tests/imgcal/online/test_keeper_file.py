@@ -1,4 +1,4 @@
-"""A keeper goes on from its file as if nothing had happened; files that were changed are refused in one line."""
+"""A keeper resumes exactly from its file; modified files are refused in one line."""
 
 import hashlib
 import json

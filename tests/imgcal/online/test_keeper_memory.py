@@ -1,4 +1,4 @@
-"""What a keeper remembers: begun, forgotten, and taken over from values that belong to it alone."""
+"""The memory of a keeper: start, forgetting, and transfer of values."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Noise beyond what blobs say of themselves is found, and the first snapshots are learnt with it."""
+"""Noise beyond the blobs' own is estimated, and the first snapshots are learned with it."""
 
 from dataclasses import replace
 

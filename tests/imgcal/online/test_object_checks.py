@@ -1,4 +1,4 @@
-"""An object that is bent, or another one, is told where its labels look like strays; strays by chance are not."""
+"""A bent or different object is reported where its labels look like strays; random strays are not."""
 
 from dataclasses import replace
 

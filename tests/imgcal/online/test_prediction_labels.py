@@ -1,4 +1,4 @@
-"""Labels from the snapshot before: against brute force, and against what is known to have moved."""
+"""Labels predicted from the previous snapshot agree with brute force and with known motions."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What is told of a camera that moved, and when it is known again."""
+"""Reports about a camera that moved, and when it is known again."""
 
 import math
 

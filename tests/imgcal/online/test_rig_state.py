@@ -1,4 +1,4 @@
-"""What a state says of motion: a motion of the whole rig is none, and its standard deviation is of the same thing."""
+"""Motion in a state is free of a motion of the whole rig, and so is its standard deviation."""
 
 import re
 from pathlib import Path

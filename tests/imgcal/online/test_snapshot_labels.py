@@ -1,4 +1,4 @@
-"""Snapshots are labelled by the last pose, else by themselves; what fits nowhere is refused, and at last the rig."""
+"""Snapshots are labelled by the last pose, else from scratch; misfits are refused, until the rig is given up."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A labelled snapshot is learnt; what a camera sees elsewhere waits for a second one, and is a move then."""
+"""A labelled snapshot is learned; labels that are off wait for a second one, and then are a move."""
 
 import math
 

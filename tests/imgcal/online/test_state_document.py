@@ -1,4 +1,4 @@
-"""Values as a document and back, exactly; what a document says is checked against the types of the code."""
+"""Values survive a round trip through a document exactly, and are checked against the types of the code."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Real captures of boards: what is asked of them, without the time of the benchmark."""
+"""Real captures of boards meet their targets, in less time than the benchmark."""
 
 import csv
 import gzip

@@ -1,4 +1,4 @@
-"""What is not known is said, and where the object would tell more is true: it is tried."""
+"""Undetermined values are reported, and the suggested object positions do help."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A camera that stops fitting at the end of a capture is named: nobody can say yet whether it was bumped."""
+"""A camera that stops fitting at the end of a capture is named, since it is too early to call it a bump."""
 
 import numpy as np
 import pytest

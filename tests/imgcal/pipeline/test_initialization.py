@@ -1,4 +1,4 @@
-"""Networks in the main job: a first guess from labelled fiducials, and what becomes of a bad one."""
+"""First guesses of networks from labelled fiducials, and the handling of a bad one."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A camera whose blobs nobody can label is refused by name; one that sees much else besides is not."""
+"""A camera whose blobs cannot be labelled is refused by name; one that sees many other things is not."""
 
 from dataclasses import replace
 

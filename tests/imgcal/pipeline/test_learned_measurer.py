@@ -1,4 +1,4 @@
-"""Blobs measured again: by a network that knows, which one is told what to say."""
+"""Measuring blobs again, with a network whose answers are prescribed."""
 
 from dataclasses import replace
 

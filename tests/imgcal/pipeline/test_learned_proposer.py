@@ -1,4 +1,4 @@
-"""The proposer, around networks that know the truth: what it makes of their evidence."""
+"""The proposer with networks that know the truth: its use of their evidence."""
 
 from dataclasses import dataclass, replace
 

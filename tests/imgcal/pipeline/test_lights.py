@@ -1,4 +1,4 @@
-"""Calibration from markers of which nothing is known: right where it answers, one line where it refuses."""
+"""Calibration from unknown markers: correct results, and one-line refusals."""
 
 from dataclasses import replace
 

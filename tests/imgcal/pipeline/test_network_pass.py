@@ -1,4 +1,4 @@
-"""Many small markers: tiles that see a pattern which goes on beyond the object cannot tell where the object is."""
+"""Many small markers: tiles of a pattern that continues beyond the object cannot locate the object."""
 
 from dataclasses import replace
 

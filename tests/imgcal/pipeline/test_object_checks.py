@@ -1,4 +1,4 @@
-"""An object that is not what its file says: recovered, or refused, never silently taken for right."""
+"""An object that differs from its file is estimated or refused, never silently accepted."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Refusals say in plain words what was found, and what to do."""
+"""Refusals say in plain words what was found and what to do."""
 
 from types import SimpleNamespace
 

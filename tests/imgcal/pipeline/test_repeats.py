@@ -1,4 +1,4 @@
-"""Exact copies among blobs: found, left out and reported; what only looks alike stays."""
+"""Exact copies of blobs are found, left out and reported; merely similar ones stay."""
 
 from __future__ import annotations
 

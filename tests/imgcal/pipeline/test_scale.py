@@ -1,4 +1,4 @@
-"""What the scale rests on, and whether an error of the object's file adds what is said."""
+"""The source of the scale, and the stated effect of an error in the object's file."""
 
 from __future__ import annotations
 

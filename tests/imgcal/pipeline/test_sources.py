@@ -1,4 +1,4 @@
-"""What a program hands over is compared with the rig and the object, as files are."""
+"""Data passed by a program are checked against the rig and the object, like files."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Cameras that expose at moments of their own are told from noise, lenses and wrong objects by the object's speed."""
+"""Unsynchronized cameras are distinguished from noise, lenses and wrong objects by the object's speed."""
 
 from dataclasses import replace
 

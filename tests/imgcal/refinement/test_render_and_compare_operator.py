@@ -1,4 +1,4 @@
-"""The operator by PyTorch's own checks; `imgcal.nn.RenderAndCompare` has tests of what it computes."""
+"""PyTorch's own checks of the operator; `imgcal.nn.RenderAndCompare` has tests of its results."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What a report shows in a real browser's window of some width."""
+"""Content of a report in a real browser window of a given width."""
 
 from __future__ import annotations
 

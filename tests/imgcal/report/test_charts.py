@@ -1,4 +1,4 @@
-"""Still charts: what is counted and drawn."""
+"""Static charts: what is counted and drawn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scene of the report: what was seen is where it is drawn, changes are exaggerated as said."""
+"""The scene of the report: positions are correct, and changes are exaggerated as stated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables: digits, flags, and what is fixed."""
+"""Tables: digits, flags and fixed values."""
 
 from __future__ import annotations
 

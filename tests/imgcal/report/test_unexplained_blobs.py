@@ -1,4 +1,4 @@
-"""What cameras saw beside the object, and that one moved, is said in the verdict."""
+"""The verdict mentions blobs besides the object, and a moved object."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plain words: what makes a result trusted, doubted or refused."""
+"""Verdicts in plain words: what makes a result trusted, doubted or refused."""
 
 from __future__ import annotations
 

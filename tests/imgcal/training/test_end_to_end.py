@@ -1,4 +1,4 @@
-"""Training through the refinement: weights of the fiducials learn what is an outlier."""
+"""Training through the refinement: weights of fiducials learn to detect outliers."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""What the keys of `training` and `optimizer` do to a run; the task is a line, which costs nothing."""
+"""Effects of the keys of `training` and `optimizer` on a run; the task fits a line, which is fast."""
 
 from functools import partial
 

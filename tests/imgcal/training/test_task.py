@@ -1,4 +1,4 @@
-"""The engine knows nothing of rigs: a task of its own is trained, stopped and continued."""
+"""The engine is independent of rigs: another task is trained, stopped and resumed."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""What networks are given and return: cameras in the object's frame, split and put together again."""
+"""Inputs and outputs of networks: cameras in the object's frame, split and recombined."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""A small server that speaks QTM's real-time protocol as far as its 2D component goes, and sends what it is given."""
+"""A small server that speaks the 2D part of QTM's real-time protocol and sends given data."""
 
 import socket
 import struct

@@ -38,5 +38,5 @@ def test_addresses_that_are_none(address):
 
 
 def test_an_address_that_cannot_be_published_at():
-    with pytest.raises(InputError, match="cannot be published at"):
+    with pytest.raises(InputError, match="cannot publish there"):
         PosePublisher("tcp://256.0.0.1:1")

@@ -183,7 +183,7 @@ def test_a_server_that_is_not_there_is_waited_for():
         port = free.getsockname()[1]
     items = Qualisys(f"qtm://127.0.0.1:{port}", RIG, pause=0.0).items()
     found = [next(items) for _ in range(20)]
-    assert [item.reason for item in found if item] == [f"qtm://127.0.0.1:{port}: cannot be connected to: ECONNREFUSED"]
+    assert [item.reason for item in found if item] == [f"qtm://127.0.0.1:{port}: cannot connect: ECONNREFUSED"]
     items.close()
 
 

@@ -56,7 +56,7 @@ def test_frames_among_blobs_are_told_and_not_silently_left_out():
     with SourceReader(Given(given), PAIR) as intake:
         found = taken(intake)
     assert [len(one.exposures) for one in found] == [2, 1, 2] and dict(intake.unreadable) == {"cam02": 1}
-    assert list(intake.reasons) == ["cam02: found a frame, expected blobs as in what came first"]
+    assert list(intake.reasons) == ["cam02: found a frame, expected blobs as in the first exposure"]
 
 
 @pytest.mark.parametrize("keep_all", [False, True])
@@ -148,6 +148,6 @@ def test_what_an_earlier_run_has_worked_on_is_left_out(known, new, before):
 
 def test_another_recording_that_is_not_later_is_refused():
     items = [Exposure(camera, 1.0, NOTHING, "a") for camera in PAIR.camera_names]
-    refused = pytest.raises(InputError, match="begins at 1 s, expected one after 5 s; --fresh begins anew")
+    refused = pytest.raises(InputError, match="begins at 1 s, expected one after 5 s; --fresh starts over")
     with refused, SourceReader(Given(items, live=False), PAIR, known=Known(5.0, "a", another=True)) as intake:
         intake.next(5.0)
