@@ -20,7 +20,8 @@ from scripts.output import ROOT
 
 LIST = ROOT / "tests" / "slow_tests.txt"
 LINE = re.compile(r"^\s*([\d.]+)s (?:call|setup|teardown)\s+(\S+?)(?:\[.*\])?\s*$")
-HEAD = """# Slow tests, by the start of their node ids. CI=true or `scripts/test --slow` runs them.
+HEAD = """# Slow tests, by the start of their node ids, and their seconds: several workers begin with the slowest files.
+# CI=true or `scripts/test --slow` runs them.
 # Generated from measured durations by: python -m scripts.slow_tests DURATIONS.log
 """
 
@@ -34,17 +35,20 @@ class Options:
     out: Path = LIST
 
 
-def slowest(log: str, seconds: float) -> list[str]:
-    """List the slowest tests, until the others fit into `seconds`; parametrized cases of a test count together."""
+def slowest(log: str, seconds: float) -> dict[str, float]:
+    """List the slowest tests and their seconds, until the others fit into `seconds`.
+
+    Parametrized cases of a test count together.
+    """
     spent: dict[str, float] = {}
     for line in log.splitlines():
         if found := LINE.match(line):
             spent[found[2]] = spent.get(found[2], 0.0) + float(found[1])
-    left, named = sum(spent.values()), list[str]()
+    left, named = sum(spent.values()), dict[str, float]()
     for name, took in sorted(spent.items(), key=lambda one: -one[1]):
         if left <= seconds:
             break
-        named.append(name)
+        named[name] = took
         left -= took
     return named
 
@@ -53,7 +57,7 @@ def main() -> None:
     """Read the durations, choose the slow tests, and write the list."""
     options = tyro.cli(Options, description=__doc__)
     named = slowest(options.log.read_text(), options.seconds)
-    write_text(options.out, HEAD + "".join(f"{name}\n" for name in sorted(named)))
+    write_text(options.out, HEAD + "".join(f"{name} {took:.1f}\n" for name, took in sorted(named.items())))
     print(f"{len(named)} tests in {options.out}")
 
 

@@ -2,18 +2,21 @@
 
 import os
 import shutil
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 from imgcal.io import load_object, read_rig
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import CameraRig
+from imgcal.types import CalibrationObject, CameraRig
 
 LEFT_OUT = pytest.StashKey[dict[str, int]]()
-SLOW = tuple(
-    line for line in (Path(__file__).parent / "slow_tests.txt").read_text().splitlines() if not line.startswith("#")
-)
+SLOW = {
+    name: float(seconds)
+    for name, seconds in (
+        line.split() for line in (Path(__file__).parent / "slow_tests.txt").read_text().splitlines() if line[0] != "#"
+    )
+}
 CHROMIUM = shutil.which("chromium")
 ARGUMENTS = [
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
@@ -27,17 +30,27 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Run slow tests in CI, and where paths are given; workers have the option from the process that started them."""
+    """Run slow tests in CI, and where paths are given; workers have the option from the process that started them.
+
+    Workers share the cores: with a thread of its own for each core, every one of them takes three times as long.
+    """
+    if getattr(config.option, "numprocesses", None):
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
     whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS
     if not hasattr(config, "workerinput") and (os.environ.get("CI") or not whole):
         os.environ["IMGCAL_SLOW_TESTS"] = "1"  # workers inherit the environment, and not what is set among the options
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out benchmarks' smokes and slow tests, unless they are asked for: by an option, by -m, or by name."""
+    """Leave out benchmarks' smokes and slow tests, unless they are asked for: by an option, by -m, or by name.
+
+    Several workers begin with the files that take longest, so that none of them is left for the end.
+    """
     for item in items:
-        if item.nodeid.startswith(SLOW):
+        if item.nodeid.startswith(tuple(SLOW)):
             item.add_marker(pytest.mark.slow)
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: -seconds_of_file(item.nodeid.partition("::")[0]))
     if config.option.markexpr:
         return
     named = any("test_benchmark" in argument for argument in config.args)
@@ -53,6 +66,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             config.hook.pytest_deselected(items=left)
             items[:] = [item for item in items if item not in set(left)]
     config.stash[LEFT_OUT] = counts
+
+
+@cache
+def seconds_of_file(file: str) -> float:
+    """What the slow tests of a file take together."""
+    return sum(seconds for name, seconds in SLOW.items() if name.partition("::")[0] == file)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:

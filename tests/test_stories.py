@@ -14,9 +14,7 @@ import numpy as np
 import pytest
 
 from imgcal.cli.main import main
-from imgcal.formats import in_millimetres, load_rig, read_foreign_rig, worst_difference
-from imgcal.formats.conversion import from_camera_rig
-from imgcal.formats.writing import select_cameras
+from imgcal.formats import from_camera_rig, in_millimetres, load_rig, read_foreign_rig, select_cameras, worst_difference
 
 ROOT = Path(__file__).parents[1]
 FENCE = re.compile(r"^```(python|console)\n(.*?)^```$", re.DOTALL | re.MULTILINE)

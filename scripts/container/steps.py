@@ -7,6 +7,7 @@ packages are those of this environment: downloads by pip and the base image itse
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -18,7 +19,7 @@ import sys
 import sysconfig
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,14 @@ HEALTHY_WITHIN = 180.0  # s
 
 def main() -> None:
     """Run every step; on failure, exit with that step's exit code."""
+    with build() as image:
+        image.start()
+    print("all steps run, and the page answers")
+
+
+@contextlib.contextmanager
+def build() -> Iterator[Image]:
+    """Run every instruction of the Dockerfile, in a folder that is removed at the end."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o755)
         image = Image(Path(folder))
@@ -39,8 +48,7 @@ def main() -> None:
             began = time.monotonic()
             image.step(keyword, rest)
             print(f"{time.monotonic() - began:6.1f} s  {keyword} {rest[:100]}", flush=True)
-        image.start()
-    print("all steps run, and the page answers")
+        yield image
 
 
 def instructions(text: str) -> Iterator[tuple[str, str]]:
@@ -56,7 +64,7 @@ class Image:
     """Folder that stands for the root of an image."""
 
     root: Path
-    environment: dict[str, str] = field(default_factory=lambda: {"PATH": os.environ["PATH"], "LANG": "C.UTF-8"})
+    environment: dict[str, str] = field(default_factory=lambda: {"LANG": "C.UTF-8"} | _passed_on())
     values: dict[str, str] = field(default_factory=dict)  # of ARG
     user: int | None = None
     start_with: dict[str, list[str]] = field(default_factory=dict)  # ENTRYPOINT, CMD, HEALTHCHECK
@@ -95,7 +103,7 @@ class Image:
         began = time.monotonic()
         with subprocess.Popen(self._found(command), cwd=self.root / "data", **self._as_user()) as process:
             try:
-                while subprocess.run(self._found(check), check=False, **self._as_user()).returncode:
+                while self.run(check).returncode:
                     if process.poll() is not None or time.monotonic() - began > HEALTHY_WITHIN:
                         raise SystemExit(f"{shlex.join(command)}: never healthy, exit code {process.poll()}")
                     time.sleep(0.5)
@@ -104,6 +112,10 @@ class Image:
                 process.wait(timeout=30)
             finally:
                 process.kill()
+
+    def run(self, command: Sequence[str], **options: Any) -> subprocess.CompletedProcess[str]:
+        """Run a command in the image as its user, whatever it returns."""
+        return subprocess.run(self._found(command), cwd=self.root / "data", check=False, **self._as_user(), **options)
 
     def _copy(self, source: str, target: Path, is_folder: bool) -> None:
         """Copy what .dockerignore sends to the builder."""
@@ -154,7 +166,7 @@ class Image:
             return {"env": environment}
         return {"env": environment, "user": self.user, "group": self.user, "extra_groups": []}
 
-    def _found(self, command: list[str]) -> list[str]:
+    def _found(self, command: Sequence[str]) -> list[str]:
         """Resolve a command's program in the image's PATH."""
         program = shutil.which(command[0], path=self.environment["PATH"])
         return [program or command[0], *command[1:]]
@@ -167,6 +179,11 @@ class Image:
     def _inside(self, text: str) -> str:
         """Translate the image's paths into paths of the folder."""
         return ROOTS.sub(lambda match: f"{self.root}/{match[1]}", text)
+
+
+def _passed_on() -> dict[str, str]:
+    """Variables of this environment that the image has too."""
+    return {name: os.environ[name] for name in ("PATH", "OMP_NUM_THREADS") if name in os.environ}
 
 
 if __name__ == "__main__":

@@ -14,11 +14,9 @@ import torch
 from scipy.optimize import least_squares
 
 from imgcal.cli.main import main
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import save_rig
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig, RigPrior
+from imgcal.types import CameraRig, Detections, RigPrior
 
 # Rotation, translation, focal length, principal point, distortion: sizes of a unit step in the fit.
 SCALE = np.array([0.1] * 3 + [10.0] * 3 + [100.0] * 4 + [0.1, 0.1, 0.01, 0.01, 1.0])

@@ -6,13 +6,10 @@ import numpy as np
 import torch
 
 from imgcal.estimation import EstimationOptions, estimate
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import load_object, read_rig
-from imgcal.synthesis.captures import simulate_truth
-from imgcal.synthesis.rigs import PhysicalDrift
-from imgcal.synthesis.simulated_rig import simulate_blobs
-from imgcal.types.observations import Observations
+from imgcal.synthesis import PhysicalDrift, simulate_blobs, simulate_truth
+from imgcal.types import Observations
 
 
 class Stream:

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.association.identity import PipelineOptions
+from imgcal.association import PipelineOptions
 from imgcal.io import load_object, read_rig
 from scripts.benchmarks.honesty_prediction import Case, judge, measure, table
 

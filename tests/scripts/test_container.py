@@ -4,9 +4,8 @@ import json
 import re
 import runpy
 import shlex
+import shutil
 import socket
-import subprocess
-import sys
 from pathlib import Path
 
 import numba
@@ -16,6 +15,7 @@ import yaml
 from imgcal import load_object, load_rig
 from imgcal.cli.main import parse
 from imgcal.live_page import LivePage, parse_address
+from scripts.container import steps
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "scripts" / "container"
@@ -99,10 +99,74 @@ def test_health_is_whether_the_page_answers(address):
     assert not answers(port)
 
 
+USE = """
+import json, sys
+from numba.core import event
+from numba.core.dispatcher import Dispatcher
+
+class Compiled(event.Listener):
+    names = []
+    def on_start(self, happening):
+        self.names.append(happening.data["dispatcher"].py_func.__qualname__)
+    def on_end(self, happening):
+        pass
+
+event.register("numba:compile", Compiled())
+
+from imgcal import RigKeeper, load_detections, load_object, load_rig
+from imgcal.cli.main import main
+from imgcal.io import open_capture
+
+sample, *networks = sys.argv[1:]
+given = ["--rig", sample + "/rig.yaml", "--object", sample + "/object.csv"]
+for guess in ("none", *networks):
+    assert main(["calibrate", sample, *given, "--out", "result", "--first-guess", guess]) == 0
+assert main(["detect", sample, "--out", "blobs.csv"]) == 0
+assert main(["score", "blobs.csv", *given]) == 0
+assert main(["render", sample, *given, "--out", "coded"]) == 0
+deep = ["--sensor.bit-depth", "12", "--sensor.polarity", "dark", "--kappa", "0.005"]
+cube = ["--rig", "O6", "--object", "cube8"]
+assert main(["simulate", *cube, "--out", "deep", "--snapshots", "2", *deep]) == 0
+assert main(["calibrate", "deep", *cube, "--out", "cube", "--polarity", "dark"]) == 0
+rig, obj = load_rig(given[1]), load_object(given[3])
+with RigKeeper(rig, obj, horizon=2) as keeper:
+    for number, (_, frames) in enumerate(open_capture(sample, rig).snapshots()):
+        keeper.update(frames, number / 60)
+assert main(["warmup"]) == 0
+ours = [
+    value
+    for name, module in list(sys.modules.items())
+    if name.startswith(("imgcal", "renderers"))
+    for value in vars(module).values()
+    if isinstance(value, Dispatcher) and value.targetoptions.get("inline") != "always"  # compiled where it is used
+]
+files = {f.py_func.__qualname__: f._cache._cache_file for f in ours if hasattr(f._cache, "_cache_file")}
+left = [name for name, file in files.items() if not file._load_index()]
+print(json.dumps([Compiled.names, sorted(left)]))
+"""
+NETWORKS = [ROOT / "data" / "models" / f"{name}-O10-asymmetric8.safetensors" for name in ("points", "vit")]
+UNUSED = {"_minimize_all", "_pair", "_gradients", "_through_profile"}  # many rigs at once, and training
+OTHER_LENSES = "_chosen.<locals>"  # compiled where a rig has one
+
+
 @pytest.mark.slow
-def test_the_steps_of_the_image_run_and_its_page_answers():
-    """Copying, building, installing, compiling, starting, health: all but the base image and pip's downloads."""
-    done = subprocess.run([sys.executable, FOLDER / "steps.py"], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "RUN imgcal warmup" in done.stdout and ": healthy\n" in done.stdout
-    assert done.stdout.endswith("all steps run, and the page answers\n")
+def test_the_image_is_built_has_all_compiled_and_its_page_answers(capfd):
+    """Copying, building, installing, compiling, starting, health: all but the base image and pip's downloads.
+
+    Everything is compiled when the image is built. Whatever is done there later compiles nothing.
+    """
+    with steps.build() as image:
+        told = capfd.readouterr()
+        assert "RUN imgcal warmup" in told.out
+        assert "imgcal: compiling, which takes a while" in told.err.splitlines()
+        assert re.search(rf"\d+ functions compiled in .* s, kept in {image.root}/var/cache/imgcal\n", told.err)
+        image.start()
+        assert ": healthy\n" in capfd.readouterr().out
+        (sample,) = image.root.glob("opt/imgcal/lib/python*/site-packages/imgcal/data/samples/O10")
+        networks = [shutil.copy(path, image.root / "data") for path in NETWORKS]
+        done = image.run(["python", "-c", USE, sample, *networks], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        compiled, left = json.loads(done.stdout.splitlines()[-1])
+        assert compiled == [] and "imgcal: compiling" not in done.stderr
+        assert "all was compiled already" in done.stderr
+        assert {name for name in left if not name.startswith(OTHER_LENSES)} == UNUSED

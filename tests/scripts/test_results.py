@@ -186,7 +186,7 @@ def test_bundle_adjustment(trained, tmp_path):
 
 def test_plain_bundle_adjustment_starts_at_the_projection_of_the_rig():
     from imgcal.io import load_object, read_rig
-    from imgcal.synthesis.rigs import synthesize
+    from imgcal.synthesis import synthesize
 
     module, obj = script("bundle_adjustment"), load_object("cube8")
     made = synthesize(read_rig("T4"), obj, 1, torch.Generator().manual_seed(2))

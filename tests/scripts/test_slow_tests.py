@@ -15,9 +15,9 @@ LOG = """
 
 
 def test_the_slowest_are_named_until_the_rest_fits():
-    assert slowest(LOG, 100.0) == []
-    assert slowest(LOG, 4.0) == ["tests/a/test_one.py::test_x"]
-    assert slowest(LOG, 0.6) == ["tests/a/test_one.py::test_x", "tests/a/test_two.py::test_y"]
+    assert slowest(LOG, 100.0) == {}
+    assert slowest(LOG, 4.0) == {"tests/a/test_one.py::test_x": 9.0}
+    assert slowest(LOG, 0.6) == {"tests/a/test_one.py::test_x": 9.0, "tests/a/test_two.py::test_y": 3.0}
 
 
 def test_every_line_of_the_list_names_a_test_that_is_there():

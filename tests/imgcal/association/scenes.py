@@ -8,11 +8,9 @@ import torch
 from imgcal.association.blobs import PaddedBlobs, gather
 from imgcal.association.hypotheses import Poses
 from imgcal.association.verification import Scene
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.synthesis.rigs import RelativeDrift, synthesize
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig
+from imgcal.geometry import RigidTransform
+from imgcal.synthesis import RelativeDrift, synthesize
+from imgcal.types import CalibrationObject, CameraRig, Detections
 
 DRIFT = RelativeDrift(0.02, 0.02)
 

@@ -6,8 +6,7 @@ import numpy as np
 import torch
 
 from imgcal.io import read_rig
-from imgcal.synthesis import simulate_volume, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift
+from imgcal.synthesis import PhysicalDrift, simulate_volume, true_detections
 from imgcal.types import CalibrationObject
 
 PAIR = ((-250.0, 0.0, 0.0), (250.0, 0.0, 0.0))

@@ -1,11 +1,11 @@
 import numpy as np
 import torch
 
-from imgcal.association.ambiguities import conflicts, differ, lattice_shifts, near_symmetries, relabel
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.io import load_object
-from imgcal.io.names import data_path
-from imgcal.types.calibration_object import CalibrationObject
+from imgcal.association import lattice_shifts, near_symmetries
+from imgcal.association.ambiguities import conflicts, differ, relabel
+from imgcal.geometry import RigidTransform
+from imgcal.io import data_path, load_object
+from imgcal.types import CalibrationObject
 
 
 def lattice(columns: int, rows: int) -> CalibrationObject:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from imgcal.association.assignment import assign, mutual_nearest, spacing
+from imgcal.association import mutual_nearest
+from imgcal.association.assignment import assign, spacing
 
 
 def cheapest(cost: np.ndarray, gate: float) -> float:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.blobs import FAR, gather, pattern_prior
+from imgcal.association import pattern_prior
+from imgcal.association.blobs import FAR, gather
 from imgcal.errors import InputError
-from imgcal.types.observations import BlobFlag
-from imgcal.types.rig import RigPrior
+from imgcal.types import BlobFlag, RigPrior
 from tests.imgcal.association.scenes import detections_of, take
 
 

@@ -6,15 +6,10 @@ import torch
 
 from imgcal.association import IdentityOptions, identification, identify, relocalize, track
 from imgcal.errors import InputError
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.io import load_object, read_rig
-from imgcal.io.names import data_path
-from imgcal.synthesis.captures import simulate_truth, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift, RelativeDrift, Snapshots, synthesize
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import BlobFlag, Detections
-from imgcal.types.rig import CameraRig
+from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.io import data_path, load_object, read_rig
+from imgcal.synthesis import PhysicalDrift, RelativeDrift, Snapshots, simulate_truth, synthesize, true_detections
+from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections
 
 DRIFT = RelativeDrift(0.05, 0.05)
 Associations = tuple[Detections, np.ndarray]

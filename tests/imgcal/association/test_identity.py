@@ -6,16 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association import Tracker, associate
-from imgcal.association.identity import PipelineOptions
+from imgcal.association import PipelineOptions, Tracker, associate
 from imgcal.errors import InputError
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import load_object
 from imgcal.pipeline import calibrate
-from imgcal.synthesis.captures import Truth, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift
-from imgcal.types.observations import Detections
+from imgcal.synthesis import PhysicalDrift, Truth, true_detections
+from imgcal.types import Detections
 
 CENTRE = torch.tensor([0.0, 0.0, 800.0], dtype=torch.float64)  # mm, what the ring of cameras looks at
 

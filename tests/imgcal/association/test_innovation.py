@@ -10,14 +10,10 @@ import torch
 from imgcal.association.blobs import gather
 from imgcal.association.innovation import THRESHOLD, find_contested, innovations
 from imgcal.association.verification import fit, make_problem, rig_and_pose, start
-from imgcal.estimation import levenberg_marquardt_cpu
-from imgcal.estimation.levenberg_marquardt import Solution
-from imgcal.estimation.linearization import Problem, State, linearize, pose_at, retract, rig_at
-from imgcal.io import load_object, read_rig
-from imgcal.io.names import data_path
-from imgcal.synthesis.rigs import synthesize
-from imgcal.types.observations import Detections
-from imgcal.types.rig import RigPrior
+from imgcal.estimation import Problem, Solution, State, levenberg_marquardt_cpu, linearize, pose_at, retract, rig_at
+from imgcal.io import data_path, load_object, read_rig
+from imgcal.synthesis import synthesize
+from imgcal.types import Detections, RigPrior
 from tests.imgcal.association.scenes import scene_of, take
 
 

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.merging import MOST_REACH, drop_merged, merging_distance
-from imgcal.association.series import Associations
-from imgcal.association.tracker import SnapshotIdentity
+from imgcal.association import Associations, SnapshotIdentity, drop_merged, merging_distance
+from imgcal.association.merging import MOST_REACH
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import load_object
-from imgcal.synthesis.arrangements import arrange_rig
-from imgcal.types.observations import BlobFlag, Detections
+from imgcal.synthesis import arrange_rig
+from imgcal.types import BlobFlag, Detections
 
 RIG = arrange_rig("ring", 3, 3000.0, height=0.0)
 WAND = load_object("wand4")

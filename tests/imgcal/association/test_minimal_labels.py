@@ -7,11 +7,8 @@ import pytest
 import torch
 
 from imgcal.association import relocalize
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Detections
-from imgcal.types.rig import RigPrior
+from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.types import CalibrationObject, Detections, RigPrior
 
 FLAT = np.array([[0.0, 0, 0], [220, 30, 0], [180, 190, 0], [-40, 140, 0]])
 SKEW = np.array([[0.0, 0, 0], [240, 0, 0], [90, 130, 0], [-60, 60, 0]])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from imgcal.association.p3p import rotation_towards, three_point_pose
-from imgcal.geometry.rotations import rotation_from_vector
+from imgcal.geometry import rotation_from_vector
 from tests.imgcal.association.scenes import degrees_between
 
 

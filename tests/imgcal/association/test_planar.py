@@ -9,7 +9,7 @@ import torch
 
 from imgcal.association.blobs import PaddedBlobs, gather
 from imgcal.association.planar import _affinity, _fit_homography, _pose, _rotation, _whiten, planar_poses
-from imgcal.geometry.rotations import rotation_from_vector
+from imgcal.geometry import rotation_from_vector
 from tests.imgcal.association.scenes import degrees_between, make_object, take
 
 

@@ -6,9 +6,8 @@ import torch
 
 from imgcal.association import associate, identify, match_to_rig, series, to_observations, tracker
 from imgcal.errors import InputError, RefusedError
-from imgcal.synthesis.captures import simulate_truth, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift
-from imgcal.types.calibration_object import CalibrationObject
+from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+from imgcal.types import CalibrationObject
 
 
 @pytest.fixture(scope="module")

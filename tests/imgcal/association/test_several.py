@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association import Associations, PipelineOptions, Tracker, associate
-from imgcal.association.identity import IdentityOptions
+from imgcal.association import Associations, IdentityOptions, PipelineOptions, Tracker, associate
 from imgcal.association.several import place_objects
 from imgcal.association.tracker import LearntRig
 from imgcal.pipeline import calibrate

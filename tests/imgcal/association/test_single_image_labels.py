@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.single_image_labels import is_small_planar, label_by_shape
+from imgcal.association import is_small_planar, label_by_shape
 from imgcal.io import load_object, read_rig
 from imgcal.synthesis import simulate_volume
 

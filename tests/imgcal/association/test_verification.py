@@ -25,7 +25,7 @@ from imgcal.association.verification import (
     settle_labels,
     start,
 )
-from imgcal.geometry.rotations import rotation_from_vector
+from imgcal.geometry import rotation_from_vector
 from imgcal.io import load_object
 from tests.imgcal.association.scenes import DRIFT, degrees_between, make_object, scene_of, take
 

@@ -11,7 +11,7 @@ import imgcal
 from imgcal.cli.main import main
 from imgcal.errors import InputError
 from imgcal.estimation import relative_difference
-from imgcal.geometry.rotations import vector_from_rotation
+from imgcal.geometry import vector_from_rotation
 from imgcal.io import (
     load_detections,
     load_object,
@@ -21,9 +21,8 @@ from imgcal.io import (
     save_detections,
     write_frame,
 )
-from imgcal.synthesis.captures import simulate_truth, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift, RelativeDrift
-from imgcal.types.observations import Detections
+from imgcal.synthesis import PhysicalDrift, RelativeDrift, simulate_truth, true_detections
+from imgcal.types import Detections
 from tests.imgcal.cli.calibrating import calibrate, one_line
 
 KEYS = {

@@ -5,9 +5,7 @@ import torch
 
 from imgcal.cli.main import main
 from imgcal.io import load_object, load_rig_covariance, read_rig, save_cameras, save_detections
-from imgcal.synthesis import arrange_rig, simulate_volume
-from imgcal.synthesis.captures import true_detections
-from imgcal.synthesis.rigs import PhysicalDrift
+from imgcal.synthesis import PhysicalDrift, arrange_rig, simulate_volume, true_detections
 from tests.imgcal.cli.calibrating import one_line
 
 

@@ -19,7 +19,7 @@ from imgcal.cli.common import (
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError
 from imgcal.io import open_capture
-from imgcal.synthesis.captures import simulate_truth, true_detections
+from imgcal.synthesis import simulate_truth, true_detections
 
 
 @pytest.mark.parametrize(

@@ -24,10 +24,10 @@ from imgcal.formats import (
     fill_image_sizes,
     in_millimetres,
     load_rig,
+    read_foreign_rig,
 )
 from imgcal.formats.conversion import NATIVE
 from imgcal.formats.fitting import fit_lens
-from imgcal.formats.registry import read_foreign_rig
 from tests.imgcal.formats.test_registry import SAMPLES
 
 TARGETS: dict[str, Format | None] = {OURS: None, **{one.name: one for one in FORMATS if one.write is not None}}

@@ -9,7 +9,7 @@ import pytest
 
 from imgcal.cli.main import main
 from imgcal.io import load_detections, load_object, save_detections, save_object, save_rig
-from imgcal.types.observations import BlobFlag
+from imgcal.types import BlobFlag
 from scripts.benchmarks import camera_faults as damage
 
 CAMERA = 3

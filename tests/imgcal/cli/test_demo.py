@@ -1,7 +1,7 @@
 import pytest
 
 from imgcal.cli.main import main
-from imgcal.live_page.demonstration import Demonstration
+from imgcal.live_page import Demonstration
 
 
 def test_the_address_is_printed_and_an_interruption_ends_it(monkeypatch, capsys):

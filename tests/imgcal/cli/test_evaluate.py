@@ -12,7 +12,7 @@ from imgcal.evaluation import QUICK_BASELINES
 from imgcal.fleet import StoredResults
 from imgcal.io import load_object, read_rig
 from imgcal.networks import Checkpoint, build_network, save_checkpoint
-from imgcal.training.experiment_file import load_experiment
+from imgcal.training import load_experiment
 from tests.imgcal.fleet.conftest import engine  # noqa: F401  one Ray for all tests
 
 EXPERIMENT = """

@@ -16,12 +16,10 @@ from imgcal.cli.main import main
 from imgcal.cli.watch import metrics_address
 from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform
-from imgcal.io import load_object, read_rig, save_detections, save_object, save_rig
-from imgcal.io.frames import write_frame
+from imgcal.io import load_object, read_rig, save_detections, save_object, save_rig, write_frame
 from imgcal.online import RigKeeper
 from imgcal.synthesis import Truth, simulate_volume, true_detections
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig, DriftRate, RigPrior
+from imgcal.types import CameraRig, Detections, DriftRate, RigPrior
 from imgcal.watch import Progress
 from tests.imgcal.streams import Stream
 from tests.imgcal.watch.test_marker_files import points_of

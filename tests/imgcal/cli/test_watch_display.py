@@ -8,9 +8,7 @@ from rich.console import Console
 
 from imgcal.cli import watch_display as module
 from imgcal.cli.watch_display import Display
-from imgcal.watch.exposures import Unreadable
-from imgcal.watch.metrics import Tally
-from imgcal.watch.source_reader import SourceReader
+from imgcal.watch import SourceReader, Tally, Unreadable
 from tests.imgcal.watch.states import RIG, event, some_state
 
 

@@ -8,7 +8,7 @@ from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from imgcal.detection import candidates, fitting, kernels
 from imgcal.detection import moments as moments_of
-from imgcal.types.observations import BlobFlag
+from imgcal.types import BlobFlag
 
 
 def components(frame, screening, invert=None):

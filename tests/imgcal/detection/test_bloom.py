@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from imgcal.detection import DetectionOptions, detect_frame
-from imgcal.types.observations import BlobFlag
+from imgcal.types import BlobFlag
 from tests.imgcal.detection.discs import draw_lamps, exposed, nearest
 
 SHAPE = (160, 160)

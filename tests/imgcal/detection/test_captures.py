@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from imgcal.detection import DetectionOptions, detect_frame
-from imgcal.types.observations import UNUSABLE, BlobFlag
+from imgcal.types import UNUSABLE, BlobFlag
 from tests.imgcal.detection.discs import nearest
 
 

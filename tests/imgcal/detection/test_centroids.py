@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from imgcal.detection import DetectionOptions
+from imgcal.detection import Blobs, DetectionOptions
 from imgcal.detection.candidates import block_means, outline, screen
-from imgcal.detection.centroids import Blobs, measure
-from imgcal.types.observations import BlobFlag
+from imgcal.detection.centroids import measure
+from imgcal.types import BlobFlag
 from tests.imgcal.detection.discs import draw_discs, exposed, nearest, scattered
 
 SHAPE = (160, 208)

@@ -7,7 +7,7 @@ import pytest
 
 from imgcal.detection import DetectionOptions, detect, detect_frame
 from imgcal.errors import InputError
-from imgcal.types.observations import BlobFlag
+from imgcal.types import BlobFlag
 from tests.imgcal.detection.discs import draw_discs, draw_patches, exposed, nearest, scattered
 
 SHAPE = (480, 640)

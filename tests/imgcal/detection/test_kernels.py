@@ -8,7 +8,7 @@ from imgcal.detection import DetectionOptions
 from imgcal.detection.candidates import block_means, outline, screen
 from imgcal.detection.centroids import measure
 from imgcal.detection.kernels import half_size
-from imgcal.types.observations import BlobFlag
+from imgcal.types import BlobFlag
 from tests.imgcal.detection import reference
 from tests.imgcal.detection.discs import draw_discs, draw_lamps, exposed, scattered
 

@@ -1,6 +1,6 @@
 import pytest
 
-from imgcal.detection.options import DetectionOptions
+from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError
 
 

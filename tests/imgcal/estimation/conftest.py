@@ -7,13 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from imgcal.estimation.linearization import Problem, State
-from imgcal.estimation.map_estimate import initial_state, make_problem
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.synthesis.rigs import Drift, PhysicalDrift, PoseRange, sample_rig_from_object
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Observations
-from imgcal.types.rig import CameraRig
+from imgcal.estimation import Problem, State, initial_state, make_problem
+from imgcal.geometry import RigidTransform
+from imgcal.synthesis import Drift, PhysicalDrift, PoseRange
+from imgcal.synthesis.rigs import sample_rig_from_object
+from imgcal.types import CalibrationObject, CameraRig, Observations
 
 
 @dataclass(frozen=True)

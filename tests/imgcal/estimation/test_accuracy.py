@@ -7,18 +7,11 @@ import torch
 
 from imgcal import InputError, PipelineOptions, calibrate, estimate, predicted_error
 from imgcal.cli.common import select_cameras
-from imgcal.estimation.accuracy import (
-    GRID,
-    MAP_DEPTHS,
-    MAP_SIZE,
-    WorkingVolume,
-    joint_covariance,
-    working_volume,
-)
-from imgcal.geometry.lenses import undistort
-from imgcal.synthesis.captures import simulate_truth, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift
-from imgcal.types.observations import Observations
+from imgcal.estimation import MAP_DEPTHS, MAP_SIZE, WorkingVolume
+from imgcal.estimation.accuracy import GRID, joint_covariance, working_volume
+from imgcal.geometry import undistort
+from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+from imgcal.types import Observations
 
 F64 = torch.float64
 

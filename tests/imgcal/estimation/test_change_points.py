@@ -5,10 +5,9 @@ import pytest
 import torch
 from scipy.stats import chi2
 
-from imgcal.association.series import accepted_observations, associate
-from imgcal.estimation import estimate
+from imgcal.association import accepted_observations, associate
+from imgcal.estimation import LEAST_SNAPSHOTS, estimate
 from imgcal.estimation.change_points import (
-    LEAST_SNAPSHOTS,
     STEP,
     dispersion,
     is_significant,
@@ -17,7 +16,7 @@ from imgcal.estimation.change_points import (
     linearize_snapshots,
 )
 from imgcal.estimation.linearization import jacobian_at
-from imgcal.types.rig import PARAMETERS
+from imgcal.types import PARAMETERS
 from scripts.benchmarks import camera_faults as damage
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from imgcal.estimation.correlation import autocorrelation, correlation_time
+from imgcal.estimation import autocorrelation, correlation_time
 
 
 def _autoregressive(rho: float, count: int, width: int, seed: int = 0) -> np.ndarray:

@@ -18,12 +18,13 @@ from imgcal.estimation import (
     pose_covariance,
     relative_covariance,
     relative_difference,
+    relative_jacobian,
+    retract,
+    rig_at,
 )
-from imgcal.estimation.covariance import relative_jacobian, remaining_variance
-from imgcal.estimation.linearization import retract, rig_at
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.synthesis.rigs import PhysicalDrift
+from imgcal.estimation.covariance import remaining_variance
+from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.synthesis import PhysicalDrift
 
 SQUARED = EstimationOptions(loss="squared", tolerance=1e-8)
 

@@ -7,7 +7,7 @@ import torch
 
 from imgcal.estimation import EstimationOptions, curvature, estimate
 from imgcal.estimation.curvature import curvature_covariance
-from imgcal.synthesis.rigs import PhysicalDrift, RelativeDrift
+from imgcal.synthesis import PhysicalDrift, RelativeDrift
 
 SQUARED = EstimationOptions(loss="squared")
 

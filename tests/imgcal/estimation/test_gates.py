@@ -8,14 +8,15 @@ from imgcal.estimation import (
     EstimationOptions,
     camera_covariance,
     estimate,
+    initial_state,
     levenberg_marquardt_cpu,
+    map_cost,
     relative_covariance,
     relative_difference,
 )
-from imgcal.estimation.implicit import map_cost
-from imgcal.estimation.map_estimate import RESTART_AFTER, initial_state
+from imgcal.estimation.map_estimate import RESTART_AFTER
 from imgcal.estimation.robust_losses import LOSSES
-from imgcal.synthesis.rigs import Drift, PhysicalDrift, RelativeDrift
+from imgcal.synthesis import Drift, PhysicalDrift, RelativeDrift
 
 SQUARED = EstimationOptions(loss="squared")
 

@@ -1,8 +1,7 @@
 import torch
 
-from imgcal.estimation.gauge import align
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.estimation import align
+from imgcal.geometry import RigidTransform, rotation_from_vector
 
 
 def test_a_motion_of_the_whole_rig_is_taken_out(o10, asymmetric8):

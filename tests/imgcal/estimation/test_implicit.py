@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation import EstimationOptions, estimate
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.observations import Observations
+from imgcal.geometry import RigidTransform
+from imgcal.types import Observations
 
 EXACT = {name: EstimationOptions(loss=name, tolerance=1e-18, max_iterations=40) for name in ("squared", "cauchy")}
 

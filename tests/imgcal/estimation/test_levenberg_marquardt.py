@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from imgcal.estimation import linearize, squared
 from imgcal.estimation.levenberg_marquardt import damped_step, minimize
-from imgcal.estimation.linearization import linearize
-from imgcal.estimation.robust_losses import LOSSES, squared
+from imgcal.estimation.robust_losses import LOSSES
 
 
 @pytest.mark.parametrize("snapshots", [1, 2, 10])  # ten snapshots of three cameras: snapshots are eliminated

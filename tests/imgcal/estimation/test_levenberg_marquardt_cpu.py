@@ -7,8 +7,7 @@ import numba
 import pytest
 import torch
 
-from imgcal.estimation import levenberg_marquardt, levenberg_marquardt_cpu
-from imgcal.estimation.levenberg_marquardt import NormalEquations, Solution
+from imgcal.estimation import NormalEquations, Solution, levenberg_marquardt, levenberg_marquardt_cpu
 from imgcal.estimation.robust_losses import LOSSES
 
 CASES = [

@@ -6,9 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from imgcal.estimation.implicit import map_cost
-from imgcal.estimation.linearization import Problem, State, linearize, points_at, pose_at, retract, rig_at
-from imgcal.estimation.robust_losses import cauchy, squared
+from imgcal.estimation import Problem, State, linearize, map_cost, points_at, pose_at, retract, rig_at, squared
+from imgcal.estimation.robust_losses import cauchy
 
 CASES = [((), 1, 3, 5), ((1,), 2, 4, 6), ((2, 3), 2, 3, 5), ((4,), 1, 4, 4)]
 

@@ -15,10 +15,10 @@ from imgcal.estimation import (
     levenberg_marquardt_cpu,
     linearize,
     make_problem,
+    retract,
     rig_at,
 )
 from imgcal.estimation.levenberg_marquardt import select_rows
-from imgcal.estimation.linearization import retract
 from imgcal.estimation.robust_losses import LOSSES, NamedLoss
 from imgcal.synthesis import simulate_truth
 from imgcal.types import CalibrationObject, Observations

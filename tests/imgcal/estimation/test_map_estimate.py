@@ -6,13 +6,12 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.estimation import Estimate, EstimationOptions, estimate
-from imgcal.estimation.map_estimate import equations_at, equations_by_snapshot
+from imgcal.estimation import Estimate, EstimationOptions, equations_at, estimate
+from imgcal.estimation.map_estimate import equations_by_snapshot
 from imgcal.estimation.robust_losses import NamedLoss
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.synthesis.rigs import RelativeDrift
-from imgcal.types.observations import Observations
-from imgcal.types.rig import RigPrior
+from imgcal.geometry import RigidTransform
+from imgcal.synthesis import RelativeDrift
+from imgcal.types import Observations, RigPrior
 
 SQUARED = EstimationOptions(loss="squared", tolerance=1e-10)
 

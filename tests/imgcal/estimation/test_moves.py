@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.series import accepted_observations, associate
-from imgcal.estimation import EstimationOptions, estimate
+from imgcal.association import accepted_observations, associate
+from imgcal.estimation import EstimationOptions, estimate, find_moves
 from imgcal.estimation.change_points import Step, dispersion
-from imgcal.estimation.moves import Change, Places, _outlasts_an_episode, find_moves
+from imgcal.estimation.moves import Change, Places, _outlasts_an_episode
 from scripts.benchmarks import camera_faults as faults
 
 CAMERA, FIRST, COUNT = 3, 15, 30

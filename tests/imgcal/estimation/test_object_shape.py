@@ -6,13 +6,18 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.estimation import EstimationOptions, estimate, object_shape, shape_modes
-from imgcal.estimation.object_shape import (
+from imgcal.estimation import (
+    EstimationOptions,
     ScaleEvidence,
     ShapeEvidence,
+    estimate,
+    object_shape,
+    offsets,
+    shape_modes,
+)
+from imgcal.estimation.object_shape import (
     learnt_tolerances,
     object_evidence,
-    offsets,
     pull_scatter,
     scale_evidence,
     shape_evidence,

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from imgcal.estimation import initial_pose
-from imgcal.geometry.rotations import geodesic_angle
-from imgcal.synthesis.rigs import PoseRange, sample_rig_from_object
-from imgcal.types.observations import Observations
+from imgcal.geometry import geodesic_angle
+from imgcal.synthesis import PoseRange
+from imgcal.synthesis.rigs import sample_rig_from_object
+from imgcal.types import Observations
 
 
 @pytest.mark.parametrize("batch", [(), (1,), (2, 3), (4,)])

@@ -6,16 +6,22 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.tracker import to_observations
-from imgcal.estimation import EstimationOptions, camera_covariance, estimate
+from imgcal.association import to_observations
+from imgcal.estimation import (
+    EstimationOptions,
+    UndeterminedPosesError,
+    camera_covariance,
+    estimate,
+    initial_state,
+    linearize,
+    make_loss,
+    make_problem,
+    require_poses,
+)
 from imgcal.estimation.levenberg_marquardt import minimize
-from imgcal.estimation.linearization import linearize
-from imgcal.estimation.map_estimate import initial_state, make_loss, make_problem
-from imgcal.estimation.pose_support import UndeterminedPosesError, require_poses
 from imgcal.io import read_rig
 from imgcal.pipeline import calibrate
-from imgcal.synthesis import simulate_volume, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift
+from imgcal.synthesis import PhysicalDrift, simulate_volume, true_detections
 from imgcal.types import CalibrationObject
 
 LIGHT = ((0.0, 0.0, 0.0),)

@@ -7,11 +7,10 @@ import pytest
 import torch
 
 from imgcal.errors import RefusedError
-from imgcal.estimation.pose_support import UndeterminedPosesError, require_poses
+from imgcal.estimation import UndeterminedPosesError, require_poses
 from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate
-from imgcal.synthesis import simulate_volume, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift
+from imgcal.synthesis import PhysicalDrift, simulate_volume, true_detections
 
 STEM = 3  # the fiducial of the wand that does not lie on a line with the others
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from imgcal.errors import RefusedError
-from imgcal.estimation.rig_initialization import cold_start
+from imgcal.estimation import cold_start
 from imgcal.io import load_object, read_rig
 from imgcal.synthesis import PhysicalDrift, arrange_rig, simulate_volume
 from imgcal.types import Observations, RigPrior

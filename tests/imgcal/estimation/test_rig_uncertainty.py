@@ -2,16 +2,10 @@ import pytest
 import torch
 
 from imgcal.errors import RefusedError
-from imgcal.estimation.rig_uncertainty import (
-    ROUNDS,
-    RigUncertainty,
-    aligned_covariance,
-    pixel_jacobian,
-    rigid_motion,
-    uncertainty_over,
-)
+from imgcal.estimation import RigUncertainty, pixel_jacobian, rigid_motion, uncertainty_over
+from imgcal.estimation.rig_uncertainty import ROUNDS, aligned_covariance
 from imgcal.evaluation.true_error import true_error
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform
 
 F64 = torch.float64
 

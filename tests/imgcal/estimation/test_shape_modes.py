@@ -7,8 +7,7 @@ import torch
 
 import imgcal
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
-from imgcal.types import CalibrationObject
-from imgcal.types.board import Board
+from imgcal.types import Board, CalibrationObject
 
 BEND = (0.4, -0.3)  # mm
 BOARD = Board("charuco", columns=6, rows=8, pitch=12.0, marker=9.0, dictionary="DICT_4X4_50")

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.estimation import camera_covariance, camera_std, estimate
+from imgcal.estimation import BlockScatter, block_scatter, camera_covariance, camera_std, estimate
 from imgcal.estimation.robust_losses import NamedLoss
-from imgcal.estimation.snapshot_scatter import BlockScatter, block_scatter
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform
 
 LOSS = NamedLoss("huber", 3.0)
 

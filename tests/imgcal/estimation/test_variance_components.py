@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.series import associate
+from imgcal.association import associate
 from imgcal.errors import RefusedError
 from imgcal.estimation import variance_components
 from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate, fit_labelled, fitting
-from imgcal.synthesis.captures import simulate_truth, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift
+from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from scripts.benchmarks import merging_wands
 
 

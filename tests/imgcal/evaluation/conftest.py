@@ -9,11 +9,10 @@ from torch import nn
 
 from imgcal.evaluation import Conditions
 from imgcal.evaluation.protocol import Sample, draw
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform
 from imgcal.io import load_object, read_rig
-from imgcal.synthesis import Corruption
-from imgcal.synthesis.rigs import PoseRange, RelativeDrift
-from imgcal.types.prediction import Prediction
+from imgcal.synthesis import Corruption, PoseRange, RelativeDrift
+from imgcal.types import Prediction
 
 Make = Callable[..., Conditions]
 

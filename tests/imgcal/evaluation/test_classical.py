@@ -9,7 +9,7 @@ import torch
 
 from imgcal.evaluation import classical
 from imgcal.evaluation.classical import calibrate_cameras, pnp
-from imgcal.types.prediction import Prediction
+from imgcal.types import Prediction
 
 
 def elsewhere(truth):

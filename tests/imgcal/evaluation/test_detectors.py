@@ -6,15 +6,7 @@ import pytest
 import torch
 
 from imgcal.detection import DetectionOptions
-from imgcal.evaluation.detectors import (
-    WRONG_PX,
-    WRONG_RATIO,
-    Contender,
-    Scene,
-    compare_detectors,
-    draw_capture,
-    judge,
-)
+from imgcal.evaluation import WRONG_PX, WRONG_RATIO, Contender, Scene, compare_detectors, draw_capture, judge
 from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate
 from imgcal.synthesis import FrameModel, PhysicalDrift, simulate_truth, true_detections

@@ -7,15 +7,20 @@ import torch
 from torch import nn
 
 from imgcal.errors import InputError
-from imgcal.evaluation.encoder_check import EncoderCheck, check_encoder
-from imgcal.evaluation.protocol import Conditions
-from imgcal.geometry.projection import resized_pixels
+from imgcal.evaluation import Conditions, EncoderCheck, check_encoder
+from imgcal.geometry import resized_pixels
 from imgcal.io import data_path
-from imgcal.networks import Network, PaperPointNetwork, PooledImageNetwork, load_checkpoint
-from imgcal.networks.config import PaperPoints, PooledImages
-from imgcal.networks.soft_positions import find_soft_positions
-from imgcal.synthesis.colour_coding import ImageOptions
-from imgcal.types.prediction import Views
+from imgcal.networks import (
+    Network,
+    PaperPointNetwork,
+    PaperPoints,
+    PooledImageNetwork,
+    PooledImages,
+    find_soft_positions,
+    load_checkpoint,
+)
+from imgcal.synthesis import ImageOptions
+from imgcal.types import Views
 
 
 @pytest.fixture(scope="module")

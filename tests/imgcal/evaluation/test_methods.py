@@ -3,21 +3,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.evaluation.methods import (
-    BASELINES,
-    QUICK_BASELINES,
-    factory_from_pnp,
-    keep_factory_rig,
-    map_from_pnp,
-    network_method,
-    pnp,
-    refine_by_positions,
-    steps_from_factory,
-)
-from imgcal.evaluation.metrics import errors
+from imgcal.evaluation import BASELINES, QUICK_BASELINES, errors, network_method, refine_by_positions
+from imgcal.evaluation.methods import factory_from_pnp, keep_factory_rig, map_from_pnp, pnp, steps_from_factory
 from imgcal.networks import Positions
-from imgcal.synthesis.colour_coding import ImageOptions
-from imgcal.types.prediction import Prediction
+from imgcal.synthesis import ImageOptions
+from imgcal.types import Prediction
 from tests.imgcal.evaluation.conftest import Fake, disturbed
 
 

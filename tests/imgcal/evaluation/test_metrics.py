@@ -3,11 +3,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.evaluation.metrics import KINDS, cramer_rao, errors, held_out_points, reprojection_error
-from imgcal.evaluation.protocol import Protocol, evaluate
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.types.prediction import Prediction
+from imgcal.evaluation import Protocol, cramer_rao, errors, evaluate, held_out_points, reprojection_error
+from imgcal.evaluation.metrics import KINDS
+from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.types import Prediction
 
 
 def test_a_prediction_that_is_the_truth_has_no_error(sample):

@@ -6,10 +6,11 @@ from dataclasses import replace
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.evaluation.models import _names, load_models
+from imgcal.evaluation import load_models
+from imgcal.evaluation.models import _names
 from imgcal.io import data_path, load_object, read_rig
 from imgcal.networks import load_checkpoint
-from imgcal.pipeline.initialization import load_initializer
+from imgcal.pipeline import load_initializer
 
 POINTS = data_path("models", "points-O10-asymmetric8.safetensors")
 

@@ -1,7 +1,6 @@
 import json
 
-from imgcal.evaluation.detectors import Outcome, Scene
-from imgcal.evaluation.outcome_tables import detector_tables, detector_values
+from imgcal.evaluation import Outcome, Scene, detector_tables, detector_values
 from imgcal.io import load_object, read_rig
 from imgcal.synthesis import FrameModel
 

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.evaluation import BASELINES, Conditions, Method, Protocol, evaluate, network_method
+from imgcal.evaluation import BASELINES, Conditions, Errors, Method, Protocol, Scores, evaluate, network_method
 from imgcal.evaluation.methods import Refined, keep_factory_rig
-from imgcal.evaluation.metrics import KINDS, Errors
-from imgcal.evaluation.protocol import LEAST_SIGMA, Scores, draw
+from imgcal.evaluation.metrics import KINDS
+from imgcal.evaluation.protocol import LEAST_SIGMA, draw
 from imgcal.synthesis import LEVELS, Degradation, ImageOptions
 from tests.imgcal.evaluation.conftest import Fake, straight_down
 

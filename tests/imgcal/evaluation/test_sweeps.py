@@ -4,7 +4,7 @@ import torch
 from imgcal.errors import InputError
 from imgcal.evaluation import AXES, Method, Protocol, sweep
 from imgcal.evaluation.methods import keep_factory_rig
-from imgcal.synthesis.rigs import RelativeDrift
+from imgcal.synthesis import RelativeDrift
 
 FACTORY = {"factory": Method(keep_factory_rig)}
 FEW = Protocol(count=6, trials=1)

@@ -4,11 +4,27 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.evaluation import EncoderCheck, Evaluation, Method, Protocol, Row, Scores, evaluate, network_method, sweep
+from imgcal.evaluation import (
+    EncoderCheck,
+    Evaluation,
+    Facts,
+    Latency,
+    Method,
+    Protocol,
+    Row,
+    Scores,
+    Summary,
+    as_tables,
+    describe,
+    evaluate,
+    markdown,
+    network_method,
+    sweep,
+    write,
+)
 from imgcal.evaluation.methods import keep_factory_rig
 from imgcal.evaluation.plots import draw_latency, draw_sweep, draw_training
-from imgcal.evaluation.tables import Facts, Summary, Table, as_tables, as_values, describe, markdown, write
-from imgcal.evaluation.timing import Latency
+from imgcal.evaluation.tables import Table, as_values
 from tests.imgcal.evaluation.conftest import Fake, straight_down
 
 HISTORY = ({"step": 10, "re_px": 9.0}, {"step": 20, "re_px": 5.0, "validation_re_px": 6.0})

@@ -1,6 +1,6 @@
-from imgcal.evaluation import Method, network_method
+from imgcal.evaluation import Method, latency, network_method
 from imgcal.evaluation.methods import keep_factory_rig
-from imgcal.evaluation.timing import WARM, latency
+from imgcal.evaluation.timing import WARM
 from tests.imgcal.evaluation.conftest import Fake, straight_down
 
 

@@ -3,10 +3,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.estimation.rig_uncertainty import rigid_motion, uncertainty_over
+from imgcal.estimation import rigid_motion, uncertainty_over
 from imgcal.evaluation.true_error import normalized_error, true_error
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform, rotation_from_vector
 
 F64 = torch.float64
 

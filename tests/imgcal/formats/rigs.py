@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imgcal.formats import ForeignCamera, ForeignRig, Lens, in_millimetres, read_foreign_rig, worst_difference
-from imgcal.formats.format import Files
+from imgcal.formats import Files, ForeignCamera, ForeignRig, Lens, in_millimetres, read_foreign_rig, worst_difference
 from imgcal.formats.values import rotation_from_vector
 
 

@@ -3,8 +3,8 @@ import pytest
 import torch
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.formats import Holds, fill_image_sizes, fit_to_target, from_camera_rig, to_camera_rig
-from imgcal.formats.conversion import NATIVE, describe_lens
+from imgcal.formats import Holds, describe_lens, fill_image_sizes, fit_to_target, from_camera_rig, to_camera_rig
+from imgcal.formats.conversion import NATIVE
 from imgcal.types import CameraRig
 from tests.imgcal.formats.rigs import apart, brown, fisheye, rig_of
 

@@ -4,7 +4,8 @@ from pathlib import Path
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats.documents import parse_document, parse_xml, read_document
+from imgcal.formats import parse_xml
+from imgcal.formats.documents import parse_document, read_document
 from imgcal.io import read_bytes
 from imgcal.io.names import MOST_BYTES
 

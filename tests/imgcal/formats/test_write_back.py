@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.formats import ForeignRig, from_camera_rig, known_points, to_camera_rig, write_into
-from imgcal.formats.conversion import NATIVE, fit_to_target
-from imgcal.formats.lens import Lens
+from imgcal.formats import ForeignRig, Lens, fit_to_target, from_camera_rig, known_points, to_camera_rig, write_into
+from imgcal.formats.conversion import NATIVE
 from tests.imgcal.formats import originals
 from tests.imgcal.formats.rigs import apart, brown, fisheye, read_in_mm, rig_of
 

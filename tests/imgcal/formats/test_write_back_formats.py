@@ -9,8 +9,17 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.formats import FORMATS, ForeignRig, convert_rig, from_camera_rig, select_cameras, to_camera_rig, write_into
-from imgcal.formats.conversion import NATIVE, fit_to_target
+from imgcal.formats import (
+    FORMATS,
+    ForeignRig,
+    convert_rig,
+    fit_to_target,
+    from_camera_rig,
+    select_cameras,
+    to_camera_rig,
+    write_into,
+)
+from imgcal.formats.conversion import NATIVE
 from tests.imgcal.formats.originals import drifted
 from tests.imgcal.formats.rigs import apart, brown, put_files, read_in_mm, rig_of
 from tests.imgcal.formats.test_write_back import damaged

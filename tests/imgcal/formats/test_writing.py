@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.formats import FORMATS, convert_rig, find_format, select_cameras
-from imgcal.formats.writing import OURS
+from imgcal.formats import FORMATS, OURS, convert_rig, find_format, select_cameras
 from imgcal.io import RigCovariance
 from tests.imgcal.formats.rigs import brown, rig_of
 

@@ -4,8 +4,9 @@ import pytest
 import torch
 from kornia.geometry.camera import distort_points_kannala_brandt, undistort_points_kannala_brandt
 
+from imgcal.geometry import LENS_MODELS
 from imgcal.geometry.kornia_distortion import kannala_brandt_distortion, opencv_distortion
-from imgcal.geometry.lenses import LENS_MODELS, distort
+from imgcal.geometry.lenses import distort
 from tests.imgcal.geometry.lens_cases import LENSES, coefficients, points
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from imgcal.geometry import distort_by_coefficients, distort_with_jacobian, lens_codes
 from imgcal.geometry.lens_kernels import by_coefficients, image_of, undistort, width_of
-from imgcal.geometry.lenses import distort_by_coefficients, distort_with_jacobian, lens_codes
 from renderers.compiling import njit
 from tests.imgcal.geometry.lens_cases import LENSES, coefficients, mixed
 

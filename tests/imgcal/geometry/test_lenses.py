@@ -6,21 +6,22 @@ import pytest
 import torch
 from torch import Tensor
 
-from imgcal.geometry.lenses import (
+from imgcal.geometry import (
     LENS_MODELS,
-    distort,
+    RigidTransform,
     distort_by_coefficients,
     distort_with_jacobian,
-    is_before_fold,
     lens_codes,
     lens_label,
     lens_names,
     lens_width,
+    project_cpu,
+    project_kornia,
     undistort,
+    undistort_cpu,
 )
-from imgcal.geometry.projection import project, project_kornia
-from imgcal.geometry.projection_cpu import project_cpu, undistort_cpu
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry.lenses import distort, is_before_fold
+from imgcal.geometry.projection import project
 from tests.imgcal.geometry.lens_cases import LENSES, coefficients, mixed, points
 
 FOCAL, CENTRE = torch.tensor([[700.0, 690.0]]).double(), torch.tensor([[640.0, 500.0]]).double()

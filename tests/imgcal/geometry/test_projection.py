@@ -12,19 +12,10 @@ from kornia.geometry.liegroup import Se3
 from kornia.geometry.quaternion import Quaternion
 from torch import Tensor
 
-from imgcal.geometry.lenses import undistort
-from imgcal.geometry.projection import (
-    NEAREST_DEPTH,
-    Projection,
-    apparent_centre_scale,
-    is_inside,
-    project,
-    project_kornia,
-)
-from imgcal.geometry.projection_cpu import undistort_cpu
-from imgcal.synthesis.rigs import RelativeDrift, synthesize
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import CameraRig
+from imgcal.geometry import NEAREST_DEPTH, Projection, project_kornia, undistort, undistort_cpu
+from imgcal.geometry.projection import apparent_centre_scale, is_inside, project
+from imgcal.synthesis import RelativeDrift, synthesize
+from imgcal.types import CalibrationObject, CameraRig
 
 SHAPES = [((), 4), ((1,), 4), ((2, 3), 4), ((4,), 4)]  # the last one has as many rigs as cameras
 FIDUCIALS = 5

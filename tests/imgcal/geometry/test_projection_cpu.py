@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.geometry.projection import NEAREST_DEPTH
-from imgcal.synthesis.rigs import PhysicalDrift
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import CameraRig
+from imgcal.geometry import NEAREST_DEPTH
+from imgcal.synthesis import PhysicalDrift
+from imgcal.types import CalibrationObject, CameraRig
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -2,7 +2,7 @@
 
 import torch
 
-from imgcal.geometry.lenses import distort_with_jacobian
+from imgcal.geometry import distort_with_jacobian
 from tests.imgcal.geometry.lens_cases import coefficients, points
 
 

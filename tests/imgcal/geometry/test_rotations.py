@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from imgcal.geometry.rotations import (
+from imgcal.geometry import (
     cross_matrix,
     euler_from_rotation,
     geodesic_angle,

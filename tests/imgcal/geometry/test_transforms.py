@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform, rotate
+from imgcal.geometry import RigidTransform, rotate, rotation_from_vector
 
 
 def transform(*shape: int, seed: int = 0) -> RigidTransform:

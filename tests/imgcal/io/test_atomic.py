@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.io.atomic import replacing, write_bytes, write_text
+from imgcal.io import replacing, write_bytes, write_text
 
 
 def test_replaces_the_content(tmp_path: Path) -> None:

@@ -9,8 +9,7 @@ import pytest
 from imgcal.errors import InputError
 from imgcal.io import load_object
 from imgcal.io.board_yaml import board_from_yaml, board_text
-from imgcal.types import CalibrationObject
-from imgcal.types.board import Board
+from imgcal.types import Board, CalibrationObject
 
 WHERE = Path("board.yaml")
 BOARDS = [

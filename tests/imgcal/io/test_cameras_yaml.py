@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.io.cameras_yaml import load_cameras, save_cameras
+from imgcal.io import load_cameras, save_cameras
 
 TEXT = """\
 format: imgcal-cameras/1

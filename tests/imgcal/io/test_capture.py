@@ -8,12 +8,9 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.io.capture import Capture, open_capture, open_input, save_capture_settings
-from imgcal.io.frames import Frame, write_frame
-from imgcal.io.names import data_path
-from imgcal.types.observations import Detections
-from imgcal.types.rig import CameraRig
+from imgcal.geometry import RigidTransform
+from imgcal.io import Capture, Frame, data_path, open_capture, open_input, save_capture_settings, write_frame
+from imgcal.types import CameraRig, Detections
 
 
 def make_rig(*names: str) -> CameraRig:

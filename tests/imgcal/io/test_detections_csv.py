@@ -8,13 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imgcal.errors import InputError
-from imgcal.io import csv_file
+from imgcal.io import DEFAULT_SIGMA, csv_file, load_detections, load_object, read_rig, save_detections
 from imgcal.io.csv_file import CHUNK, Chunk
-from imgcal.io.detections_csv import DEFAULT_SIGMA, load_detections, save_detections
-from imgcal.io.object_csv import load_object
-from imgcal.io.rig_yaml import read_rig
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.observations import Detections
+from imgcal.types import CalibrationObject, Detections
 
 COLUMNS = ("uv", "sigma", "camera", "snapshot", "fiducial", "radius", "flags")
 

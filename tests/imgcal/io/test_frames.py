@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from imgcal.errors import InputError
-from imgcal.io.frames import Video, count_frames, read_frame, write_frame
+from imgcal.io import Video, read_frame, write_frame
+from imgcal.io.frames import count_frames
 
 RNG = np.random.default_rng(0)
 GREY8 = RNG.integers(0, 256, (48, 64)).astype(np.uint8)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.io.frames import Video, count_frames, read_frame
+from imgcal.io import Video, read_frame
+from imgcal.io.frames import count_frames
 
 GREY = np.random.default_rng(0).integers(0, 255, (24, 32)).astype(np.uint8)
 

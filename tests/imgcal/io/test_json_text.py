@@ -2,7 +2,8 @@ import json
 
 import pytest
 
-from imgcal.io.json_text import MOST_DEPTH, read_json
+from imgcal.io import read_json
+from imgcal.io.json_text import MOST_DEPTH
 
 
 @pytest.mark.parametrize("value", [None, 3, "text", [1, [2, {"a": [3.5]}]], {"a": {"b": []}}, [], {}])

@@ -9,18 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imgcal.errors import InputError
-from imgcal.io.names import (
-    LONGEST_NAME,
-    MODEL,
-    check_regular,
-    find_file,
-    is_file_name,
-    model_file,
-    model_name,
-    natural_key,
-    nearest,
-    title_from_name,
-)
+from imgcal.io import MODEL, find_file, is_file_name, model_file, model_name, natural_key, nearest, title_from_name
+from imgcal.io.names import LONGEST_NAME, check_regular
 
 
 def test_numbers_in_names_count() -> None:

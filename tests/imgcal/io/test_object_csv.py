@@ -7,8 +7,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from imgcal.errors import InputError
-from imgcal.io.object_csv import load_object, save_object
-from imgcal.types.calibration_object import CalibrationObject
+from imgcal.io import load_object, save_object
+from imgcal.types import CalibrationObject
 from renderers.palette import palette
 
 GOOD = "x,y,z\n0,0,0\n1.5,0,0\n0,1,0\n0,0,1\n"

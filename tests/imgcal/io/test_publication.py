@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.io.atomic import DEAD_AFTER, PREFIX, PREVIOUS, is_unfinished, keep_previous, publishing, write_text
+from imgcal.io import PREVIOUS, keep_previous, publishing, write_text
+from imgcal.io.atomic import DEAD_AFTER, PREFIX, is_unfinished
 
 NAMES = ("report", "rig", "result")
 OLD = {"report": "old", "rig": "old", "result": "old", "mine": "untouched"}

@@ -3,8 +3,7 @@ from pathlib import Path
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.io import load_object, names, open_capture, open_input, read_rig
-from imgcal.io.names import data_path, sample_path, shipped_names
+from imgcal.io import data_path, load_object, names, open_capture, open_input, read_rig, sample_path, shipped_names
 
 
 def test_what_ships_is_there_and_can_be_read() -> None:

@@ -10,9 +10,9 @@ import torch
 import yaml
 
 from imgcal.errors import InputError
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.io.rig_yaml import RigCovariance, load_rig_covariance, read_rig, save_rig
-from imgcal.types.rig import RigPrior
+from imgcal.geometry import rotation_from_vector
+from imgcal.io import RigCovariance, load_rig_covariance, read_rig, save_rig
+from imgcal.types import RigPrior
 
 TEXT = """\
 format: imgcal-rig/1

@@ -7,12 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imgcal.errors import InputError
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.io.cameras_yaml import save_cameras
-from imgcal.io.rig_yaml import RigCovariance, load_rig_covariance, read_rig, save_rig
-from imgcal.types.rig import CameraRig, DriftRate, RigPrior
-from imgcal.types.volume import ConvexVolume
+from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.io import RigCovariance, load_rig_covariance, read_rig, save_cameras, save_rig
+from imgcal.types import CameraRig, ConvexVolume, DriftRate, RigPrior
 
 
 def make_rig(numbers: torch.Tensor, names: tuple[str, ...] = ("a", "b", "c")) -> CameraRig:

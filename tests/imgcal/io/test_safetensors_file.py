@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.io.safetensors_file import read_tensors, read_texts, write_tensors
+from imgcal.io import read_tensors, read_texts, write_tensors
 
 FORMAT = "imgcal-test/1"
 

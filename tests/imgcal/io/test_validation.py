@@ -7,7 +7,7 @@ import pytest
 from pydantic import Field
 
 from imgcal.errors import InputError
-from imgcal.io.validation import StrictModel, StrictRecord, validate
+from imgcal.io import StrictModel, StrictRecord, validate
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imgcal.errors import InputError
-from imgcal.io import StrictModel
-from imgcal.io.yaml_file import Flow, FlowMap, is_prose, parse_yaml, read_yaml, yaml_text
+from imgcal.io import Flow, StrictModel, is_prose, parse_yaml, read_yaml, yaml_text
+from imgcal.io.yaml_file import FlowMap
 
 
 class Lens(StrictModel):

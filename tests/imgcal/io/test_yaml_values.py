@@ -3,8 +3,7 @@ import itertools
 import pytest
 import yaml
 
-from imgcal.io import yaml_file
-from imgcal.io.names import data_path
+from imgcal.io import data_path, yaml_file
 from imgcal.io.yaml_file import MOST_DEPTH, read_values
 
 

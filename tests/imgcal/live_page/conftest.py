@@ -2,8 +2,7 @@
 
 import pytest
 
-from imgcal.live_page.address import Address
-from imgcal.live_page.live_page import LivePage
+from imgcal.live_page import Address, LivePage
 from tests.imgcal.live_page.pages import ACTIONS, Client, Stream, made_state
 
 

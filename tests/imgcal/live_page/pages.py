@@ -8,13 +8,12 @@ import time
 import numpy as np
 import torch
 
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.live_page.commands import Action
+from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.live_page import Action
 from imgcal.monitoring import RigBelief
 from imgcal.online import Event, RigState
-from imgcal.synthesis.captures import Truth, true_detections
-from imgcal.types.rig import CameraRig
+from imgcal.synthesis import Truth, true_detections
+from imgcal.types import CameraRig
 
 ACTIONS = (Action("bump", "Bump it", of_camera=True), Action("warm", "Warm up", undo="Cool down"))
 

@@ -3,8 +3,8 @@ from dataclasses import replace
 
 import pytest
 
+from imgcal.live_page import Command
 from imgcal.live_page.acknowledgements import MOST_EVENTS, Acknowledgements
-from imgcal.live_page.commands import Command
 from imgcal.live_page.contents import event_message
 from tests.imgcal.live_page.pages import ACTIONS, alarm
 

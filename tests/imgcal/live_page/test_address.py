@@ -3,7 +3,8 @@ import socket
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.live_page.address import Address, check_token, is_loopback, parse_address
+from imgcal.live_page import Address, parse_address
+from imgcal.live_page.address import check_token, is_loopback
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 import pytest
 
-from imgcal.live_page.commands import Action, Command, read_command
+from imgcal.live_page import Action, Command
+from imgcal.live_page.commands import read_command
 
 CAMERAS, ACTIONS = ("left", "right"), {"bump": Action("bump", "Bump", of_camera=True), "warm": Action("warm", "Warm")}
 

@@ -1,8 +1,8 @@
 import time
 
 from imgcal.io import read_rig
-from imgcal.live_page.address import Address
-from imgcal.live_page.demonstration import SETTLED, Demonstration
+from imgcal.live_page import Address, Demonstration
+from imgcal.live_page.demonstration import SETTLED
 from tests.imgcal.live_page.pages import Client
 
 

@@ -8,7 +8,7 @@ from imgcal.live_page.contents import belief_message, rig_message
 from imgcal.live_page.guidance import compare, compute_guidance, information_gain
 from imgcal.live_page.rig_drawing import viewing_volume
 from imgcal.monitoring import RigBelief, absorb
-from imgcal.types.observations import Observations
+from imgcal.types import Observations
 from tests.imgcal.live_page.pages import made_state
 
 PLACES = torch.tensor([[0.0, 0.0, 850.0], [150.0, 80.0, 800.0], [0.0, 0.0, -500.0]]).double()

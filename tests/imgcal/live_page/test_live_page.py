@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
+from imgcal.live_page import Address, LivePage
 from imgcal.live_page import live_page as module
-from imgcal.live_page.address import Address
-from imgcal.live_page.live_page import LivePage
 from tests.imgcal.live_page.pages import ACTIONS, Client, Stream, alarm, made_state
 
 

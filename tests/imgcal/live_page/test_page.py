@@ -13,10 +13,7 @@ from dataclasses import replace
 import pytest
 
 from imgcal.io import read_rig
-from imgcal.live_page.address import Address
-from imgcal.live_page.commands import Command
-from imgcal.live_page.demonstration import Demonstration
-from imgcal.live_page.live_page import LivePage
+from imgcal.live_page import Address, Command, Demonstration, LivePage
 from imgcal.live_page.page import live_page, report_page
 from tests.imgcal.live_page.pages import ACTIONS, Client, alarm, dome, made_state
 

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from imgcal.live_page import Address, Command
 from imgcal.live_page.acknowledgements import MOST_EVENTS
-from imgcal.live_page.address import Address
-from imgcal.live_page.commands import Command
 from imgcal.live_page.contents import event_message, greeting, picture_message, state_message
 from imgcal.live_page.page_state import MOST_VISITED, PageState
 from imgcal.live_page.rig_drawing import viewing_volume

@@ -2,8 +2,8 @@ import hmac
 
 import pytest
 
-from imgcal.live_page.address import Address
-from imgcal.live_page.security import Allowance, Gate
+from imgcal.live_page import Address, Gate
+from imgcal.live_page.security import Allowance
 
 TOKEN = "a-token-of-this-test"
 LOCAL, REMOTE = Gate(Address("127.0.0.1", 8765), TOKEN), Gate(Address("0.0.0.0", 8765), TOKEN)

@@ -6,9 +6,7 @@ import time
 
 import pytest
 
-from imgcal.live_page.address import Address
-from imgcal.live_page.commands import Command
-from imgcal.live_page.live_page import LivePage
+from imgcal.live_page import Address, Command, LivePage
 from imgcal.live_page.server import MOST_BODY
 from tests.imgcal.live_page.pages import Client, alarm, made_state
 

@@ -3,7 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from imgcal.live_page.page import round_values, stream_event, to_json
+from imgcal.live_page import to_json
+from imgcal.live_page.page import round_values, stream_event
 
 
 def test_numbers_are_short_and_what_is_none_is_null():

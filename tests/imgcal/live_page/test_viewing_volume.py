@@ -5,7 +5,7 @@ import torch
 
 from imgcal.io import read_rig
 from imgcal.live_page.rig_drawing import viewing_volume
-from imgcal.types.volume import ConvexVolume
+from imgcal.types import ConvexVolume
 from tests.imgcal.live_page.pages import dome
 
 

@@ -8,14 +8,25 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.estimation.linearization import NormalEquations, Problem, State, pose_at, retract
-from imgcal.estimation.map_estimate import EstimationOptions, equations_at, initial_state, make_loss, make_problem
-from imgcal.estimation.rig_error import displace, error_between, step_by_error
+from imgcal.estimation import (
+    EstimationOptions,
+    NormalEquations,
+    Problem,
+    State,
+    displace,
+    equations_at,
+    error_between,
+    initial_state,
+    make_loss,
+    make_problem,
+    pose_at,
+    retract,
+    step_by_error,
+)
 from imgcal.geometry import RigidTransform
-from imgcal.monitoring import measurement_update_cpu
+from imgcal.monitoring import MeasurementUpdate, RigBelief, SnapshotInformation, measurement_update_cpu
 from imgcal.monitoring.measurement_update_cpu import DAMPED, MOST_DAMPING, SLACK, STALLED, WHY_NOT
-from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, cholesky_factor, whiten
-from imgcal.monitoring.snapshot_information import SnapshotInformation
+from imgcal.monitoring.rig_belief import cholesky_factor, whiten
 from imgcal.types import Observations
 
 

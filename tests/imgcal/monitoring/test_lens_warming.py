@@ -4,8 +4,8 @@ import pytest
 import torch
 
 import imgcal
+from imgcal.monitoring import CHANGES
 from imgcal.monitoring.case import Case
-from imgcal.monitoring.change_test import CHANGES
 from imgcal.monitoring.explanations import Steady, weigh
 from imgcal.monitoring.lens_warming import LEAST_SECONDS, MOST_SECONDS, OWN_PACE, PACE, Warmed
 from imgcal.monitoring.object_change import ObjectChanged

@@ -178,19 +178,19 @@ def test_of_a_camera_that_moves_within_the_first_snapshots_no_other_and_no_objec
 
 
 def test_a_camera_of_which_it_cannot_be_told_yet_is_undecided_until_it_is() -> None:
-    """At 60 snapshots a second the first ones do not tell a camera that has moved from one that always was late."""
+    """At 30 snapshots a second the first ones do not tell a camera that has moved from one that always was late."""
     bump = Bump(4, 2, "rotation", 0.005)
-    conditions = Conditions(labelled=True)
+    conditions = Conditions(labelled=True, rate=30.0)
     made = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 23, conditions, [bump])
-    poses, (observations, _) = made.poses_at(torch.arange(90, dtype=torch.float64) / 60), made.labelled(0, 90)
+    poses, (observations, _) = made.poses_at(torch.arange(60, dtype=torch.float64) / 30), made.labelled(0, 60)
     monitor, told, undecided = RigMonitor(RigFilter(made.factory, made.obj)), [], []
-    for s in range(90):
+    for s in range(60):
         one = observations.of_snapshots([s])
-        told += [(s, change.camera) for change in monitor.update(one, poses[s : s + 1], 1 / 60).changes]
+        told += [(s, change.camera) for change in monitor.update(one, poses[s : s + 1], 1 / 30).changes]
         undecided.append(set(monitor.undecided))
     assert told and {camera for _, camera in told} == {2}
     first = told[0][0]
-    assert undecided[:4] == [set()] * 4 and undecided[first:] == [set()] * (90 - first)
+    assert undecided[:4] == [set()] * 4 and undecided[first:] == [set()] * (60 - first)
     assert first > 8 and undecided[6:first] == [{2}] * (first - 6)
 
 

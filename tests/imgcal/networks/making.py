@@ -4,8 +4,7 @@ import torch
 
 from imgcal.io import load_object, read_rig
 from imgcal.networks import NetworkConfig, build
-from imgcal.synthesis.colour_coding import render_views
-from imgcal.synthesis.rigs import RelativeDrift, synthesize
+from imgcal.synthesis import RelativeDrift, render_views, synthesize
 from imgcal.types import Views
 from tests.imgcal.lensed import lensed
 

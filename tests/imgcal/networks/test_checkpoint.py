@@ -8,12 +8,11 @@ import torch
 from safetensors.torch import save
 
 from imgcal.errors import InputError
-from imgcal.io import load_object, read_rig
-from imgcal.io.safetensors_file import read_tensors, write_tensors
+from imgcal.io import load_object, read_rig, read_tensors, write_tensors
 from imgcal.networks import Checkpoint, build_network, load_checkpoint, load_network, save_checkpoint, warm_start
 from imgcal.networks.checkpoint import FORMAT
 from imgcal.training import checkpoint_experiment
-from imgcal.types.prediction import Views
+from imgcal.types import Views
 from tests.imgcal.training.toy import Toy, experiments
 
 

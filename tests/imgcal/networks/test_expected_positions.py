@@ -3,7 +3,7 @@ import torch
 
 import imgcal
 from imgcal.geometry import RigidTransform
-from imgcal.networks.expected_positions import Expectation, cut_crops, cut_patches
+from imgcal.networks import Expectation, cut_crops, cut_patches
 from imgcal.types import CropPlacement
 
 

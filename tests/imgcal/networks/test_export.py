@@ -10,6 +10,8 @@ import torch
 from imgcal.errors import InputError
 from imgcal.io import model_file
 from imgcal.networks import (
+    InfraredConfig,
+    InfraredNetwork,
     Measurer,
     MeasurerConfig,
     drawing_from,
@@ -19,7 +21,6 @@ from imgcal.networks import (
     save_onnx,
 )
 from imgcal.networks.export import _measurer, _points, _query, difference
-from imgcal.networks.infrared import InfraredConfig, InfraredNetwork
 from imgcal.synthesis import render_crops, sample_scenes
 from imgcal.types import PATCH_SIZE
 from tests.imgcal.networks.making import make

@@ -7,8 +7,7 @@ import torch
 from torch import nn
 
 from imgcal.errors import InputError
-from imgcal.networks import NetworkConfig
-from imgcal.networks.config import Images
+from imgcal.networks import Images, NetworkConfig
 from imgcal.networks.feature_maps import make_encoder
 from tests.imgcal.networks.making import make, snapshots, views
 

@@ -7,7 +7,7 @@ from imgcal.errors import InputError
 from imgcal.io import load_object, read_rig
 from imgcal.networks import NetworkConfig, Positions, build
 from imgcal.nn import MapEstimate, project_fiducials
-from imgcal.synthesis.colour_coding import ImageOptions, render_views
+from imgcal.synthesis import ImageOptions, render_views
 from imgcal.types import Observations, Views
 from tests.imgcal.networks.making import DRIFT, make, snapshots, views
 

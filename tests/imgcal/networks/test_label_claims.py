@@ -1,7 +1,6 @@
 import torch
 
-from imgcal.networks import Evidence
-from imgcal.networks.label_claims import claim
+from imgcal.networks import Evidence, claim
 
 SIZE = 8
 

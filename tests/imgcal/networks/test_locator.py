@@ -4,7 +4,8 @@ import pytest
 import torch
 from torch import nn
 
-from imgcal.networks.locator import CROP, PositionNetwork, _centre, _crops
+from imgcal.networks import PositionNetwork
+from imgcal.networks.locator import CROP, _centre, _crops
 from imgcal.synthesis import ImageOptions
 
 

@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import load_object, read_rig
-from imgcal.networks.parameterization import POSE_SHIFT, Parameterization
-from imgcal.synthesis.rigs import RelativeDrift, synthesize
-from imgcal.types.parameter_vectors import pack18, pack21
-from imgcal.types.prediction import Prediction
+from imgcal.networks import Parameterization
+from imgcal.networks.parameterization import POSE_SHIFT
+from imgcal.synthesis import RelativeDrift, synthesize
+from imgcal.types import Prediction, pack21
+from imgcal.types.parameter_vectors import pack18
 from tests.imgcal.lensed import KINDS, lensed
 
 DRIFT = RelativeDrift(0.03, 0.03)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from imgcal.networks.soft_positions import find_soft_positions
+from imgcal.networks import find_soft_positions
 from renderers import palette, splat
 
 COLOURS = palette(8)

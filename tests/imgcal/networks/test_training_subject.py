@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.networks.training_subject import check_object, check_rig
+from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.networks import check_object, check_rig
 
 
 def test_single_precision_is_the_same_rig_and_object(o10, asymmetric8) -> None:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.identity import PipelineOptions
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.association import PipelineOptions
+from imgcal.geometry import RigidTransform
 from imgcal.monitoring import RigBelief
 from imgcal.online import camera_search
 from imgcal.online.camera_search import LONGEST_REST, NEARBY_TRIES, REMEMBERED, SUSPICIOUS, Search, Surroundings

@@ -216,7 +216,7 @@ def test_a_clock_that_slips_by_nobody_knows_how_much_is_told_as_that_and_as_no_m
 
 
 @pytest.mark.parametrize(
-    ("rate", "first", "count"), [(60.0, 70, 7), (60.0, 70, 30), (15.0, 60, 4), (1.0, 100, 3), (0.1, 100, 2)]
+    ("rate", "first", "count"), [(60.0, 70, 7), (60.0, 70, 30), (15.0, 60, 4), (1.0, 40, 3), (0.1, 40, 2)]
 )
 def test_a_camera_that_is_shaken_is_in_doubt_until_it_stands_still_and_then_told_as_moved(
     rate: float, first: int, count: int
@@ -227,7 +227,7 @@ def test_a_camera_that_is_shaken_is_in_doubt_until_it_stands_still_and_then_told
     made = stream(1, conditions=Conditions(rate=rate), bumps=steps)
     events, health = [], []
     with RigKeeper(made.factory, made.obj) as keeper:
-        for time, blobs in made.snapshots(first + count + 60):
+        for time, blobs in made.snapshots(first + count + 40):
             state = keeper.update(blobs, time)
             events += state.events
             health.append(state.cameras)
@@ -301,7 +301,7 @@ def test_clocks_of_half_of_the_cameras_that_slip_at_once_are_told_and_nothing_el
 @pytest.mark.parametrize("rate", [4.0, 60.0])
 def test_a_camera_that_is_late_from_the_first_snapshot_on_is_told_as_that_or_doubted(rate: float) -> None:
     made = stream(1, conditions=Conditions(rate=rate), slips=[Slip(0, 1, 0.02)])
-    events, last = events_of(made, 50 if rate < 60 else 150)
+    events, last = events_of(made, 50 if rate < 60 else 100)
     assert {(event.kind, event.camera) for event in events} == {("clock_slip", "cam02")}
     assert last.cameras["cam02"] in ("ok", "doubtful")
 
@@ -327,8 +327,8 @@ def test_clocks_that_are_set_are_no_years_of_drift(leap: float) -> None:
     """From 1970, as after a start without a network, or of another month."""
     made = stream(5)
     with RigKeeper(made.factory, made.obj) as keeper:
-        for number, (time, blobs) in enumerate(made.snapshots(120)):
-            state = keeper.update(blobs, time % 1e8 + leap * (number >= 60))
+        for number, (time, blobs) in enumerate(made.snapshots(80)):
+            state = keeper.update(blobs, time % 1e8 + leap * (number >= 40))
             assert state.events == () and set(state.cameras.values()) == {"ok"}
             assert normalized(state, made.rig) < 2.0
     prior = (made.factory.prior or RigPrior()).std(made.factory)
@@ -372,12 +372,13 @@ def test_a_bump_of_a_camera_that_sends_less_often_is_told_though_it_is_never_see
 
 def test_another_object_is_told_while_a_camera_is_held() -> None:
     made = stream(1, conditions=Conditions(clutter=0.0, labelled=True), slips=[Slip(30, 1, 0.25)])
-    points, events = made.obj.points, []
+    points, told, number = made.obj.points, set(), 0
     with RigKeeper(made.factory, made.obj) as keeper:
-        for number in range(100):
+        while number < 100 and "object_exchanged" not in told:
             made.obj = replace(made.obj, points=points * (1.2 if number >= 60 else 1.0))
-            events += keeper.update(made.snapshot(number), number / 60).events
-    assert "object_exchanged" in {event.kind for event in events}
+            told |= {event.kind for event in keeper.update(made.snapshot(number), number / 60).events}
+            number += 1
+    assert number > 60 and "object_exchanged" in told
 
 
 def test_lenses_that_warm_up_are_no_other_object() -> None:

@@ -19,8 +19,7 @@ import torch
 import imgcal
 from imgcal.errors import InputError
 from imgcal.online import RigKeeper, RigState
-from imgcal.types import CalibrationObject, CameraRig, ConvexVolume, DriftRate, RigPrior
-from imgcal.types.board import Board
+from imgcal.types import Board, CalibrationObject, CameraRig, ConvexVolume, DriftRate, RigPrior
 from scripts.benchmarks.rig_streams import Bump, Stream
 
 CHILD = """

@@ -1,6 +1,7 @@
 import numpy as np
 
-from imgcal.online.light_tracks import HIDDEN_SECONDS, STILL_SECONDS, LightTracks
+from imgcal.online import LightTracks
+from imgcal.online.light_tracks import HIDDEN_SECONDS, STILL_SECONDS
 
 
 def test_lights_keep_their_numbers_while_they_move() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.identity import PipelineOptions
+from imgcal.association import PipelineOptions
 from imgcal.online.prediction_labels import (
     TOO_NEAR,
     find_displaced_cameras,

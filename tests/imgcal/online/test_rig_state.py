@@ -10,8 +10,7 @@ import torch
 import imgcal
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.monitoring import RigBelief
-from imgcal.online import RigState
-from imgcal.online.rig_state import CameraHealth
+from imgcal.online import CameraHealth, RigState
 from imgcal.types import Detections
 
 

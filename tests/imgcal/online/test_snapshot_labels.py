@@ -11,15 +11,25 @@ from scripts.benchmarks.rig_streams import Conditions
 from tests.imgcal.online.memories import Remembered
 
 
-def test_a_snapshot_is_followed_by_the_last_pose_and_else_decided_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    made, decided = Remembered(), []
-    own = made.labelling.decide
-    monkeypatch.setattr(made.labelling, "decide", lambda *given: (decided.append(made.memory.count), own(*given))[1])
+def test_a_snapshot_is_labelled_by_the_last_pose_and_else_by_itself() -> None:
+    made = Remembered()
     made.learn(5)
-    assert decided == [1]
+    blobs = made.blobs()
+    followed = made.labelled(blobs)
+    assert made.labelling.follows  # a snapshot that is labelled by itself ends that
     made.labelling.follows = False
-    made.learn(1)
-    assert decided == [1, 6]
+    decided = made.labelled(blobs)
+    assert not made.labelling.follows
+    np.testing.assert_array_equal(followed.checked.blobs.fiducial, decided.checked.blobs.fiducial)
+
+
+def test_an_object_that_is_not_where_the_last_pose_predicts_is_found_again() -> None:
+    made = Remembered(conditions=Conditions(clutter=0.0, hidden=0.0))
+    made.learn(5)
+    made.memory.count += 120
+    blobs = made.blobs()  # two seconds later
+    found = made.labelled(blobs)
+    assert not made.labelling.follows and found.checked.labels == len(blobs)
 
 
 def test_labels_are_the_true_ones() -> None:

@@ -20,8 +20,7 @@ from imgcal.online.keeper_file import FORMAT
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.labelling import Labelling
 from imgcal.online.state_document import NOT_SAVED, StateReader, StateWriter, is_union, state_entries
-from imgcal.types import CalibrationObject
-from imgcal.types.board import Board
+from imgcal.types import Board, CalibrationObject
 
 KEYS = Path(__file__).parent / f"state_keys_{FORMAT.rpartition('/')[2]}.txt"
 

@@ -6,8 +6,7 @@ import torch
 
 from imgcal.errors import RefusedError
 from imgcal.io import load_object
-from imgcal.pipeline import calibrate, unit_doubt
-from imgcal.pipeline.from_scratch import calibrate_from_scratch
+from imgcal.pipeline import calibrate, calibrate_from_scratch, unit_doubt
 from imgcal.synthesis import HandHeld, PhysicalDrift, arrange_rig, simulate_volume, true_detections
 from imgcal.types import ConvexVolume, RigPrior
 

@@ -8,15 +8,12 @@ import torch
 from torch import nn
 
 from imgcal.errors import InputError
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import data_path, load_object, read_rig
-from imgcal.pipeline import calibrate, rms_length
-from imgcal.pipeline.initialization import KINDS, Initializer, load_initializer
-from imgcal.synthesis.captures import simulate_truth, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, RelativeDrift, synthesize
-from imgcal.types import Prediction
-from imgcal.types.observations import Observations
+from imgcal.pipeline import calibrate, load_initializer, rms_length
+from imgcal.pipeline.initialization import KINDS, Initializer
+from imgcal.synthesis import PhysicalDrift, PoseRange, RelativeDrift, simulate_truth, synthesize, true_detections
+from imgcal.types import Observations, Prediction
 
 SNAPSHOTS = 3
 

@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imgcal.association.identity import PipelineOptions
-from imgcal.association.series import associate
+from imgcal.association import PipelineOptions, associate
 from imgcal.errors import RefusedError
-from imgcal.pipeline import LabelCounts, calibrate
-from imgcal.pipeline.fitting import fit_labelled
+from imgcal.pipeline import LabelCounts, calibrate, fit_labelled
 from scripts.benchmarks import camera_faults as damage
 
 CAMERA = 3

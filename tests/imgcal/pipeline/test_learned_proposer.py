@@ -13,8 +13,7 @@ from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import data_path
 from imgcal.networks import Evidence, Expectation, InfraredNetwork, Measured, Measurer, Queries
-from imgcal.pipeline.learned_measurer import LearnedMeasurer
-from imgcal.pipeline.learned_proposer import LearnedProposer, load_proposer
+from imgcal.pipeline import LearnedMeasurer, LearnedProposer, load_proposer
 from imgcal.synthesis import DIFFICULTIES, FrameModel, PhysicalDrift, Truth, simulate_frames, simulate_truth
 from imgcal.types import Detections, RigPrior
 from tests.imgcal.pipeline.oracles import Blind, sure_of

@@ -4,14 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.identity import PipelineOptions
-from imgcal.association.series import associate
+from imgcal.association import PipelineOptions, associate
 from imgcal.errors import RefusedError
 from imgcal.pipeline import calibrate, score
 from imgcal.pipeline.motion_check import list_moves
-from imgcal.synthesis.captures import Truth
-from imgcal.types.moved_camera import MovedError
-from imgcal.types.rig import RigPrior
+from imgcal.synthesis import Truth
+from imgcal.types import MovedError, RigPrior
 from scripts.benchmarks import camera_faults as damage
 from scripts.benchmarks import merging_wands
 

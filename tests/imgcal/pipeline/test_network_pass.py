@@ -12,8 +12,7 @@ from imgcal.association import Proposal, Snapshot
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
 from imgcal.networks import Evidence, InfraredNetwork, Queries
-from imgcal.pipeline import learned_proposer
-from imgcal.pipeline.learned_proposer import LearnedProposer, load_proposer
+from imgcal.pipeline import LearnedProposer, learned_proposer, load_proposer
 from imgcal.synthesis import Difficulty, FrameModel, Truth, simulate_shots
 from imgcal.types import Detections
 from renderers import BlobRange, ClutterModel

@@ -9,9 +9,8 @@ import torch
 from imgcal.errors import RefusedError
 from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate, score
-from imgcal.synthesis import simulate_truth, simulate_volume, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift
-from imgcal.types.rig import RigPrior
+from imgcal.synthesis import PhysicalDrift, simulate_truth, simulate_volume, true_detections
+from imgcal.types import RigPrior
 
 DRIFT = PhysicalDrift()
 PRIOR = RigPrior(DRIFT.focal_length, DRIFT.principal_point, DRIFT.distortion, np.radians(DRIFT.rotation_deg), 2.0)

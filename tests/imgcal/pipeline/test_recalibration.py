@@ -8,8 +8,7 @@ from imgcal.association import Proposal, Sight, proposal_rows
 from imgcal.errors import RefusedError
 from imgcal.estimation import relative_covariance
 from imgcal.pipeline import calibrate
-from imgcal.synthesis.captures import Truth, simulate_truth, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift
+from imgcal.synthesis import PhysicalDrift, Truth, simulate_truth, true_detections
 
 
 def capture(rig, obj, snapshots=6, noise=0.05, seed=0):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association.identity import PipelineOptions
+from imgcal.association import PipelineOptions
 from imgcal.errors import RefusedError
 from imgcal.pipeline.refusals import require_fit, require_most_labels, require_near_prior
-from imgcal.types.rig import RigPrior
+from imgcal.types import RigPrior
 
 OPTIONS = PipelineOptions()
 

@@ -1,11 +1,10 @@
 import pytest
 import torch
 
-from imgcal.association.identity import PipelineOptions
+from imgcal.association import PipelineOptions
 from imgcal.io import read_rig
-from imgcal.pipeline.scoring import rms_length, score
-from imgcal.synthesis.captures import simulate_truth, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift
+from imgcal.pipeline import rms_length, score
+from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from tests.imgcal.lensed import KINDS, lensed
 
 

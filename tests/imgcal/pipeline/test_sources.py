@@ -11,8 +11,7 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.io import load_object, read_rig
 from imgcal.online import RigKeeper
 from imgcal.pipeline import calibrate, score
-from imgcal.synthesis.captures import FrameModel, simulate_frames, simulate_truth, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift
+from imgcal.synthesis import FrameModel, PhysicalDrift, simulate_frames, simulate_truth, true_detections
 
 
 @pytest.fixture(scope="module")

@@ -4,14 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import load_object, read_rig
-from imgcal.synthesis.colour_coding import render_views
-from imgcal.synthesis.rigs import RelativeDrift, Snapshots, synthesize
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.prediction import Prediction
-from imgcal.types.rig import CameraRig
+from imgcal.synthesis import RelativeDrift, Snapshots, render_views, synthesize
+from imgcal.types import CalibrationObject, CameraRig, Prediction
 from tests.imgcal.evaluation.conftest import conditions, sample  # noqa: F401  fixtures
 
 

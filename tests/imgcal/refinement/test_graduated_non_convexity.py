@@ -3,9 +3,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.evaluation.metrics import errors
-from imgcal.refinement import make_prediction, refine_robustly
-from imgcal.refinement.graduated_non_convexity import Target, robust_pose, undo_label_swaps
+from imgcal.evaluation import errors
+from imgcal.refinement import make_prediction, refine_robustly, robust_pose
+from imgcal.refinement.graduated_non_convexity import Target, undo_label_swaps
 from tests.imgcal.evaluation.conftest import disturbed
 
 

@@ -3,7 +3,7 @@ import torch
 
 from imgcal.refinement import refine_images
 from imgcal.refinement.render_and_compare import colours_at, find_swapped_labels
-from imgcal.types.prediction import Prediction
+from imgcal.types import Prediction
 from renderers import palette, splat
 
 

@@ -5,7 +5,7 @@ import torch
 
 from imgcal.estimation import EstimationOptions
 from imgcal.refinement import refine_points
-from imgcal.types.prediction import Prediction, Views
+from imgcal.types import Prediction, Views
 
 
 def found(estimate):

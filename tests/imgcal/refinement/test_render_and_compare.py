@@ -6,8 +6,8 @@ import torch
 from imgcal.errors import InputError
 from imgcal.estimation import camera_std, estimate
 from imgcal.refinement import ImageRefinementOptions, refine_images
-from imgcal.synthesis.colour_coding import ImageOptions, render_views
-from imgcal.types.prediction import Prediction
+from imgcal.synthesis import ImageOptions, render_views
+from imgcal.types import Prediction
 
 
 def found(refined):

@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.estimation import EstimationOptions, Gauge, estimate
-from imgcal.estimation.accuracy import predicted_error
-from imgcal.io import load_object, read_rig
-from imgcal.io.names import data_path
+from imgcal.estimation import EstimationOptions, Gauge, estimate, predicted_error
+from imgcal.io import data_path, load_object, read_rig
 from imgcal.report import ReportContent, SnapshotSummary
-from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, sample_rig_from_object, synthesize
-from imgcal.types.observations import Detections, Observations
-from imgcal.types.rig import PARAMETERS, CameraRig, RigPrior
+from imgcal.synthesis import PhysicalDrift, PoseRange, synthesize
+from imgcal.synthesis.rigs import sample_rig_from_object
+from imgcal.types import PARAMETERS, CameraRig, Detections, Observations, RigPrior
 
 SIGMA = 0.05
 

@@ -9,10 +9,9 @@ import pytest
 import torch
 
 from imgcal.estimation import Gauge
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.report import ReportContent
-from imgcal.types.rig import PARAMETERS
+from imgcal.types import PARAMETERS
 
 
 def test_residuals_agree_with_the_estimate(content: ReportContent) -> None:

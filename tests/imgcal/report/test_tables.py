@@ -11,7 +11,7 @@ import torch
 from imgcal.estimation import Gauge
 from imgcal.report import ReportContent
 from imgcal.report.tables import GROUPS, camera_rows, format_signed, knowledge_rows
-from imgcal.types.rig import PARAMETERS
+from imgcal.types import PARAMETERS
 
 
 @pytest.mark.parametrize(

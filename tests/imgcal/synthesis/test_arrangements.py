@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.synthesis.arrangements import Lens, arrange_positions, arrange_rig, look_at
+from imgcal.synthesis import Lens, arrange_positions, arrange_rig, look_at
 
 
 @pytest.mark.parametrize("shape", ["ring", "dome", "row"])

@@ -4,8 +4,7 @@ import numpy as np
 import torch
 
 from imgcal.detection import DetectionOptions, detect
-from imgcal.synthesis.captures import FrameModel, simulate_frames, simulate_truth, true_detections
-from imgcal.synthesis.rigs import PhysicalDrift, RelativeDrift
+from imgcal.synthesis import FrameModel, PhysicalDrift, RelativeDrift, simulate_frames, simulate_truth, true_detections
 from renderers import SensorModel
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.synthesis.colour_coding import ImageOptions, render_views
+from imgcal.synthesis import ImageOptions, render_views
 
 SENSOR = torch.tensor([[512, 272], [512, 272], [400, 300]])  # C = 3, and square images: scales differ across and down
 SMALL = ImageOptions(size=40, dot=1.2)

@@ -2,8 +2,9 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.synthesis.corruption import FALSE, SWAPPED, Corruption
-from imgcal.types.prediction import Views
+from imgcal.synthesis import Corruption
+from imgcal.synthesis.corruption import FALSE, SWAPPED
+from imgcal.types import Views
 
 SIZE = torch.tensor([[200, 100], [64, 48], [300, 300]])
 

@@ -1,6 +1,7 @@
 import torch
 
-from imgcal.synthesis.drawing import Draw, host_generator
+from imgcal.synthesis import host_generator
+from imgcal.synthesis.drawing import Draw
 
 
 def test_numbers_are_what_they_say() -> None:

@@ -2,9 +2,9 @@ from dataclasses import fields
 
 import torch
 
-from imgcal.synthesis import expose_patches, render_patches
+from imgcal.synthesis import Patches, expose_patches, render_patches
 from imgcal.synthesis.drawing import Draw
-from imgcal.synthesis.patches import LEAST_CUT, Patches, Trouble, _chunk
+from imgcal.synthesis.patches import LEAST_CUT, Trouble, _chunk
 from imgcal.types import PATCH_SIZE, BlobKind
 
 QUIET = {"merged": False, "false": False, "company": False, "cut": False, "uneven": False, "smeared": False}

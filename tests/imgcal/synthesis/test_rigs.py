@@ -8,20 +8,19 @@ import torch
 from scipy import stats
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.geometry.rotations import euler_from_rotation
-from imgcal.synthesis.rigs import (
+from imgcal.geometry import euler_from_rotation
+from imgcal.synthesis import (
     Drift,
     PhysicalDrift,
     PoseRange,
     RelativeDrift,
     Snapshots,
-    sample_rig_from_object,
     share_of_good_rigs,
     synthesize,
     synthesize_at_once,
 )
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import CameraRig
+from imgcal.synthesis.rigs import sample_rig_from_object
+from imgcal.types import CalibrationObject, CameraRig
 
 
 def seeded(seed: int = 0) -> torch.Generator:

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.synthesis.simulated_rig import NOISE, WARM, SimulatedRig
+from imgcal.synthesis import SimulatedRig
+from imgcal.synthesis.simulated_rig import NOISE, WARM
 
 LOW, HIGH = torch.tensor([[-300.0, -200.0, 700.0], [300.0, 200.0, 1000.0]]).double()
 

@@ -7,10 +7,16 @@ import torch
 from imgcal.errors import InputError
 from imgcal.io import load_object, read_rig
 from imgcal.pipeline import score
-from imgcal.synthesis.arrangements import look_at
-from imgcal.synthesis.captures import true_detections
-from imgcal.synthesis.rigs import PhysicalDrift
-from imgcal.synthesis.volumes import HandHeld, find_seen_volume, sample_path, sample_volume, simulate_volume
+from imgcal.synthesis import (
+    HandHeld,
+    PhysicalDrift,
+    find_seen_volume,
+    look_at,
+    sample_path,
+    sample_volume,
+    simulate_volume,
+    true_detections,
+)
 from imgcal.types import ConvexVolume
 
 CORNER = ConvexVolume(((0, 0, 0), (900, 0, 0), (0, 900, 0), (0, 0, 900)))

@@ -7,8 +7,7 @@ import torch
 from torch import nn
 
 from imgcal.io import write_tensors
-from imgcal.training import Loss, Task
-from imgcal.training.experiment import Experiment
+from imgcal.training import Experiment, Loss, Task
 
 EXPERIMENT = """
 format: imgcal-experiment/1

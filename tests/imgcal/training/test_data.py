@@ -3,9 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.synthesis.colour_coding import ImageOptions
-from imgcal.synthesis.corruption import Corruption
-from imgcal.synthesis.levels import LEVELS
+from imgcal.synthesis import LEVELS, Corruption, ImageOptions
 from imgcal.training.data import Source, draw_levels, object_to
 from imgcal.types import Views
 

@@ -5,12 +5,11 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.io import load_object, read_rig
-from imgcal.synthesis.corruption import Corruption
-from imgcal.synthesis.rigs import PoseRange, RelativeDrift
+from imgcal.synthesis import Corruption, PoseRange, RelativeDrift
 from imgcal.training.data import Source, object_to
 from imgcal.training.end_to_end import end_to_end_loss
 from imgcal.training.losses import RefinedLoss
-from imgcal.types.prediction import Prediction
+from imgcal.types import Prediction
 
 CONFIG = RefinedLoss(weight=1.0)
 

@@ -11,13 +11,10 @@ from tensorboard.backend.event_processing import event_accumulator
 
 from imgcal.cli.training_folder import BAD_BATCH, RESULT, STATE
 from imgcal.errors import InputError, RefusedError
-from imgcal.io import read_metrics, read_rig, save_rig
-from imgcal.io.safetensors_file import read_tensors
+from imgcal.io import read_metrics, read_rig, read_tensors, save_rig
 from imgcal.networks import load_checkpoint
-from imgcal.training import engine, rigs
-from imgcal.training.callbacks import Callbacks, DivergedError
-from imgcal.training.engine import is_finished, progress, stream_seeds
-from imgcal.training.experiment_file import load_experiment
+from imgcal.training import Callbacks, DivergedError, engine, is_finished, load_experiment, progress, rigs
+from imgcal.training.engine import stream_seeds
 from tests.imgcal.training.toy import Toy, ToyOfImages, train
 
 

@@ -4,9 +4,9 @@ import pytest
 
 from imgcal.errors import InputError
 from imgcal.io import read_rig, save_rig
-from imgcal.synthesis import ImageOptions
-from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, RelativeDrift, make_drift
-from imgcal.training.experiment_file import change_experiment, load_experiment, save_experiment
+from imgcal.synthesis import ImageOptions, PhysicalDrift, PoseRange, RelativeDrift
+from imgcal.synthesis.rigs import make_drift
+from imgcal.training import change_experiment, load_experiment, save_experiment
 from tests.imgcal.training.toy import EXPERIMENT
 
 

@@ -7,8 +7,7 @@ import torch
 import imgcal
 from imgcal.errors import RefusedError
 from imgcal.io import data_path, open_capture
-from imgcal.training.frame_dataset import FrameDataset
-from imgcal.training.labelled_crops import cut_labelled, split
+from imgcal.training import FrameDataset, cut_labelled, split
 
 
 def harvest(frames, detections, rig, obj) -> tuple[FrameDataset, FrameDataset]:

@@ -4,11 +4,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import read_rig
 from imgcal.nn import project_fiducials, rms_per_axis
-from imgcal.synthesis.rigs import RelativeDrift, synthesize
+from imgcal.synthesis import RelativeDrift, synthesize
 from imgcal.training.losses import (
     ExtraLoss,
     LossConfig,
@@ -27,9 +26,7 @@ from imgcal.training.losses import (
     principal_point_shift,
     reprojection_rmse,
 )
-from imgcal.types.parameter_vectors import pack21
-from imgcal.types.prediction import Prediction
-from imgcal.types.rig import PARAMETERS
+from imgcal.types import PARAMETERS, Prediction, pack21
 from tests.imgcal.lensed import KINDS, lensed
 
 B, C, N = 3, 10, 8

@@ -5,8 +5,7 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.networks import Located, load_checkpoint, warm_start
-from imgcal.training import load_experiment, prepare, train
-from imgcal.training.callbacks import Callbacks
+from imgcal.training import Callbacks, load_experiment, prepare, train
 from imgcal.training.positions import PositionBatch, PositionsExperiment, coarse_loss, fine_loss, random_dots
 
 SMALL = (

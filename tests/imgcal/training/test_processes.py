@@ -11,8 +11,7 @@ from pathlib import Path
 import torch
 
 from imgcal.cli.training_folder import RESULT, STATE
-from imgcal.io import read_metrics
-from imgcal.io.safetensors_file import read_tensors, read_texts
+from imgcal.io import read_metrics, read_tensors, read_texts
 from tests.imgcal.training.toy import EXPERIMENT, train
 
 ROOT = Path(__file__).parents[3]

@@ -6,8 +6,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from imgcal.errors import InputError
 from imgcal.networks import Checkpoint, NetworkSpec, load_checkpoint
-from imgcal.training import data
-from imgcal.training.rigs import RigTask, checkpoint_experiment
+from imgcal.training import RigTask, checkpoint_experiment, data
 from imgcal.types import CameraRig
 from tests.imgcal.training.toy import ToyOfImages
 

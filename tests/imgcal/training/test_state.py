@@ -5,15 +5,8 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.io import write_tensors
-from imgcal.training.state import (
-    FORMAT,
-    TrainingState,
-    first_difference,
-    load_state,
-    random_states,
-    restore_random_states,
-    save_state,
-)
+from imgcal.training import TrainingState, load_state, save_state
+from imgcal.training.state import FORMAT, first_difference, random_states, restore_random_states
 
 
 def state_of(experiment) -> TrainingState:

@@ -5,15 +5,12 @@ from torch import nn
 
 from imgcal.cli.main import run as command
 from imgcal.cli.training_folder import train_in
-from imgcal.geometry.rotations import rotation_from_6d
-from imgcal.geometry.transforms import RigidTransform
+from imgcal.geometry import RigidTransform, rotation_from_6d
 from imgcal.networks import Network, Parameterization, drawing_from, factory
-from imgcal.synthesis.colour_coding import ImageOptions
-from imgcal.training import engine
+from imgcal.synthesis import ImageOptions
+from imgcal.training import engine, load_experiment
 from imgcal.training.engine import save
-from imgcal.training.experiment_file import load_experiment
-from imgcal.types.prediction import Prediction
-from imgcal.types.rig import PARAMETERS
+from imgcal.types import PARAMETERS, Prediction
 
 EXPERIMENT = """
 format: imgcal-experiment/1

@@ -2,7 +2,7 @@
 
 import torch
 
-from imgcal.types.rig import CameraRig
+from imgcal.types import CameraRig
 
 
 def assert_same(first: CameraRig, second: CameraRig) -> None:

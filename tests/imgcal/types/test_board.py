@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.types.board import WARP, Board
+from imgcal.types import Board
+from imgcal.types.board import WARP
 
 CHARUCO = Board("charuco", columns=5, rows=7, pitch=30.0, marker=22.0, dictionary="DICT_4X4_50")
 APRILGRID = Board("aprilgrid", columns=3, rows=2, pitch=40.0, marker=30.0, dictionary="DICT_APRILTAG_36h11")

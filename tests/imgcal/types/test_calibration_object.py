@@ -13,8 +13,7 @@ import imgcal
 from imgcal.errors import InputError
 from imgcal.io import load_object
 from imgcal.pipeline import calibrate_from_scratch
-from imgcal.types import MOST_LIGHTS, check_object
-from imgcal.types.calibration_object import CalibrationObject, Symmetry
+from imgcal.types import MOST_LIGHTS, CalibrationObject, Symmetry, check_object
 
 
 def body(points: Tensor, radius: Tensor | None = None) -> CalibrationObject:

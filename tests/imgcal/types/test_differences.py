@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import torch
 
-from imgcal.types.differences import object_difference, rig_difference
+from imgcal.types import object_difference, rig_difference
 
 
 def test_what_came_through_single_precision_is_the_same(o10, asymmetric8):

@@ -6,8 +6,8 @@ import torch
 
 import imgcal
 from imgcal.errors import InputError
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.synthesis.captures import simulate_truth, true_detections
+from imgcal.geometry import RigidTransform
+from imgcal.synthesis import simulate_truth, true_detections
 
 
 @pytest.fixture(scope="module")

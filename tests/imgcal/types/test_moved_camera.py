@@ -1,4 +1,4 @@
-from imgcal.types.moved_camera import MovedCamera
+from imgcal.types import MovedCamera
 
 
 def test_a_move_in_words_and_values():

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from imgcal.types.observations import UNUSABLE, BlobFlag, Detections, Observations
+from imgcal.types import UNUSABLE, BlobFlag, Detections, Observations
 
 
 def detections() -> Detections:

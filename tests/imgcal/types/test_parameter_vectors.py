@@ -1,9 +1,10 @@
 import pytest
 import torch
 
-from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, sample_rig_from_object
-from imgcal.types.parameter_vectors import pack18, pack21, unpack18, unpack21
-from imgcal.types.rig import CameraRig
+from imgcal.synthesis import PhysicalDrift, PoseRange
+from imgcal.synthesis.rigs import sample_rig_from_object
+from imgcal.types import CameraRig, pack21, unpack18, unpack21
+from imgcal.types.parameter_vectors import pack18
 from tests.imgcal.types.same_rig import assert_same
 
 

@@ -3,10 +3,9 @@
 import pytest
 import torch
 
-from imgcal.geometry.rotations import rotation_from_vector
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.synthesis.rigs import RelativeDrift, synthesize
-from imgcal.types.prediction import Prediction, Views
+from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.synthesis import RelativeDrift, synthesize
+from imgcal.types import Prediction, Views
 
 B, C, N = 3, 10, 8
 

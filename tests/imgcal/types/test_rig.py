@@ -5,16 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.geometry.rotations import rotation_from_euler
-from imgcal.geometry.transforms import RigidTransform
-from imgcal.synthesis.rigs import PhysicalDrift, PoseRange, sample_rig_from_object, synthesize
-from imgcal.types.calibration_object import CalibrationObject
-from imgcal.types.rig import (
-    PARAMETER_NAMES,
-    PARAMETERS,
-    CameraRig,
-    RigPrior,
-)
+from imgcal.geometry import RigidTransform, rotation_from_euler
+from imgcal.synthesis import PhysicalDrift, PoseRange, synthesize
+from imgcal.synthesis.rigs import sample_rig_from_object
+from imgcal.types import PARAMETER_NAMES, PARAMETERS, CalibrationObject, CameraRig, RigPrior
 from tests.imgcal.types.same_rig import assert_same
 
 SHAPES = [(), (1,), (2, 3), (10,)]  # the last one has as many rigs as cameras

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.types.volume import ConvexVolume
+from imgcal.types import ConvexVolume
 
 
 def test_a_tetrahedron_is_no_box():

@@ -8,9 +8,8 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.io import load_object, read_rig, write_text
-from imgcal.online.events import Event
-from imgcal.online.keeper import RigKeeper
-from imgcal.synthesis.captures import simulate_truth, true_detections
+from imgcal.online import Event, RigKeeper
+from imgcal.synthesis import simulate_truth, true_detections
 
 RIG, OBJECT = read_rig("T4"), load_object("asymmetric8")
 

@@ -5,8 +5,7 @@ import pytest
 
 from imgcal.errors import InputError
 from imgcal.io import read_rig
-from imgcal.watch.bags import Bag
-from imgcal.watch.exposures import Exposure, Unreadable
+from imgcal.watch import Bag, Exposure, Unreadable
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2")
 typesys = pytest.importorskip("rosbags.typesys")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.watch.event_log import EventLog, forget_after
+from imgcal.watch import EventLog, forget_after
 from tests.imgcal.watch.states import event
 
 

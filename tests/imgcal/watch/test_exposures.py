@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.watch.exposures import MOST_BLOBS, CameraBlobs, Exposure, check_exposure
+from imgcal.watch import CameraBlobs, Exposure, check_exposure
+from imgcal.watch.exposures import MOST_BLOBS
 
 
 @pytest.mark.parametrize(

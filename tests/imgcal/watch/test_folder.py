@@ -8,12 +8,9 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.io import read_rig
-from imgcal.io.frames import write_frame
+from imgcal.io import read_rig, write_frame
+from imgcal.watch import Exposure, Folder, SourceReader, Unreadable
 from imgcal.watch import folder as module
-from imgcal.watch.exposures import Exposure, Unreadable
-from imgcal.watch.folder import Folder
-from imgcal.watch.source_reader import SourceReader
 
 RIG = read_rig("T4")
 HEIGHT, WIDTH = 1088, 2048

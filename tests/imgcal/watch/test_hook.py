@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from imgcal.errors import InputError
+from imgcal.watch import Hook
 from imgcal.watch import hook as module
-from imgcal.watch.hook import Hook
 from tests.imgcal.watch.states import event
 
 EVIL = '"; touch evil; $(touch evil) `touch evil` | touch evil'

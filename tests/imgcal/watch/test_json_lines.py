@@ -5,8 +5,8 @@ import threading
 
 import pytest
 
-from imgcal.watch.exposures import Exposure, Unreadable
-from imgcal.watch.json_lines import AT_ONCE, JsonLines
+from imgcal.watch import Exposure, JsonLines, Unreadable
+from imgcal.watch.json_lines import AT_ONCE
 from imgcal.watch.wire import LONGEST_LINE
 
 LINE = b'{"camera": "a", "time": %d, "uv": [[1, 2]]}\n'

@@ -5,8 +5,7 @@ import time
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.watch.exposures import Exposure, Unreadable
-from imgcal.watch.lab_streaming import LabStreaming
+from imgcal.watch import Exposure, LabStreaming, Unreadable
 
 pytest.importorskip("pylsl", reason="no pylsl (extra lsl)")
 CONFIGURATION = """

@@ -8,14 +8,9 @@ import pytest
 
 from imgcal.errors import InputError
 from imgcal.online import RigKeeper
+from imgcal.watch import CameraBlobs, Exposure, Hook, Poses, Progress, SourceReader, TimedSnapshot, Watch
 from imgcal.watch import loop as module
-from imgcal.watch.exposures import CameraBlobs, Exposure
-from imgcal.watch.hook import Hook
 from imgcal.watch.learning import Outcome
-from imgcal.watch.loop import Progress, Watch
-from imgcal.watch.poses import Poses
-from imgcal.watch.source_reader import SourceReader
-from imgcal.watch.synchronization import TimedSnapshot
 from tests.imgcal.watch.states import OBJECT, RIG, KeeperOfStates, event
 
 NOTHING = CameraBlobs.of([])

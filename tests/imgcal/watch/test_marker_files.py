@@ -6,7 +6,8 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.online import ObjectPose
-from imgcal.watch.marker_files import TO_FIND_RATE, MarkerFile, marker_labels, usual_rate
+from imgcal.watch import MarkerFile
+from imgcal.watch.marker_files import TO_FIND_RATE, marker_labels, usual_rate
 from tests.imgcal.watch.states import OBJECT, RIG
 from tests.imgcal.watch.test_poses import record
 from tests.imgcal.watch.test_trc_file import rows_of

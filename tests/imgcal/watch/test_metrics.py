@@ -4,11 +4,8 @@ import urllib.request
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.watch.exposures import CameraBlobs, Exposure, Unreadable
-from imgcal.watch.hook import Hook
-from imgcal.watch.loop import Watch
-from imgcal.watch.metrics import BUCKETS, Metrics, Tally
-from imgcal.watch.source_reader import SourceReader
+from imgcal.watch import CameraBlobs, Exposure, Hook, Metrics, SourceReader, Tally, Unreadable, Watch
+from imgcal.watch.metrics import BUCKETS
 from tests.imgcal.watch.states import RIG, KeeperOfStates, event
 
 parser = pytest.importorskip("prometheus_client.parser")

@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
+from imgcal.watch import OpenIGTLink, listening_address
 from imgcal.watch import open_igt_link as module
-from imgcal.watch.open_igt_link import (
-    HEADER,
-    OpenIGTLink,
-    listening_address,
-    message,
-    status_message,
-    transform_message,
-)
+from imgcal.watch.open_igt_link import HEADER, message, status_message, transform_message
 from tests.imgcal.watch.test_poses import record
 
 pyigtl = pytest.importorskip("pyigtl", reason="no pyigtl (extra dev): no independent client reads the messages")

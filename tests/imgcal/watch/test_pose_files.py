@@ -5,7 +5,7 @@ import os
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.watch.pose_files import PoseFile
+from imgcal.watch import PoseFile
 from imgcal.watch.poses import COLUMNS
 from tests.imgcal.watch.test_poses import record
 

@@ -3,7 +3,8 @@ import json
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.watch.pose_publisher import QUEUED, PosePublisher
+from imgcal.watch import PosePublisher
+from imgcal.watch.pose_publisher import QUEUED
 from tests.imgcal.watch.test_poses import record
 
 zmq = pytest.importorskip("zmq")

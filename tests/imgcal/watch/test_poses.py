@@ -7,7 +7,8 @@ import torch
 
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.online import ObjectPose
-from imgcal.watch.poses import COLUMNS, PoseRecord, Poses
+from imgcal.watch import PoseRecord, Poses
+from imgcal.watch.poses import COLUMNS
 from tests.imgcal.watch.states import some_state
 
 TURN = torch.tensor([0.1, -0.2, 0.3], dtype=torch.float64)

@@ -10,10 +10,8 @@ from imgcal.errors import InputError
 from imgcal.formats import parse_xml
 from imgcal.io import read_rig
 from imgcal.online import RigKeeper
-from imgcal.watch.exposures import Exposure, Unreadable
-from imgcal.watch.qualisys import COMMANDS, Qualisys, find_cameras
-from imgcal.watch.recordings import BlobTable
-from imgcal.watch.source_reader import SourceReader
+from imgcal.watch import BlobTable, Exposure, Qualisys, SourceReader, Unreadable
+from imgcal.watch.qualisys import COMMANDS, find_cameras
 from tests.imgcal.streams import Stream
 from tests.imgcal.watch.qtm import Qtm, frame, general, packet
 

@@ -6,8 +6,8 @@ import pytest
 
 from imgcal.errors import InputError
 from imgcal.io import read_rig
-from imgcal.types.observations import BlobFlag, Detections
-from imgcal.watch.recordings import BlobTable, Videos, holds_videos
+from imgcal.types import BlobFlag, Detections
+from imgcal.watch import BlobTable, Videos, holds_videos
 
 RIG = read_rig("T4")
 

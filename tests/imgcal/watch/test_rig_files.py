@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from imgcal.io import load_rig_covariance, read_rig
-from imgcal.watch.rig_files import RigFiles
+from imgcal.watch import RigFiles
 from tests.imgcal.watch.states import some_state
 
 

@@ -6,10 +6,8 @@ import pytest
 
 from imgcal.errors import InputError
 from imgcal.io import read_rig
+from imgcal.watch import CameraBlobs, Exposure, Known, SourceReader, Timing, Unreadable
 from imgcal.watch import source_reader as module
-from imgcal.watch.exposures import CameraBlobs, Exposure, Unreadable
-from imgcal.watch.source_reader import Known, SourceReader
-from imgcal.watch.synchronization import Timing
 
 PAIR = read_rig("T4").select([0, 1])
 NOTHING = CameraBlobs.of([])

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.types.observations import Detections
-from imgcal.watch.exposures import CameraBlobs, Exposure
-from imgcal.watch.synchronization import LEAST_INTERVALS, MOST_PENDING, OUT_AFTER, REMEMBERED, Synchronizer, Timing
+from imgcal.types import Detections
+from imgcal.watch import CameraBlobs, Exposure, Synchronizer, Timing
+from imgcal.watch.synchronization import LEAST_INTERVALS, MOST_PENDING, OUT_AFTER, REMEMBERED
 
 NOTHING = CameraBlobs.of([])
 ABC = ("a", "b", "c")

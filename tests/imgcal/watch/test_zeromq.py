@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.watch.exposures import Exposure, Unreadable
-from imgcal.watch.zeromq import ZeroMQ
+from imgcal.watch import Exposure, Unreadable, ZeroMQ
 
 zmq = pytest.importorskip("zmq")
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
