@@ -6,6 +6,8 @@ one in a container image that was warmed up when it was built, is used as it is.
 
 Machine code includes the functions it calls and the constants. Numba compiles a function again when its own file
 changes. Here it is also compiled again when one of the files that its file imports changes.
+
+Processes that share a folder wait for each other: one compiles a function, the others load it.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.core import event
+from numba.core import event, sigutils
+from numba.core.compiler_lock import global_compiler_lock
 
 from renderers.sources import source_digest
 
@@ -33,6 +36,9 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+WAITING = "imgcal:waiting"
+"""Kind of the event that lasts while another process compiles what this one needs."""
 
 
 def njit(**options: Any) -> Callable[[Function], Function]:
@@ -58,30 +64,40 @@ def njit(**options: Any) -> Callable[[Function], Function]:
 
 
 def _keep_cached(compiled: Any) -> Any:
-    """Keep machine code until one of its sources changes, and lock the cache while saving.
+    """Keep machine code until one of its sources changes, and let one process at a time compile the function.
 
-    Numba numbers the files of a function's signatures without a lock: if two processes save at once, one may find the
-    code of the other under its own name.
+    The others load what that one has saved. Numba numbers the files of a function's signatures without a lock: if two
+    processes saved at once, one might find the code of the other under its own name.
     """
-    cache = compiled._cache
-    cache._cache_file._source_stamp = source_digest(compiled.py_func.__module__)
-    save = cache.save_overload
+    compiled._cache._cache_file._source_stamp = source_digest(compiled.py_func.__module__)
+    name = f"{compiled.py_func.__module__}.{compiled.py_func.__qualname__}"
+    compile_now = compiled.compile
 
-    def save_overload(*arguments: Any) -> None:
-        with _alone():
-            save(*arguments)
+    def compile_alone(signature: Any) -> Any:
+        if tuple(sigutils.normalize_signature(signature)[0]) in compiled.overloads:
+            return compile_now(signature)
+        # Numba's own lock comes first, as it does for a function that is compiled on behalf of another: threads that
+        # took the two in different orders would wait for each other.
+        with global_compiler_lock, _alone(name):
+            return compile_now(signature)
 
-    cache.save_overload = save_overload
+    compiled.compile = compile_alone
     return compiled
 
 
 @contextlib.contextmanager
-def _alone() -> Iterator[None]:
+def _alone(name: str) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):  # a file system without locks, or a folder that cannot be written
             if fcntl and cache_folder():
-                lock = stack.enter_context(Path(cache_folder(), ".lock").open("a"))
-                fcntl.flock(lock, fcntl.LOCK_EX)
+                locks = Path(cache_folder(), ".locks")
+                locks.mkdir(exist_ok=True)
+                lock = stack.enter_context((locks / name).open("a"))
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    with event.trigger_event(WAITING, data=name):
+                        fcntl.flock(lock, fcntl.LOCK_EX)
         yield
 
 

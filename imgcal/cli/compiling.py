@@ -13,13 +13,14 @@ import imgcal
 from imgcal.machine import usable_cores
 
 HINT = "compiling for this machine: 10 to 60 s, once; `imgcal warmup` compiles everything ahead of time"
+WAIT = "waiting for another process that compiles for this machine"
 HELP = "from imgcal.online import warm_up_fits; warm_up_fits()"
 NEEDED_LAST = "levenberg_marquardt_cpu.*"  # files of the cache that show that there is nothing to help with
 
 
 @contextlib.contextmanager
 def announce_compilation(hint: str = HINT, helped: bool = False) -> Iterator[list[object]]:
-    """Print a notice on standard error when the first function is compiled.
+    """Print a notice on standard error when the first function is compiled, here or in another process.
 
     Args:
         hint: what to say.
@@ -33,6 +34,8 @@ def announce_compilation(hint: str = HINT, helped: bool = False) -> Iterator[lis
         yield compiled
         return
     from numba.core import event
+
+    from renderers.compiling import WAITING
 
     helpers: list[subprocess.Popen[bytes]] = []
 
@@ -48,12 +51,25 @@ def announce_compilation(hint: str = HINT, helped: bool = False) -> Iterator[lis
         def on_end(self, happening: event.Event) -> None:
             pass
 
-    listener = Told()
-    event.register("numba:compile", listener)
+    class Waiting(event.Listener):
+        told = False
+
+        def on_start(self, happening: event.Event) -> None:
+            if not self.told and not compiled:
+                print(f"imgcal: {WAIT}", file=sys.stderr, flush=True)
+            self.told = True
+
+        def on_end(self, happening: event.Event) -> None:
+            pass
+
+    listeners = {"numba:compile": Told(), WAITING: Waiting()}
+    for kind, listener in listeners.items():
+        event.register(kind, listener)
     try:
         yield compiled
     finally:
-        event.unregister("numba:compile", listener)
+        for kind, listener in listeners.items():
+            event.unregister(kind, listener)
         for helper in helpers:  # what is not done by now is not needed
             helper.terminate()
             helper.wait()

@@ -189,25 +189,58 @@ twins()
 
 
 @pytest.mark.skipif(compiling.fcntl is None, reason="there are no such locks on Windows")
-def test_one_process_at_a_time_saves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_process_compiles_a_function_and_the_others_load_it(tmp_path: Path) -> None:
+    """The second starts while the first compiles, tells that it waits, and compiles nothing."""
+    source = """
+import sys, time
+from numba.core import event
+from renderers.compiling import WAITING, njit
+
+class Tell(event.Listener):
+    def __init__(self, word):
+        self.word = word
+    def on_start(self, happening):
+        print(self.word, flush=True)
+        if self.word == "compiles" and happening.data["dispatcher"].py_func.__name__ == "thrice":
+            sys.stdin.readline()
+    def on_end(self, happening):
+        pass
+
+event.register("numba:compile", Tell("compiles"))
+event.register(WAITING, Tell("waits"))
+
+@njit()
+def thrice(x):
+    return 3 * x
+
+print(thrice(1.5), flush=True)
+"""
+    (tmp_path / "lab.py").write_text(source)
+    paths = os.pathsep.join([str(tmp_path), *sys.path])
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": paths}
+
+    def start() -> subprocess.Popen[str]:
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        return subprocess.Popen([sys.executable, "-c", "import lab"], env=environment, text=True, **pipes)
+
+    with start() as first:
+        assert first.stdout and first.stdout.readline() == "compiles\n"
+        with start() as second:
+            assert second.stdout and second.stdout.readline() == "waits\n"
+            assert first.communicate("\n")[0] == "4.5\n"
+            assert second.communicate()[0] == "4.5\n"
+
+
+def test_a_function_that_fails_to_compile_leaves_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiling, "cache_folder", lambda: str(tmp_path))
-    held = []
-
-    def save(self: object, *arguments: object) -> None:
-        with (tmp_path / ".lock").open("a") as lock:
-            try:
-                compiling.fcntl.flock(lock, compiling.fcntl.LOCK_EX | compiling.fcntl.LOCK_NB)
-            except BlockingIOError:
-                held.append(arguments)
-
-    monkeypatch.setattr(numba.core.caching.FunctionCache, "save_overload", save)
 
     @compiling.njit()
-    def thrice(x: float) -> float:
-        return 3 * x
+    def increment(x: float) -> float:
+        return x + 1
 
-    assert thrice(1.5) == 4.5
-    assert len(held) == 1
+    with pytest.raises(numba.core.errors.TypingError):
+        increment("a")
+    assert increment(1.5) == 2.5
 
 
 def test_without_compilation_everything_can_be_imported():

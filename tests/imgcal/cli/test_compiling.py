@@ -5,10 +5,11 @@ from pathlib import Path
 import numba
 import pytest
 from numba import config
+from numba.core import event
 
 import renderers.compiling
 from imgcal.cli import compiling
-from imgcal.cli.compiling import HINT, NEEDED_LAST, announce_compilation
+from imgcal.cli.compiling import HINT, NEEDED_LAST, WAIT, announce_compilation
 from imgcal.estimation import levenberg_marquardt_cpu
 
 
@@ -22,6 +23,15 @@ def test_compiling_is_told_once_and_counted(capsys):
         pass
     numba.njit(lambda x: x + 3)(1)
     assert capsys.readouterr().err == ""
+
+
+def test_waiting_for_another_process_is_told_once(capsys):
+    with announce_compilation() as compiled:
+        for _ in range(2):
+            with event.trigger_event(renderers.compiling.WAITING):
+                pass
+    assert compiled == []
+    assert capsys.readouterr().err == f"imgcal: {WAIT}\n"
 
 
 @pytest.fixture
