@@ -169,7 +169,7 @@ def test_compare_puts_networks_side_by_side(models, tmp_path, capsys):
         (["--cores", "0"], "--cores: found 0"),
         (["--phi", "20", "10"], "--phi"),
         (["--level", "5"], "--level: found 5, expected 0 to 4"),
-        (["--level", "1", "--noise", "0.2"], "--level: found --noise"),
+        (["--level", "1", "--noise", "0.2"], "--level: cannot be used with --noise"),
     ],
 )
 def test_what_cannot_be_evaluated_is_refused_in_one_line(models, tmp_path, capsys, arguments, expected):

@@ -461,7 +461,7 @@ def test_lights_become_points_in_a_file(tmp_path, capsys, suffix):
         (["a.c4d"], "--poses: found 'a.c4d', expected FILE.csv"),
         (["nowhere/a.c3d"], "--poses: nowhere/a.c3d: found no folder nowhere"),
         (["folder.c3d"], "--poses: folder.c3d: found a folder, expected a file"),
-        (["old.c3d"], "old.c3d: exists, expected a new file"),
+        (["old.c3d"], "old.c3d: already exists, expected a new file"),
     ],
 )
 def test_what_lights_cannot_be_written_to_is_one_line_and_leaves_nothing(tmp_path, capsys, monkeypatch, given, said):
