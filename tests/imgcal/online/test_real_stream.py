@@ -68,3 +68,17 @@ def test_a_rig_that_stands_still_raises_no_alarm_and_a_turned_camera_is_reported
     assert moves and moves[0][0] < 2900 + 3 * RATE
     assert {camera for _, _, camera in moves} == {"cam03"}
     assert {kind for _, kind, _ in reported} <= {"moved", "relearnt"}
+
+
+def test_a_camera_that_was_turned_far_is_reported_once_and_then_stays_known(recording, calibrated) -> None:
+    """It is at odds with the rig for 50 frames before the kind of its change is certain."""
+    _, obj, blobs = recording
+    reported = []
+    with imgcal.RigKeeper(calibrated.rig, obj) as keeper:
+        for number, snapshot in frames(blobs, 2600, 3190):
+            seen = turned(snapshot, calibrated.rig, 5, 1.0) if number >= 3000 else snapshot
+            state = keeper.update(seen, number / RATE)
+            reported += [event for event in state.events if event.kind not in QUIET]
+    moves = [(event.camera, event.change) for event in reported if event.kind == "moved"]
+    assert moves == [("cam05", "unknown"), ("cam05", "rotation")]
+    assert {event.kind for event in reported} <= {"moved", "relearnt"}
