@@ -67,7 +67,7 @@ def test_a_rig_of_other_lenses_is_trained_for_compared_and_calibrated(tmp_path, 
     assert main(["compare", *runs, *few, "--baselines"]) == 0
     printed = capsys.readouterr()
     assert (
-        "note: left out PnP per camera, factory intrinsics and OpenCV calibrateCamera per camera: no support" in printed.err
+        "note: left out PnP per camera, factory intrinsics and OpenCV calibrateCamera per camera: no sup" in printed.err
     )
     assert all(name in printed.out for name in ("| 0 ", "| 1 ", "| 2 ", "MAP from PnP", "scipy bundle adjustment"))
     capture, known = tmp_path / "capture", ["--rig", str(rig), "--object", "asymmetric8"]
