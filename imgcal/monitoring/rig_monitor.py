@@ -164,11 +164,7 @@ class RigMonitor:
         return self.filter.learnt_since(self.known_since) - age < FEW_SNAPSHOTS
 
     def _follow(self, observations: Observations, rig_from_object: RigidTransform, seconds: float) -> MonitorUpdate:
-        """Learn from a snapshot, and test for a change before it.
-
-        Raises:
-            RefusedError: see `update`.
-        """
+        """Learn from a snapshot, and test for a change before it; raises as `update`."""
         try:
             result = self.filter.follow(observations, rig_from_object, seconds)
         except RefusedError:
@@ -516,33 +512,17 @@ class RigMonitor:
         decided, kinds = pending.decide_kinds(test, self.open, last)
         pending.kinds.update(kinds)
         if any(kind is not None for kind in kinds.values()):
-            self._adopt_kinds(*pending.adopt_kinds(test))
+            first, belief, information = pending.adopt_kinds(test)
+            self._recent.rebase(belief, information)
+            # Snapshots that were linearized while a camera could be anywhere are absorbed again.
+            if pending.count <= len(self._recent):
+                with contextlib.suppress(RefusedError):
+                    belief = self._restart(first, *self._recent.latest(pending.count)).belief
+            self.filter.suppose(first, age_belief(belief, pending.seconds, self.filter.walk))
         self.open = {camera: change for camera, change in self.open.items() if camera not in kinds}
         if not self.open:
             self._pending = None
         return decided
-
-    def _adopt_kinds(self, first: RigBelief, belief: RigBelief, information: Tensor) -> None:
-        """Believe that pending changes are of their decided kinds.
-
-        While all snapshots since the change are kept, they are absorbed again: what was linearized while a camera could
-        be anywhere says little about where it was before them.
-
-        Args:
-            first: before these snapshots.
-            belief: with them, without drift since.
-            information: (D, D), its information.
-        """
-        pending = self._pending
-        assert pending is not None
-        try:
-            if pending.count > len(self._recent):
-                raise RefusedError("some of the snapshots are not kept")
-            snapshots, pauses = self._recent.latest(pending.count)
-            belief = self._restart(first, snapshots, pauses).belief
-        except RefusedError:
-            self._recent.rebase(belief, information)
-        self.filter.suppose(first, age_belief(belief, pending.seconds, self.filter.walk))
 
 
 def _shift(belief: RigBelief, snapshot: Snapshot, camera: int) -> float:
