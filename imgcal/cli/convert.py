@@ -95,7 +95,8 @@ class Convert(arguments.Convert):
         to = self.to if self.to is not None else OURS if self.out.suffix in (".yaml", ".yml") else None
         if to is None:
             able = ", ".join(one.name for one in FORMATS if one.write is not None)
-            raise InputError(f"--to: cannot tell the format from {self.out.name}; expected one of imgcal, {able}")
+            expected = f"one of imgcal, {able}, or --into the original"
+            raise InputError(f"--to: cannot tell the format from {self.out.name}; expected {expected}")
         if to != OURS:
             find_format(to)
             self._check_held()

@@ -129,7 +129,8 @@ def model_file(path: str | Path) -> Path:
 def shipped_networks() -> str:
     """List the shipped networks, and say what has more of them where those for whole rigs are not installed."""
     names = shipped_names("models", SUFFIX)
-    more = "" if any(name.startswith("points-") for name in names) else " (imgcal-models, in data/models, has more)"
+    installed = any(name.startswith("points-") for name in names)
+    more = "" if installed else "; those for whole rigs are in imgcal-models (in a clone: pip install ./data/models)"
     return f"a file, the folder of a training run, or one of {', '.join(names)}{more}"
 
 

@@ -64,7 +64,7 @@ def read_texts(path: str | Path, file_format: str) -> dict[str, str]:
     path = Path(path)
     check_regular(path)
     if not path.exists() and path == Path(path.stem):
-        raise InputError(f"{path}: found no such file or network, expected {shipped_networks()}")
+        raise InputError(f"{path}: no file or shipped network has this name; expected {shipped_networks()}")
     try:
         with open(path, "rb") as raw:
             start = raw.read(4)

@@ -183,7 +183,8 @@ class Learning:
     @property
     def summary(self) -> str:
         """What was learnt, in a few words."""
-        return f"learning: {self.kept} snapshots, {self.trainings} trainings, {self.adopted} adopted"
+        why = "" if self.kept else " (none qualified, or the source ended before the learning process was ready)"
+        return f"learning: {self.kept} snapshots{why}, {self.trainings} trainings, {self.adopted} adopted"
 
     @property
     def process_id(self) -> int:

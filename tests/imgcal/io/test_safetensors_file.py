@@ -68,7 +68,9 @@ def test_a_name_that_no_shipped_network_has_is_answered_with_those_that_exist(ri
     for name in ("ir-cnn", "points-O10-cube8")[: 1 + rigs]:
         (tmp_path / "data" / "models" / f"{name}.safetensors").write_bytes(b"")
     monkeypatch.setattr("imgcal.io.names.__file__", str(tmp_path / "imgcal" / "io" / "names.py"))
-    with pytest.raises(InputError, match=r"points-U7: found no such file or network, .* one of ir-cnn") as caught:
+    with pytest.raises(
+        InputError, match=r"points-U7: no file or shipped network has this name; .* one of ir-cnn"
+    ) as caught:
         read_tensors("points-U7", "imgcal-network/1")
     assert ("imgcal-models" in str(caught.value)) is not rigs
     assert ("points-O10-cube8" in str(caught.value)) is rigs
