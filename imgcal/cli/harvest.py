@@ -80,8 +80,8 @@ class Harvest(arguments.Harvest):
         count = len(detections.snapshot_names)
         splits = split(crops, count, rig.num_cameras)
         parts = self._split_patches(patches, count, rig.num_cameras)
-        source = Source("imgcal harvest", str(self.capture), count, self.seed)
-        write_dataset(self.out, splits, parts, rig, obj, source)
+        source = Source("imgcal harvest", str(self.capture), count, self.seed, rig, obj)
+        write_dataset(self.out, splits, parts, source)
         said = [f"{len(part)} crops with {_count_markers(part)} markers" for part in splits]
         print(f"{self.out}: {said[0]} for training, {said[1]} held out", file=sys.stderr)
 
@@ -101,42 +101,32 @@ class Source:
     capture: str
     snapshots: int
     seed: int  # of the crops' places
+    rig: CameraRig
+    obj: CalibrationObject
 
 
 def write_dataset(
-    folder: Path,
-    splits: Sequence[FrameDataset],
-    patches: Sequence[PatchDataset],
-    rig: CameraRig,
-    obj: CalibrationObject,
-    source: Source,
+    folder: Path, splits: Sequence[FrameDataset], patches: Sequence[PatchDataset], source: Source
 ) -> None:
     """Write crops and patches, each to train on and held out, and a card, in one step; patches may be missing."""
-    about = {"capture": source.capture, "rig": rig.name, "object": obj.name, "seed": source.seed}
+    about = {"capture": source.capture, "rig": source.rig.name, "object": source.obj.name, "seed": source.seed}
     with publishing(folder, (CARD, TRAIN, HELD_OUT, TRAIN_PATCHES, HELD_OUT_PATCHES), mark=CARD) as out:
         for name, part in zip((TRAIN, HELD_OUT), splits, strict=True):
             part.save(out / name, about)
         for name, some in zip((TRAIN_PATCHES, HELD_OUT_PATCHES), patches, strict=False):
             some.save(out / name, about)
-        write_text(out / CARD, _card(folder, splits, patches, rig, obj, source))
+        write_text(out / CARD, _card(folder, splits, patches, source))
 
 
-def _card(
-    folder: Path,
-    splits: Sequence[FrameDataset],
-    patches: Sequence[PatchDataset],
-    rig: CameraRig,
-    obj: CalibrationObject,
-    source: Source,
-) -> str:
+def _card(folder: Path, splits: Sequence[FrameDataset], patches: Sequence[PatchDataset], source: Source) -> str:
     """Say what is in the dataset."""
     train, held_out = splits
     of_patches = NO_PATCHES
     if patches:
         of_patches = PATCHES_TEXT.format(train=len(patches[0]), held_out=len(patches[1]), folder=folder)
     return CARD_TEXT.format(
-        command=source.command, capture=source.capture, snapshots=source.snapshots, cameras=rig.num_cameras,
-        rig=rig.name, object=obj.name, folder=folder, patches=of_patches,
+        command=source.command, capture=source.capture, snapshots=source.snapshots,
+        cameras=source.rig.num_cameras, rig=source.rig.name, object=source.obj.name, folder=folder, patches=of_patches,
         train=len(train), train_seen=_count_markers(train), train_snapshots=len(train.snapshot.unique()),
         held_out=len(held_out), held_out_seen=_count_markers(held_out),
         held_out_snapshots=len(held_out.snapshot.unique()),

@@ -30,7 +30,15 @@ from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import publishing, write_text
 from imgcal.networks import Expectation
 from imgcal.pipeline import load_proposer
-from imgcal.training import FrameDataset, PatchDataset, adaptation, cut_labelled, is_finished, load_experiment
+from imgcal.training import (
+    TRAIN_PATCHES,
+    FrameDataset,
+    PatchDataset,
+    adaptation,
+    cut_labelled,
+    is_finished,
+    load_experiment,
+)
 from imgcal.types import RigPrior
 from imgcal.watch import (
     ADAPTED,
@@ -47,7 +55,7 @@ from imgcal.watch import (
     send,
 )
 
-GRACE = 6.0  # s that a training has to stop in, once nobody feeds the process
+GRACE = 6.0  # s in which a training has to stop after the watching process has ended
 NEAR = 5.0  # px within which a claim is right
 TURNED_DEG, ASIDE = 1.0, 0.01  # errors of the pose that networks are given: degrees, and parts of the distance
 SIGMAS = 2.0  # by which an adapted network must be better
@@ -178,10 +186,11 @@ class Learner:
         numbers = (train, list(self._held_out))
         splits = [FrameDataset.cat([self._crops[number] for number in part]) for part in numbers]
         patches = [PatchDataset.cat([self._patches[number] for number in part]) for part in numbers]
-        source = Source("imgcal watch --learn", "a running rig", len(self._crops), 0)
+        said = ("imgcal watch --learn", "a running rig", len(self._crops), 0)
+        source = Source(*said, self._latest.rig, self.task.obj)
         known = patches if all(len(part) for part in patches) else []
         with self.writing:
-            write_dataset(self.folder / DATASET, splits, known, self._latest.rig, self.task.obj, source)
+            write_dataset(self.folder / DATASET, splits, known, source)
         self._unwritten = False
 
     def _adapt(self) -> None:
@@ -198,11 +207,11 @@ class Learner:
         """Train what the dataset has data for; the names or folders of both networks.
 
         Raises:
-            _EndedError: nobody wants to know any more.
+            _EndedError: the watching process has ended.
         """
         found = []
         for name in SUBJECTS:
-            if name != SUBJECTS[0] and not (self.folder / DATASET / "train_patches.safetensors").is_file():
+            if name != SUBJECTS[0] and not (self.folder / DATASET / TRAIN_PATCHES).is_file():
                 found.append(name)
                 continue
             changes = adaptation(name, self.folder / DATASET)
@@ -262,7 +271,7 @@ class Learner:
 
 
 class _EndedError(Exception):
-    """Raise to leave a training that nobody waits for."""
+    """The watching process has ended, and a training with it."""
 
 
 def ask(proposer: Proposer, moment: Moment, task: LearningTask) -> tuple[int, int, int, bool]:

@@ -26,13 +26,11 @@ from numpy.typing import NDArray
 import imgcal
 from imgcal.cli.watch import LEARNING_CODE
 from imgcal.detection import DetectionOptions
-from imgcal.geometry import RigidTransform
 from imgcal.networks import Expectation
 from imgcal.synthesis import SimulatedRig
-from imgcal.types import CalibrationObject, CameraRig
 from imgcal.watch import CANDIDATE, LEARNING, LOWEST, SUBJECTS, Learning, LearningPlan, LearningTask
 from scripts.output import ROOT, command, fill, markdown, read_json, surroundings, write_json
-from scripts.results.unlike_markers import CLUTTER, GROUND, LIGHT, NOISE, draw
+from scripts.results.unlike_markers import draw_frames
 
 RESULT = ROOT / "docs" / "benchmarks" / "watch_learning.json"
 PAGE = ROOT / "docs" / "watch.md"
@@ -54,26 +52,6 @@ class Options:
     changes: tuple[str, ...] = ()  #: to the training, as for `imgcal train --set`
 
 
-def frames_of(
-    rig: CameraRig, obj: CalibrationObject, pose: RigidTransform, shape: str, random: np.random.Generator
-) -> dict[str, NDArray[np.uint8]]:
-    """Draw the frames of one moment."""
-    expected = Expectation.of(rig, obj, pose.reshape(1))
-    frames = {}
-    for camera, name in enumerate(rig.camera_names):
-        width, height = rig.image_size[camera].tolist()
-        light = np.zeros((height, width))
-        usual = float(expected.radius[0, camera].median())
-        for _ in range(CLUTTER):
-            draw(light, random.uniform((0, 0), (width, height)), usual * random.uniform(0.7, 1.3), "discs", 0.0)
-        for fiducial in np.flatnonzero(expected.visible[0, camera].numpy()):
-            place, size = expected.uv[0, camera, fiducial].numpy(), float(expected.radius[0, camera, fiducial])
-            draw(light, place, size, shape, random.uniform(0, np.pi))
-        shown = GROUND + LIGHT * light + NOISE * random.standard_normal(light.shape)
-        frames[name] = np.clip(np.rint(shown), 0, 255).astype(np.uint8)
-    return frames
-
-
 def measure(options: Options) -> dict[str, Any]:
     """Take turns; times of an update with what learning adds to it, ms."""
     torch.set_num_threads(1)
@@ -92,7 +70,8 @@ def measure(options: Options) -> dict[str, Any]:
             def block() -> Iterator[tuple[float, float]]:
                 for _ in range(options.updates):
                     seconds = next(clock) / RATE
-                    frames = frames_of(rig, obj, running.pose(seconds), options.shape, random)
+                    expected = Expectation.of(rig, obj, running.pose(seconds).reshape(1))
+                    frames = draw_frames(rig, expected, options.shape, random)
                     wall, cpu = time.perf_counter(), time.thread_time()
                     state = keeper.update(frames, 1e9 + seconds)
                     learning.offer(state, frames)

@@ -78,28 +78,34 @@ def draw(frame: NDArray[np.float64], place: NDArray[np.float64], radius: float, 
     frame[low[1] : high[1], low[0] : high[0]] += drawn
 
 
+def draw_frames(
+    rig: CameraRig, expected: Expectation, shape: str, random: np.random.Generator
+) -> dict[str, NDArray[np.uint8]]:
+    """Draw the markers of one moment, and clutter, into a frame of each camera."""
+    frames = {}
+    for camera, name in enumerate(rig.camera_names):
+        width, height = rig.image_size[camera].tolist()
+        light = np.zeros((height, width))
+        usual = float(expected.radius[0, camera].median())
+        for _ in range(CLUTTER):
+            draw(light, random.uniform((0, 0), (width, height)), usual * random.uniform(0.7, 1.3), "discs", 0.0)
+        for fiducial in np.flatnonzero(expected.visible[0, camera].numpy()):
+            place, size = expected.uv[0, camera, fiducial].numpy(), float(expected.radius[0, camera, fiducial])
+            draw(light, place, size, shape, random.uniform(0, np.pi))
+        shown = 190 - 130 * light if shape == "dark" else GROUND + LIGHT * light
+        shown += NOISE * random.standard_normal(light.shape)
+        frames[name] = np.clip(np.rint(shown), 0, 255).astype(np.uint8)
+    return frames
+
+
 def snapshots(rig: CameraRig, shape: str, count: int, seed: int) -> Iterator[tuple[CameraRig, Case]]:
     """Make snapshots of drifted rigs: the true rig, and the case."""
     obj, generator = imgcal.load_object("asymmetric8"), torch.Generator().manual_seed(seed)
     truth = simulate_truth(rig, obj, count, generator, PhysicalDrift())
     random, options = np.random.default_rng(seed), DetectionOptions(polarity="dark" if shape == "dark" else "bright")
     for number in range(count):
-        pose = truth.rig_from_object[number][None]
-        expected = Expectation.of(truth.rig, obj, pose)
-        frames = {}
-        for camera, name in enumerate(rig.camera_names):
-            width, height = rig.image_size[camera].tolist()
-            light = np.zeros((height, width))
-            usual = float(expected.radius[0, camera].median())
-            for _ in range(CLUTTER):
-                draw(light, random.uniform((0, 0), (width, height)), usual * random.uniform(0.7, 1.3), "discs", 0.0)
-            for fiducial in np.flatnonzero(expected.visible[0, camera].numpy()):
-                place, size = expected.uv[0, camera, fiducial].numpy(), float(expected.radius[0, camera, fiducial])
-                draw(light, place, size, shape, random.uniform(0, np.pi))
-            shown = 190 - 130 * light if shape == "dark" else GROUND + LIGHT * light
-            frames[name] = np.clip(np.rint(shown + NOISE * random.standard_normal(light.shape)), 0, 255).astype(
-                np.uint8
-            )
+        expected = Expectation.of(truth.rig, obj, truth.rig_from_object[number][None])
+        frames = draw_frames(rig, expected, shape, random)
         found = to_detections([detect_snapshot(frames, options)], rig.camera_names, ("0",))
         blobs = match_to_rig(found, rig)
         snapshot = Snapshot(frames, blobs, rig, obj, (rig.prior or RigPrior()).std(rig), (), options)
