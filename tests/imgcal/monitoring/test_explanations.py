@@ -12,7 +12,16 @@ from imgcal.monitoring import ClockSlip, absorb
 from imgcal.monitoring.case import Case, Explained, Explanation, Finding, Variant
 from imgcal.monitoring.change_test import JUMPS
 from imgcal.monitoring.clock_slip import ClockSlipExplanation
-from imgcal.monitoring.explanations import EXPLANATIONS, LEAD, PATIENCE, Diagnosis, Moved, doubtful_cameras, weigh
+from imgcal.monitoring.explanations import (
+    EXPLANATIONS,
+    HARMLESS_PATIENCE,
+    LEAD,
+    PATIENCE,
+    Diagnosis,
+    Moved,
+    doubtful_cameras,
+    weigh,
+)
 from imgcal.monitoring.measurement_update import stack_snapshots
 from imgcal.monitoring.pending_change import free_cameras
 from imgcal.monitoring.shaking import Shaking
@@ -90,6 +99,16 @@ def test_what_cannot_be_decided_waits_and_is_then_what_is_more_probable(case: Ca
     premature = Known("a", (2 * LEAD,), why_premature="one snapshot")
     with pytest.raises(RefusedError, match="yet: one snapshot"):
         Diagnosis().decide(case, False, (premature, table[1]))
+
+
+def test_cases_that_are_left_out_count_as_waiting_but_do_not_end_it() -> None:
+    diagnosis = Diagnosis()
+    assert diagnosis.skip() and diagnosis.waited == 0  # nothing was undecided
+    diagnosis.waited = 1
+    assert sum(diagnosis.skip() for _ in range(PATIENCE)) == HARMLESS_PATIENCE - 1
+    diagnosis.waited += 1  # that case was weighed, and is still undecided
+    assert sum(diagnosis.skip() for _ in range(PATIENCE)) == PATIENCE - HARMLESS_PATIENCE - 1
+    assert diagnosis.waited == PATIENCE
 
 
 def test_the_table_names_each_explanation_once() -> None:

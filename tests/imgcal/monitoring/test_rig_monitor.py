@@ -9,13 +9,14 @@ import torch
 import imgcal
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
-from imgcal.monitoring import CHANGES, Change, RigFilter, RigMonitor
+from imgcal.monitoring import CHANGES, Change, RigFilter, RigMonitor, explanations
+from imgcal.monitoring.case import Case
 from imgcal.monitoring.change_search import ALARM_CHI2
-from imgcal.monitoring.explanations import Diagnosis, Steady, weigh
+from imgcal.monitoring.explanations import Diagnosis, Steady, Verdict, weigh
 from imgcal.monitoring.pending_change import PendingChange
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Observations
-from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
+from scripts.benchmarks.rig_streams import Bump, Conditions, Slip, Stream
 
 NOISE = 0.1
 SIZES = {"rotation": math.radians(0.1), "position": 1.0, "focal_length": 3.0, "principal_point": 1.0}
@@ -192,6 +193,25 @@ def test_a_camera_of_which_it_cannot_be_told_yet_is_undecided_until_it_is() -> N
     first = told[0][0]
     assert undecided[:4] == [set()] * 4 and undecided[first:] == [set()] * (60 - first)
     assert first > 8 and undecided[6:first] == [{2}] * (first - 6)
+
+
+def test_an_undecided_camera_is_weighed_less_and_less_often(monkeypatch) -> None:
+    """It is late from the first snapshot on, which takes some thirty snapshots to tell."""
+    made = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 0, Conditions(), slips=[Slip(0, 1, 0.02)])
+    states, weighed = list[imgcal.RigState](), list[int]()
+
+    def count(case: Case, *rest) -> Verdict:
+        if case.cameras and not case.quarantined:
+            weighed.append(len(states))
+        return weigh(case, *rest)
+
+    monkeypatch.setattr(explanations, "weigh", count)
+    with imgcal.RigKeeper(made.factory, made.obj) as keeper:
+        for time, blobs in made.snapshots(40):
+            states.append(keeper.update(blobs, time))
+    late = [n for n in weighed if n >= 20]
+    assert late and len(late) <= 6  # of twenty snapshots
+    assert weighed[0] < 5
 
 
 def watched(stream: Stream, count: int) -> list[tuple[int, int]]:
