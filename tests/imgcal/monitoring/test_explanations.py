@@ -54,7 +54,7 @@ class Known(Explanation):
         if isinstance(given, str):
             raise RefusedError(given)
         slip = ClockSlip(1, 0, given, 1e-4, math.nan)
-        known = absorb(case.before, *stack_snapshots(case.latest)).evidence
+        known = absorb(case.before, *stack_snapshots(case.latest), case.options).evidence
         return Variant(case.before, case.latest, given - known, find=lambda _: Finding((slip,)))
 
     def premature(self, case: Case, found: Explained) -> str | None:
