@@ -35,6 +35,9 @@ PATIENCE = 16
 HARMLESS_PATIENCE = 4
 """... and the same if possibly nothing has happened: after a pause, the belief allows for small moves."""
 
+TOLERANCE = 0.01
+"""Accuracy of the evidence (log odds): far below `LEAD`. What contradicts a belief converges slowly."""
+
 
 class Steady(Explanation):
     """Nothing has happened."""
@@ -137,6 +140,7 @@ def weigh(case: Case, explanations: Sequence[Explanation] = EXPLANATIONS) -> Ver
         RefusedError: none could be weighed.
     """
     found, reasons = list[Explained](), dict[str, str]()
+    case = replace(case, options=replace(case.options, tolerance=max(TOLERANCE, case.options.tolerance)))
     for explanation in explanations:
         try:
             found.append(_explain(case, explanation))
@@ -198,6 +202,13 @@ class Diagnosis:
             raise RefusedError(f"diagnosis: {best.name} is not certain yet: {why}")
         self.waited = 0
         return verdict
+
+    def skip(self) -> bool:
+        """Leave out a case in which little is new, unless the patience ends with it; return whether it is left out."""
+        if self.waited in (HARMLESS_PATIENCE, PATIENCE):
+            return False
+        self.waited += self.waited > 0
+        return True
 
 
 def doubtful_cameras(

@@ -45,6 +45,8 @@ OBJECT_SNAPSHOTS = 8
 """... and a change of the object is not considered before so many snapshots have been absorbed."""
 UNDECIDED_SNAPSHOTS = 16
 """Snapshots for which a camera stays in doubt that seemed to have moved without a decision."""
+NEW_SHARE = 0.25
+"""Share of the snapshots since a change that must be new before an undecided camera is weighed again."""
 SETTLED_SNAPSHOTS, LEAST_AGAIN = 16, 8
 """A second move of a camera within so many snapshots is doubted, and so many snapshots are needed to decide: a late
 camera seems to have moved in any two successive snapshots, but not in eight."""
@@ -271,8 +273,11 @@ class RigMonitor:
             RefusedError: the case cannot be decided yet, or the snapshots cannot be learnt.
         """
         free: dict[int, str | None] = {}
-        pending, test = self._pending, self._recent.test(age)
-        age = likeliest_age(self._recent, likeliest_camera(test), age)
+        pending, camera = self._pending, likeliest_camera(self._recent.test(age))
+        new = UNDECIDED_SNAPSHOTS - self.undecided.get(camera, 0)  # snapshots since it was weighed
+        if new < NEW_SHARE * age and self._diagnosis.skip():
+            raise RefusedError("diagnosis: undecided, and little is new")
+        age = likeliest_age(self._recent, camera, age)
         if pending is not None and age >= pending.count - NEARBY_SNAPSHOTS:  # the pending changes happened then
             again = likeliest_camera(self._recent.test(age)) in pending.kinds
             # A second change: the first snapshots were taken from the old pose.
