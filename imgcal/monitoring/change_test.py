@@ -28,6 +28,9 @@ from imgcal.types import PARAMETER_KINDS, CameraRig
 
 CHANGES: Mapping[str, slice] = {kind: part for kind, part in PARAMETER_KINDS.items() if kind != "distortion"}
 """Kinds of change, and the camera parameters that each one covers."""
+TILT = "tilt"
+FORMS = {**CHANGES, TILT: slice(0, 2)}
+"""The same, and a rotation about an axis in the image plane: joints of mounts pan and tilt."""
 JUMPS = (0.6, 6.0, 60.0, 600.0)
 """Pixels: prior standard deviations of a change, all equally probable. They are image shifts, whatever the kind of
 change, so that no kind is preferred."""
@@ -65,13 +68,13 @@ def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = 
     """Standard deviations (C, K) of changes, by camera and kind (None = all kinds); zero where nothing changes.
 
     Args:
-        changes: kind of change of each camera that changed.
+        changes: kind of change, one of `FORMS`, of each camera that changed.
         pixels: (C, K) see `pixel_changes`.
         jump: pixels.
     """
     std = torch.zeros_like(pixels)
     for camera, kind in changes.items():
-        part = slice(None) if kind is None else CHANGES[kind]
+        part = slice(None) if kind is None else FORMS[kind]
         std[camera, part] = jump * pixels[camera, part]
     std[:, 6:] *= min(1.0, LENS / jump)
     return std

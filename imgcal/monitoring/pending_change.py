@@ -10,7 +10,16 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation import displace, error_between
-from imgcal.monitoring.change_test import CHANGES, LARGE, ChangeTest, camera_change_errors, change_std, pixel_changes
+from imgcal.monitoring.case import mean_evidence
+from imgcal.monitoring.change_test import (
+    CHANGES,
+    LARGE,
+    TILT,
+    ChangeTest,
+    camera_change_errors,
+    change_std,
+    pixel_changes,
+)
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belief, widen
 from imgcal.monitoring.rig_filter import YOUNG_SECONDS
 from imgcal.types import CameraRig
@@ -21,8 +30,8 @@ KIND_LEAD = 5.0
 SINGLE_KIND_LEAD, ALL_KINDS_LEAD = 3.0, 15.0
 """... against a change of all kinds together, and the latter against each kind: a wrong belief does no harm then."""
 LENS_KINDS, LENS_LOG_PRIOR = ("focal_length", "principal_point"), -3.0
-"""Changes of the lens alone, and their prior log odds against a rotation or a shift if the snapshots cannot tell: bumps
-hit the camera, not the lens."""
+"""Changes of the lens alone, and their prior log odds against a rotation or a shift: bumps hit the camera, not the
+lens."""
 DECIDE_AFTER = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """Numbers of snapshots since a change at which its kind is decided if possible."""
 
@@ -116,7 +125,7 @@ class PendingChange:
             The kind to believe (None = any) and the kind to report (None = no single kind); None = cannot be decided
             yet.
         """
-        odds = {kind: test.odds({**self.others(camera), camera: kind}) for kind in (*CHANGES, None)}
+        odds = {kind: self._odds(test, camera, kind) for kind in (*CHANGES, None)}
         best, second = sorted(odds, key=lambda kind: -odds[kind])[:2]
         least = ALL_KINDS_LEAD if best is None else SINGLE_KIND_LEAD if second is None else KIND_LEAD
         if odds[best] - odds[second] >= least:
@@ -124,8 +133,13 @@ class PendingChange:
         if not last:
             return None
         # Report the most probable kind, but believe that any is possible.
-        likely = {kind: odds[kind] + LENS_LOG_PRIOR * (kind in LENS_KINDS) for kind in CHANGES}
-        return None, max(likely, key=lambda kind: likely[kind]) if self.overdue else None
+        return None, max(CHANGES, key=lambda kind: odds[kind]) if self.overdue else None
+
+    def _odds(self, test: ChangeTest, camera: int, kind: str | None) -> float:
+        """Log odds of a camera's change in a kind (None = any) against none, with the kind's prior."""
+        forms = (kind, TILT) if kind == "rotation" else (kind,)
+        found = [test.odds({**self.others(camera), camera: form}) for form in forms]
+        return mean_evidence(found, len(found)) + LENS_LOG_PRIOR * (kind in LENS_KINDS)
 
     def decide_kinds(
         self, test: ChangeTest, changes: Mapping[int, Change], last: bool
