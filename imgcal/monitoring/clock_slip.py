@@ -17,7 +17,7 @@ from torch import Tensor
 from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions
 from imgcal.geometry import RigidTransform
-from imgcal.monitoring.case import Case, ClockSlip, Explained, Explanation, Finding, Snapshot, Start, Variant
+from imgcal.monitoring.case import Case, ClockSlip, Explained, Explanation, Finding, Start, Variant
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.object_motion import ObjectMotion
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
