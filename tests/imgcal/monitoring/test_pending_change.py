@@ -69,6 +69,18 @@ def test_a_tilt_that_a_shift_of_the_lens_explains_as_well_is_a_rotation(tilt, pr
     assert since.decide(SimpleNamespace(odds=evidence), 1, last=True)[1] == kind  # type: ignore[arg-type, index]
 
 
+@pytest.mark.parametrize(("alone", "kind"), [(9950.0, "rotation"), (9800.0, None)])
+def test_a_change_of_all_kinds_is_reported_as_its_main_kind_if_there_is_one(alone, kind) -> None:
+    """A lens or a place that was never quite right shows, once the camera has moved."""
+    before, result, _ = zoomed()
+    since = PendingChange.of(result, before, 0.0, {1: None})
+
+    def evidence(changes: Mapping[int, str | None]) -> float:
+        return 10_000.0 if changes[1] is None else alone if changes[1] == "rotation" else 0.0
+
+    assert since.decide(SimpleNamespace(odds=evidence), 1, last=False) == (None, kind)  # type: ignore[arg-type]
+
+
 def test_a_camera_that_is_let_free_may_be_anywhere_and_no_other() -> None:
     before, _, _ = zoomed()
     free, turned = free_cameras(before, {2: None}).std(), free_cameras(before, {2: "rotation"}).std()
