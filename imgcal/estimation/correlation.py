@@ -89,6 +89,21 @@ def correlation_time(series: NDArray[np.floating]) -> NDArray[np.float64]:
     return tau
 
 
+def median_of_known(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Median of the known values (S, ...) along the first axis; NaN where none is known.
+
+    Equals `np.nanmedian`, whose masked arrays take twenty times as long on a few hundred values.
+
+    Examples:
+        >>> median_of_known(np.array([[1.0, np.nan], [4.0, np.nan], [np.nan, 7.0]])).tolist()
+        [2.5, 7.0]
+    """
+    ordered, count = np.sort(values, axis=0), (~np.isnan(values)).sum(0, keepdims=True)
+    middle = (np.take_along_axis(ordered, place, 0)[0] for place in (np.maximum(count - 1, 0) // 2, count // 2))
+    low, high = middle
+    return np.asarray(0.5 * (low + high), dtype=np.float64)
+
+
 def _centre(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Subtract the medians of series (S, C, D) and clip outliers."""
     known = np.isfinite(x)
@@ -97,8 +112,8 @@ def _centre(x: NDArray[np.float64]) -> NDArray[np.float64]:
     filled = np.where(known, x, np.nan)
     empty = ~known.any(0)
     filled[:, empty] = 0.0
-    centre = np.nanmedian(filled, axis=0)
-    spread = 1.4826 * np.nanmedian(np.abs(filled - centre), axis=0)
+    centre = median_of_known(filled)
+    spread = 1.4826 * median_of_known(np.abs(filled - centre))
     limit = np.where(spread > 0, OUTLYING * spread, np.inf)
     clipped = np.clip(filled - centre, -limit, limit)
     clipped -= np.nanmean(clipped, axis=0)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.association import Associations, merging_distance
+from imgcal.estimation import median_of_known
 from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig
 
@@ -144,7 +145,7 @@ def _usual_false_blobs(false: Counts) -> Counts:
 
 def _usual_extra_blobs(false: Counts, whole: NDArray[np.bool_]) -> Counts:
     """Usual number of blobs (S, C) per camera beside the `whole` object (S, C): (C,); 0 = it never was whole."""
-    usual = np.nanmedian(np.where(whole, false, np.nan)[:, whole.any(0)], axis=0)
+    usual = median_of_known(np.where(whole, false, np.nan)[:, whole.any(0)])
     counts = np.zeros(whole.shape[1], dtype=np.int64)
     counts[whole.any(0)] = np.floor(usual)
     return counts
