@@ -1,7 +1,7 @@
 from . import levenberg_marquardt_cpu
 from .accuracy import MAP_DEPTHS, MAP_SIZE, PredictedError, WorkingVolume, predicted_error
 from .change_points import CLIP, LEAST_SNAPSHOTS
-from .correlation import autocorrelation, correlation_time, median_of_known
+from .correlation import autocorrelation, correlation_time
 from .covariance import (
     camera_covariance,
     camera_std,
@@ -121,7 +121,6 @@ __all__ = [
     "make_problem",
     "map_cost",
     "map_state",
-    "median_of_known",
     "minimize",
     "move_to_pair_frame",
     "object_covariance",

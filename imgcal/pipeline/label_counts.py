@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.association import Associations, merging_distance
-from imgcal.estimation import median_of_known
 from imgcal.geometry import RigidTransform
+from imgcal.medians import median_of_known
 from imgcal.types import CalibrationObject, CameraRig
 
 MARGIN = 0.05
@@ -139,7 +139,7 @@ def _count_placed(labelled: Associations, poses: RigidTransform, rig: CameraRig,
 
 def _usual_false_blobs(false: Counts) -> Counts:
     """Number of false blobs (S, C) that is normal in a frame of each snapshot: (S, 1)."""
-    usual = np.median(false, axis=1, keepdims=True)
+    usual = median_of_known(false.T)[:, None]
     return np.floor(usual + 2 * np.sqrt(usual)).astype(np.int64)
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, correlation_time
+from imgcal.medians import median
 
 Floats = NDArray[np.float64]
 
@@ -80,8 +81,8 @@ def find_step(size: Floats, sigma: Floats) -> SizeStep | None:
     level = np.where(np.arange(len(x)) <= at, moment[at] / before[at], later[at] / after[at])
     left = (x - level) * np.sqrt(weight)
     about = (x - (weight * x).sum() / weight.sum()) * np.sqrt(weight)
-    step, rest = float(change[at]), float(np.median(np.abs(left)))
-    if abs(step) < LEAST_STEP or rest > math.sqrt(LARGEST_SHARE) * np.median(np.abs(about)):
+    step, rest = float(change[at]), median(np.abs(left))
+    if abs(step) < LEAST_STEP or rest > math.sqrt(LARGEST_SHARE) * median(np.abs(about)):
         return None
     lasting = float(correlation_time(left[:, None])[0])
     noise = max(1.0, 1.4826 * rest) * math.sqrt(lasting * (1 / before[at] + 1 / after[at]))

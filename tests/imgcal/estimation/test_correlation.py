@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from imgcal.estimation import autocorrelation, correlation_time, median_of_known
+from imgcal.estimation import autocorrelation, correlation_time
 
 
 def _autoregressive(rho: float, count: int, width: int, seed: int = 0) -> np.ndarray:
@@ -79,11 +79,3 @@ def test_autocorrelation_counts_pairs_without_gaps() -> None:
     rho, pairs = autocorrelation(np.array([[1.0], [np.nan], [1.0], [-2.0]]), 3)
     assert pairs[:, 0].tolist() == [3, 1, 1, 1]
     assert rho[0, 0] == pytest.approx(1)
-
-
-@pytest.mark.parametrize("count", [1, 6, 7])
-def test_median_of_known_is_numpys(count: int) -> None:
-    values = np.random.default_rng(count).normal(size=(count, 5, 3))
-    values[1:, np.arange(5) % 2 == 0] = np.where(values[1:, ::2] > 0, np.nan, values[1:, ::2])
-    assert np.array_equal(median_of_known(values), np.nanmedian(values, axis=0))
-    assert np.isnan(median_of_known(np.full((2, 1), np.nan))).all()
