@@ -1,4 +1,4 @@
-"""Medians and quantiles of a few hundred numbers: NumPy's own take ten times as long, those that skip NaN a hundred."""
+"""Medians and quantiles of a few numbers: NumPy's own take five times as long, those that skip NaN up to ten times."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,8 @@ def median_of_known(values: NDArray[np.generic]) -> NDArray[np.float64]:
         [2.5, 7.0]
     """
     ordered, count = _sort_known(values)
+    if (count == len(ordered)).all():
+        return np.asarray(0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]))
     return np.asarray(0.5 * (_take(ordered, np.maximum(count - 1, 0) // 2) + _take(ordered, count // 2)))
 
 

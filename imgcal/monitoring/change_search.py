@@ -27,8 +27,8 @@ REMAINING_CHI2 = 20.0
 
 # Numbers of snapshots.
 SLOW_TESTS = {16: (16, 0), 64: (32, 8)}
-"""Numbers of snapshots to test without a suspicion, each with the interval between its tests and the offset of the first
-one, so that no snapshot waits for both: for young rigs."""
+"""Numbers of snapshots to test without a suspicion, each with the interval between its tests and their offset, so that
+no snapshot waits for both: for young rigs."""
 NEARBY_SNAPSHOTS = 4
 """Half width, in snapshots, of the search for the first snapshot after a change."""
 
