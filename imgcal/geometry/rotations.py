@@ -129,7 +129,8 @@ def _quaternion_from_rotation(rotation: Tensor) -> Tensor:
     xy, zx, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
     ww, xx, yy, zz = 1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22
     # Compare the candidates component by component: each component is one long row.
-    largest, chosen = ww, (ww, zy, xz, yx)
+    largest = ww
+    chosen: tuple[Tensor, ...] = (ww, zy, xz, yx)
     for square, candidate in ((xx, (zy, xx, xy, zx)), (yy, (xz, xy, yy, yz)), (zz, (yx, zx, yz, zz))):
         larger = square > largest
         largest = torch.where(larger, square, largest)
