@@ -18,6 +18,7 @@ from imgcal.estimation import EstimationOptions
 from imgcal.monitoring.case import Case, Explained, Explanation, Finding, Snapshot, Start, Variant, mean_evidence
 from imgcal.monitoring.change_test import JUMPS
 from imgcal.monitoring.clock_slip import ClockSlipExplanation
+from imgcal.monitoring.lens_misfit import LensMisfit
 from imgcal.monitoring.lens_warming import Warmed
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.object_change import ObjectChanged
@@ -91,6 +92,8 @@ class PassingError(Explanation):
         return replace(shake_cameras(start, cameras, size), find=lambda _: Finding())
 
 
+HARMLESS = {Steady.name, PassingError.name, Warmed.name, LensMisfit.name}
+"""Explanations by which nothing needs a report."""
 EXPLANATIONS: tuple[Explanation, ...] = (
     Steady(),
     Moved(),
@@ -100,6 +103,7 @@ EXPLANATIONS: tuple[Explanation, ...] = (
     ObjectChanged(),
     PassingError(),
     Warmed(),
+    LensMisfit(),
 )
 """All explanations that are weighed. To add one: a subclass as above, in its own module if long, and a line here."""
 
@@ -126,7 +130,7 @@ class Verdict:
     def harmless(self) -> bool:
         """Tell whether possibly nothing has happened, and every rival is a consequence of that or passes."""
         near = {name for name, one in self.explained.items() if one.evidence > self.best.evidence - LEAD}
-        return Steady.name in near and near <= {Steady.name, Moved.name, Warmed.name, PassingError.name}
+        return Steady.name in near and near <= HARMLESS | {Moved.name}
 
     def evidence(self, *names: str) -> float:
         """Largest evidence among the named explanations; minus infinity if none could be weighed."""

@@ -26,6 +26,7 @@ from imgcal.monitoring.change_test import JUMPS, LARGE
 from imgcal.monitoring.clock_slip import project_fiducials
 from imgcal.monitoring.drift_pace import DriftLearning, DriftPaces
 from imgcal.monitoring.explanations import Diagnosis, Moved, Steady, Verdict, doubtful_cameras, weigh
+from imgcal.monitoring.lens_misfit import LensMisfit
 from imgcal.monitoring.lens_warming import Warmed
 from imgcal.monitoring.noise_correlation import NoiseCorrelation
 from imgcal.monitoring.object_change import MISFIT_LEAD, Misfit, ObjectChanged, has_never_fitted
@@ -258,6 +259,9 @@ class RigMonitor:
             decided = self._decide_kinds(last=True)
             anew = self._learn_moved(case, dict.fromkeys(case.cameras), JUMPS[-1], sum(case.pauses[-case.count :]))
             return replace(anew, changes=(*found.changes, *decided, *anew.changes))
+        if verdict.best.name == LensMisfit.name:
+            best = verdict.best
+            return MonitorUpdate(self._restart(best.before, best.snapshots, case.pauses[-case.count :]))
         if verdict.best.finding.slips and len(verdict.best.snapshots) > case.count:  # late from the beginning
             return replace(self._adopt(case, verdict), changes=found.changes)
         return replace(found, slips=self._clock_slips(verdict))
