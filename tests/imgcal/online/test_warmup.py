@@ -69,7 +69,7 @@ while new:
 print(json.dumps({{
     "compiled": Compiled.names,
     "used": [f"{{name}}{{types}}" for value, name in ours.items() for types in value.overloads],
-    "left": [name.rpartition(".")[2] for value, name in ours.items()
+    "left": [value.py_func.__qualname__ for value in ours
              if value not in reached and value.targetoptions.get("inline") != "always"],
 }}))
 """
@@ -94,6 +94,7 @@ with RigKeeper(rig, obj, horizon=2) as keeper:
         keeper.update(frames, number / 60)
 """
 NETWORKS = [ROOT / "data" / "models" / f"{name}-O10-asymmetric8.safetensors" for name in ("points", "vit")]
+OF_A_LENS = "<locals>"  # called through numba's overloads, which a function does not name
 UNUSED = {"_minimize_all", "_pair", "_gradients", "_through_profile"}  # many rigs at once, and training
 
 
@@ -114,4 +115,4 @@ def test_commands_call_nothing_else_than_is_compiled_ahead(tmp_path: Path) -> No
     used = run_watched(tmp_path, COMMANDS, data_path("samples", "O10"), *NETWORKS)
     assert not set(used["used"]) - set(warm["used"])
     assert not used["compiled"]
-    assert set(warm["left"]) == UNUSED
+    assert {name for name in warm["left"] if OF_A_LENS not in name} == UNUSED
