@@ -123,7 +123,8 @@ def warm_up(all_lenses: bool = False) -> None:
 
 
 def installed_files(folder):
-    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if "__pycache__" not in path.parts}
+    found = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+    return {path.as_posix() for path in found if "__pycache__" not in path.parts}
 
 
 @pytest.mark.slow
