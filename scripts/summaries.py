@@ -168,7 +168,7 @@ def paper_table() -> str:
 def real_frames_table() -> str:
     """Count the cases of real frames, original and degraded, that each detector calibrates."""
     names = {"dots": "three-cameras-dots", "cavity": "cavity-two-cameras", "grid": "dot-grid-10x10"}
-    detectors = ("classical", "matched", "auto", "learned")
+    detectors = ("classical", "matched", "auto")
     calibrated: dict[tuple[str, str], list[bool]] = defaultdict(list)
     for row in read_json(RESULTS / "degraded_captures.json")["outcomes"]:
         calibrated[row["captures"], row["detector"]].append(not row["reason"])
@@ -176,7 +176,7 @@ def real_frames_table() -> str:
         [name, str(len(calibrated[key, detectors[0]])), *(str(sum(calibrated[key, one])) for one in detectors)]
         for key, name in names.items()
     ]
-    return markdown(("real frames", "cases", "blobs", "matched filter", "`auto`", "learned"), rows)
+    return markdown(("real frames", "cases", "blobs", "matched filter", "`auto`"), rows)
 
 
 def _recalibration_rows() -> list[list[str]]:

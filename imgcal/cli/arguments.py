@@ -232,12 +232,14 @@ class Watch:
     hook: str | None = None
     """command to run for each event, without a shell; the event is its standard input, a line of JSON"""
     detector: str = "classical"  #: who finds the fiducials in frames, as for imgcal calibrate
+    measurer: str | None = None
+    """network that measures what the network of --detector finds: a file, the folder of a run, or a shipped name"""
     learn: bool = False
     """with --detector learned: adapt detector and measurer to this rig's own frames while it runs, in a process of the
     lowest priority. OUT/learning/dataset gets crops of snapshots, some of them held out; a training begins after 30
     snapshots and 8 held-out ones. The adapted networks run only once they are better on held-out snapshots, otherwise
-    they are dropped; an event says which. They stay in OUT/learning/adapted, for the next start and for imgcal
-    calibrate --detector --measurer"""
+    they are dropped; an event says which. They stay in OUT/learning/adapted, for the next start and for --detector and
+    --measurer"""
     detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from rich.console import Console
 
+from imgcal.association import Proposer
 from imgcal.cli import arguments
 from imgcal.cli.common import check_folder, open_rig
 from imgcal.cli.watch_display import Display
@@ -25,6 +26,7 @@ from imgcal.extras import advice, missing
 from imgcal.io import Fiducials, holding, load_objects, open_input
 from imgcal.messages import shorten
 from imgcal.online import Event, RigKeeper
+from imgcal.pipeline import DETECTORS, DetectorName, LearnedMeasurer, choose_proposer
 from imgcal.types import CalibrationObject, CameraRig, Detections, object_difference, rig_difference
 from imgcal.watch import (
     CURRENT,
@@ -92,10 +94,11 @@ class Watch(arguments.Watch):
         _check_poses(self.poses, given.as_unknown(), self.out)
         if self.learn:
             self._check_learning(given)
+        detector = self._detector()
         with holding(self.out) as folder:
-            self._watch(rig, given, folder)
+            self._watch(rig, given, detector, folder)
 
-    def _watch(self, rig: CameraRig, given: CalibrationObject, folder: Path) -> None:
+    def _watch(self, rig: CameraRig, given: CalibrationObject, detector: DetectorName | Proposer, folder: Path) -> None:
         obj = given.as_unknown()
         with _going_on():
             progress = None if self.fresh else Progress.load(folder)
@@ -110,7 +113,7 @@ class Watch(arguments.Watch):
         hook = None if self.hook is None else Hook(self.hook)
         display = Display(Console(file=sys.stdout, soft_wrap=True), intake, hook)
         with contextlib.ExitStack() as stack:
-            keeper, restored = self._keeper(folder, rig, obj)
+            keeper, restored = self._keeper(folder, rig, obj, detector)
             stack.enter_context(keeper)
             stack.enter_context(intake).wait_until_open()  # before anything is written
             if len(given.points) > 1 and obj is not given:
@@ -240,12 +243,29 @@ class Watch(arguments.Watch):
             if meant != kind and not (given is None or given is False or given == ()):
                 raise InputError(f"--{option}: needs {meant}, found {kind} ({shorten(self.input)})")
 
+    def _detector(self) -> DetectorName | Proposer:
+        """Combine the network of `--detector` with `--measurer`.
+
+        Raises:
+            InputError: no network leaves anything to measure, or there is no such measurer.
+        """
+        if self.measurer is None:
+            return self.detector
+        if self.detector in DETECTORS and self.detector != "learned":
+            raise InputError(
+                f"--measurer: found --detector {self.detector}, expected --detector learned or a network of your own"
+            )
+        return choose_proposer(self.detector, LearnedMeasurer.load(self.measurer))[0]
+
     def _check_learning(self, obj: CalibrationObject) -> None:
         """Refuse to learn where no network runs, or none can learn.
 
         Raises:
             InputError: says what `--learn` needs.
         """
+        if self.measurer is not None:
+            found = f"found --measurer {shorten(self.measurer)}"
+            raise InputError(f"--learn: {found}, expected none: it begins with the shipped measurer, and adapts it")
         if self.detector != "learned":
             found = f"found --detector {shorten(self.detector)}"
             raise InputError(f"--learn: {found}, expected --detector learned: it adapts the network that this runs")
@@ -253,13 +273,15 @@ class Watch(arguments.Watch):
             found = f"found {shorten(obj.name)}"
             raise InputError(f"--learn: {found}, expected one object whose markers keep their distances")
 
-    def _keeper(self, folder: Path, rig: CameraRig, obj: CalibrationObject) -> tuple[RigKeeper, bool]:
+    def _keeper(
+        self, folder: Path, rig: CameraRig, obj: CalibrationObject, detector: DetectorName | Proposer
+    ) -> tuple[RigKeeper, bool]:
         """Begin, or go on with what an earlier run knew; says whether it did."""
         path = folder / STATE
         if self.fresh or not path.is_file():
-            return RigKeeper(rig, obj, detection=self.detection, detector=self.detector), False
+            return RigKeeper(rig, obj, detection=self.detection, detector=detector), False
         with _going_on():
-            keeper = RigKeeper.restore(path, detection=self.detection, detector=self.detector)
+            keeper = RigKeeper.restore(path, detection=self.detection, detector=detector)
         for option, difference in (
             (f"--rig {self.rig}", _rig_difference(rig, keeper.given)),
             (f"--object {' '.join(self.object)}", _object_difference(obj, keeper.obj)),

@@ -22,13 +22,12 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
-from imgcal.association import PipelineOptions, Proposer, Snapshot, judge
+from imgcal.association import PipelineOptions, Proposer, Snapshot, judge, to_observations
 from imgcal.cli.harvest import Source, write_dataset
 from imgcal.cli.training_folder import train_in
 from imgcal.errors import InputError, RefusedError
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import publishing, write_text
-from imgcal.networks import Expectation
 from imgcal.pipeline import load_proposer
 from imgcal.training import (
     TRAIN_PATCHES,
@@ -36,6 +35,7 @@ from imgcal.training import (
     PatchDataset,
     adaptation,
     cut_labelled,
+    find_shown,
     is_finished,
     load_experiment,
 )
@@ -59,6 +59,7 @@ GRACE = 6.0  # s in which a training has to stop after the watching process has 
 NEAR = 5.0  # px within which a claim is right
 TURNED_DEG, ASIDE = 1.0, 0.01  # errors of the pose that networks are given: degrees, and parts of the distance
 SIGMAS = 2.0  # by which an adapted network must be better
+LESS_EXACT, EXACT = 1.25, 0.3  # its error: at most so many times the other's, unless it is so small (px)
 GROWTH = 1.5  # times the snapshots that had been taken at the last training, until the next
 
 CARD = """# Networks adapted to a rig
@@ -67,11 +68,12 @@ Adapted by `imgcal watch --learn` to rig {rig} and object {object}, on {crops} c
 (`{dataset}`), from the shipped networks {names}.
 
 Measured on {moments} held-out snapshots of this rig, never neighbours in time of those trained on; the believed pose is
-1 degree and 1 % of the distance off. Right: within 5 px, of the markers in view, hidden ones included. Wrong: of the
-claims. Decided: snapshots whose claims identification accepts.
+1 degree and 1 % of the distance off. Right: within 5 px, of the markers that the frames show. Wrong: of the claims; a
+claim near a hidden marker counts as neither. Off: RMS distance of the right ones from the rig's projections. Decided:
+snapshots whose claims identification accepts.
 
-| | right % | wrong % | decided |
-|---|---|---|---|
+| | right % | wrong % | off, px | decided |
+|---|---|---|---|---|
 | before | {before} |
 | adapted | {after} |
 
@@ -83,37 +85,44 @@ To use them: `imgcal calibrate CAPTURE --detector {network} --measurer {measurer
 class Scores:
     """What networks make of M held-out snapshots."""
 
-    in_view: NDArray[np.int64]  # (M,) markers
+    shown: NDArray[np.int64]  # (M,) markers
     right: NDArray[np.int64]  # (M,) of these
-    claimed: NDArray[np.int64]  # (M,)
+    claimed: NDArray[np.int64]  # (M,) without claims near hidden markers
+    squared: NDArray[np.float64]  # (M,) px^2, summed squared distances of the right ones from their projections
     decided: NDArray[np.bool_]  # (M,) identification accepts the claims
 
     @property
     def quality(self) -> NDArray[np.float64]:
-        """Right less wrong, as a share of the markers in view: (M,)."""
-        return (2 * self.right - self.claimed) / np.maximum(self.in_view, 1)
+        """Right less wrong, as a share of the markers shown: (M,)."""
+        return (2 * self.right - self.claimed) / np.maximum(self.shown, 1)
 
     def shares(self) -> tuple[float, float]:
-        """Right % of the markers in view, wrong % of the claims."""
+        """Right % of the markers shown, wrong % of the claims."""
         right, claimed = int(self.right.sum()), int(self.claimed.sum())
-        return 100 * right / max(int(self.in_view.sum()), 1), 100 * (claimed - right) / max(claimed, 1)
+        return 100 * right / max(int(self.shown.sum()), 1), 100 * (claimed - right) / max(claimed, 1)
+
+    @property
+    def off(self) -> float:
+        """RMS distance of the right ones from their projections, px."""
+        return float(np.sqrt(self.squared.sum() / max(self.right.sum(), 1)))
 
     def row(self) -> str:
         """Cells of a table."""
         right, wrong = self.shares()
-        return f"{right:.1f} | {wrong:.1f} | {int(self.decided.sum())} of {len(self.decided)}"
+        return f"{right:.1f} | {wrong:.1f} | {self.off:.2f} | {int(self.decided.sum())} of {len(self.decided)}"
 
     def is_better(self, other: Scores) -> bool:
-        """Tell whether this is better than `other` on the same snapshots by more than its uncertainty.
+        """Tell whether this is better than `other` on the same snapshots by more than its uncertainty, and as exact.
 
         Examples:
-            >>> scores = lambda right: Scores(*(np.full(4, n) for n in (8, right, 8)), np.full(4, True))
+            >>> scores = lambda right: Scores(*(np.full(4, n) for n in (8, right, 8, 0.1)), np.full(4, True))
             >>> scores(8).is_better(scores(7)), scores(8).is_better(scores(8))
             (True, False)
         """
         gain = self.quality - other.quality
         sigma = gain.std(ddof=1) / np.sqrt(len(gain))
-        return bool(gain.mean() > SIGMAS * sigma and self.decided.sum() >= other.decided.sum())
+        exact = self.off < EXACT or not other.right.any() or self.off < LESS_EXACT * other.off
+        return bool(gain.mean() > SIGMAS * sigma and exact and self.decided.sum() >= other.decided.sum())
 
 
 class Learner:
@@ -230,8 +239,9 @@ class Learner:
         (right, wrong), (right_before, wrong_before) = after.shares(), before.shares()
         decided = f"{int(after.decided.sum())} of {len(after.decided)} held-out snapshots decided"
         figures = (
-            f"right {right:.1f} % of the markers in view (before: {right_before:.1f}), wrong {wrong:.1f} % of its "
-            f"claims ({wrong_before:.1f}), {decided} ({int(before.decided.sum())})"
+            f"right {right:.1f} % of the markers shown (before: {right_before:.1f}), wrong {wrong:.1f} % of its "
+            f"claims ({wrong_before:.1f}), {after.off:.2f} px off ({before.off:.2f}), {decided} "
+            f"({int(before.decided.sum())})"
         )
         if not after.is_better(before):
             return Outcome(f"the network adapted to {frames} frames is no better and is dropped: {figures}")
@@ -246,8 +256,7 @@ class Learner:
             if self._ended.is_set():
                 raise _EndedError
             rows.append(ask(proposer, replace(moment, frames=_unpack(moment.frames)), self.task))
-        in_view, right, claimed, decided = (np.array(column) for column in zip(*rows, strict=True))
-        return Scores(in_view, right, claimed, decided)
+        return Scores(*(np.array(column) for column in zip(*rows, strict=True)))
 
     def _publish(self, before: Scores, after: Scores) -> None:
         """Put the adapted networks and their card where the user finds them, in one step."""
@@ -274,11 +283,13 @@ class _EndedError(Exception):
     """The watching process has ended, and a training with it."""
 
 
-def ask(proposer: Proposer, moment: Moment, task: LearningTask) -> tuple[int, int, int, bool]:
+def ask(proposer: Proposer, moment: Moment, task: LearningTask) -> tuple[int, int, int, float, bool]:
     """Ask a proposer about a snapshot whose pose is known, from a pose nearby.
 
     Returns:
-        Markers in view, right ones, claims, and whether identification accepts them.
+        Markers that the frames show, right ones, claims, summed squared distances (px^2) of the right ones, and whether
+        identification accepts the claims. A claim near a hidden marker does not count: it may be no more than what the
+        others predict.
     """
     rig, obj, pose, options = moment.rig, task.obj, moment.rig_from_object, PipelineOptions()
     nothing = np.full(len(moment.blobs), -1, dtype=np.int64)
@@ -287,14 +298,17 @@ def ask(proposer: Proposer, moment: Moment, task: LearningTask) -> tuple[int, in
         (_believe(pose, moment, task),), task.detection,
     )  # fmt: skip
     proposal = proposer.propose(snapshot)
-    expected = Expectation.of(rig, obj, pose.reshape(1))
-    there = np.array([moment.frames.get(name) is not None for name in rig.camera_names])
-    visible = expected.visible[0].numpy() & there[:, None]
+    uv = rig.project(pose.apply(obj.points)).uv.numpy()
+    labels = to_observations(moment.blobs.select(moment.blobs.fiducial >= 0), rig, obj)
+    shown = find_shown(moment.frames, rig, obj, pose.reshape(1), labels, task.detection).numpy()
     claims = proposal.detections
-    off = np.linalg.norm(claims.uv - expected.uv[0].numpy()[claims.camera, claims.fiducial], axis=1)
-    right = (off < NEAR) & visible[claims.camera, claims.fiducial]
+    off = np.linalg.norm(claims.uv - uv[claims.camera, claims.fiducial], axis=1)
+    near = off < NEAR
+    of_shown = shown[claims.camera, claims.fiducial]
     found, _ = judge(proposal, snapshot, options.identity, error=options.identity_error, pose_known=True)
-    return int(visible.sum()), int(right.sum()), len(claims), found.accepted
+    right, counted = near & of_shown, of_shown | ~near
+    squared = float(np.square(off[right]).sum())
+    return int(shown.sum()), int(right.sum()), int(counted.sum()), squared, found.accepted
 
 
 def _believe(pose: RigidTransform, moment: Moment, task: LearningTask) -> RigidTransform:

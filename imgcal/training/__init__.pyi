@@ -15,7 +15,7 @@ from .frame_dataset import (
     load_splits,
 )
 from .infrared_task import InfraredExperiment, InfraredTask
-from .labelled_crops import cut_labelled, split
+from .labelled_crops import cut_labelled, find_shown, split
 from .measurer_task import MeasurerExperiment, MeasurerTask
 from .rigs import RigExperiment, RigTask, checkpoint_experiment
 from .state import TrainingState, load_state, save_state
@@ -48,6 +48,7 @@ __all__ = [
     "change_experiment",
     "checkpoint_experiment",
     "cut_labelled",
+    "find_shown",
     "is_finished",
     "load_experiment",
     "load_patches",

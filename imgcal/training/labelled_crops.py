@@ -169,6 +169,20 @@ def find_visible(
     return seen & expected.visible[0], sigma
 
 
+def find_shown(
+    frames: Mapping[str, Frame | None],
+    rig: CameraRig,
+    obj: CalibrationObject,
+    pose: RigidTransform,
+    labels: Observations,
+    detection: DetectionOptions,
+) -> Tensor:
+    """Tell which markers the frames of a snapshot show, whatever their shape: (C, N) bool; see `find_visible`."""
+    seen, _ = find_visible(frames, rig, obj, pose, labels, detection)
+    look = usual_look(lambda _: frames, (0,), rig, obj, pose, detection)
+    return seen if look is None else seen | look.shows(frames, rig, Expectation.of(rig, obj, pose), detection)
+
+
 @dataclass(frozen=True)
 class Look:
     """How the markers of a capture look, whatever their shape."""

@@ -15,7 +15,7 @@ import subprocess
 import sys
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,23 +23,25 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from torch import Tensor, nn
 
 import imgcal
 from imgcal.errors import RefusedError
+from imgcal.io import MODEL
 from imgcal.matching import MatchedFilter
-from imgcal.networks import load_infrared, load_measurer
+from imgcal.networks import Evidence, InfraredNetwork, Queries, load_infrared, load_measurer
 from imgcal.pipeline.learned_proposer import LearnedProposer
 from imgcal.pipeline.sources import Detector
 from imgcal.training import HELD_OUT, TRAIN
 from imgcal.training.labelled_crops import cut_labelled
 from imgcal.types import CameraRig, Detections
-from scripts.output import RESULTS, ROOT, command, fill, markdown, read_json, surroundings, write_json
+from scripts.output import RESULTS, ROOT, command, fill, machine, markdown, read_json, write_json
 from scripts.results import degraded_captures as captures
 from scripts.results.degradations import DEGRADATIONS
-from scripts.results.infrared import Shuffled
 from tests.captures.sets import dot_grid
 
 JSON, PAGE = RESULTS / "own_frames.json", ROOT / "docs" / "infrared.md"
+MODELS = ROOT / "data" / "models"
 ADAPT = {
     "dots": ("cam1",),
     "cavity": ("cam3",),
@@ -48,6 +50,7 @@ ADAPT = {
 REST = {"dots": ("cam2", "cam3"), "cavity": ("cam4",), "grid": ("cam",)}
 ENCODERS = {"ir-cnn": "cnn", "ir-vit": "vit", "ir-vit-stem": "vit-stem"}
 SEEDS = (0, 1, 2)
+KEY = ("captures", "kind", "level", "detector")  # everything that a result depends on
 EVERY = 5  # every fifth crop is held out to stop a training; results come from other cameras or views
 
 
@@ -115,11 +118,11 @@ def train(runs: Path, cores: int) -> None:
     """Train the encoders' starting networks that are not shipped, and adapt all."""
     todo = []
     for encoder in ENCODERS:
-        if encoder != "ir-cnn" and not (runs / encoder / "model.safetensors").is_file():
+        if encoder != "ir-cnn" and not (runs / encoder / MODEL).is_file():
             todo.append(["ir-cnn", "--out", str(runs / encoder), "--set", f"network.encoder={ENCODERS[encoder]}"])
     run_trainings(todo, cores)
     run_trainings([each for each in trainings(runs, ENCODERS, SEEDS)
-                   if not (Path(each[4]) / "model.safetensors").is_file()], cores)  # fmt: skip
+                   if not (Path(each[4]) / MODEL).is_file()], cores)  # fmt: skip
 
 
 def run_trainings(todo: list[list[str]], cores: int) -> None:
@@ -133,6 +136,39 @@ def run_trainings(todo: list[list[str]], cores: int) -> None:
             raise SystemExit("a training run failed")
 
 
+class Placed(InfraredNetwork):
+    """A query network on any device, for a proposer on the CPU, optionally with a useless encoder."""
+
+    shuffled = False  # the cells of every feature map change places
+
+    @classmethod
+    def load(cls, path: Path, device: str, shuffled: bool) -> Placed:
+        """Load a network."""
+        torch.backends.cudnn.allow_tf32 = False  # as exact as on a CPU
+        read = load_infrared(path).network
+        made = cls(read.config).eval()
+        made.load_state_dict(read.state_dict())
+        made.to(device)
+        made.encoder.register_forward_pre_hook(lambda module, crops: crops[0].to(device))
+        made.encoder.register_forward_hook(made._maps)
+        made.shuffled = shuffled
+        return made
+
+    def _maps(self, module: nn.Module, crops: Any, maps: Tensor) -> Tensor:
+        """Return the feature maps, their cells in random order if the encoder is to be useless."""
+        if not self.shuffled:
+            return maps
+        cells = maps.flatten(2)
+        order = torch.randperm(cells.shape[-1], generator=torch.Generator().manual_seed(0))
+        return cells[..., order.to(cells.device)].view_as(maps)
+
+    def search(self, features: Tensor, queries: Queries, window: int | None = None) -> Evidence:
+        """Search where the features are; return evidence on the CPU."""
+        there = Queries(*(getattr(queries, each.name).to(features.device) for each in fields(Queries)))
+        found = super().search(features, there, window)
+        return Evidence(*(getattr(found, each.name).cpu() for each in fields(Evidence)))
+
+
 @dataclass(frozen=True)
 class Case:
     """One calibration."""
@@ -142,26 +178,28 @@ class Case:
     level: float
     detector: str  # a name, or "ENCODER seed K", optionally followed by "shuffled"
     runs: str
+    device: str  # of the query network
+
+    @property
+    def weights(self) -> Path | None:
+        """File of the query network, if the detector is one."""
+        encoder, _, more = self.detector.partition(" seed ")
+        if encoder in ENCODERS:
+            return adapted(Path(self.runs), self.captures, encoder, int(more.split()[0])) / MODEL
+        return MODELS / "ir-cnn.safetensors" if self.detector == "learned" else None
 
     def proposer(self) -> Detector:
         """Make the detector."""
-        encoder, _, more = self.detector.partition(" seed ")
-        if encoder not in ENCODERS:
+        if self.weights is None:
             return self.detector
-        seed, _, shuffled = more.partition(" ")
-        path = adapted(Path(self.runs), self.captures, encoder, int(seed)) / "model.safetensors"
-        network = load_infrared(path).network
-        if shuffled:
-            broken = Shuffled(network.config).eval()
-            broken.load_state_dict(network.state_dict())
-            network = broken
+        network = Placed.load(self.weights, self.device, self.detector.endswith(" shuffled"))
         return LearnedProposer(network, shipped_measurer(), MatchedFilter())
 
 
 @cache
 def shipped_measurer() -> Any:
     """The shipped measurer."""
-    return load_measurer(ROOT / "data" / "models" / "measurer-cnn.safetensors").network
+    return load_measurer(MODELS / "measurer-cnn.safetensors").network
 
 
 def measured(case: Case) -> dict[str, Any]:
@@ -169,8 +207,8 @@ def measured(case: Case) -> dict[str, Any]:
     torch.set_num_threads(1)
     given = rest(case.captures)
     frames = given.degraded(case.kind, case.level, 0)
-    row: dict[str, Any] = {**asdict(case), "reason": "", "off_px": None, "labels": 0, "found_by": {}}
-    del row["runs"]
+    row: dict[str, Any] = {name: getattr(case, name) for name in KEY}
+    row |= {"machine": machine(case.device), "reason": "", "off_px": None, "labels": 0, "found_by": {}}
     try:
         found = imgcal.calibrate(frames, given.rig, given.obj, detection=given.detection, detector=case.proposer())
     except RefusedError as error:
@@ -179,10 +217,10 @@ def measured(case: Case) -> dict[str, Any]:
             "found_by": dict(found.detectors)}  # fmt: skip
 
 
-def cases(runs: Path, detectors: Iterable[str]) -> list[Case]:
+def cases(runs: Path, detectors: Iterable[str], device: str) -> list[Case]:
     """All cases of some detectors, the slowest first."""
     return [
-        Case(name, kind, level, detector, str(runs))
+        Case(name, kind, level, detector, str(runs), device)
         for name in ("grid", "dots", "cavity")
         for kind, made in DEGRADATIONS.items()
         for level in made.levels
@@ -206,12 +244,12 @@ def measure(runs: Path, cores: int, todo: list[Case]) -> None:
             known.append(row)
             said = row["reason"][:120] or f"{row['off_px']:.3f} px {row['found_by']}"
             print(*key(row), said, flush=True)
-            write_json(JSON, surroundings() | {"outcomes": known})
+            write_json(JSON, {"outcomes": known})
 
 
 def key(row: dict[str, Any]) -> tuple[Any, ...]:
     """Everything that a result depends on."""
-    return tuple(row[name] for name in ("captures", "kind", "level", "detector"))
+    return tuple(row[name] for name in KEY)
 
 
 def tables(rows: list[dict[str, Any]]) -> str:
@@ -245,6 +283,7 @@ def main(
     steps: tuple[str, ...] = ("prepare", "train", "measure", "page"),
     cores: int = 1,
     only: tuple[str, ...] = (),
+    device: str = "cpu",
 ) -> None:
     """Adapt, calibrate, and write the JSON and the table.
 
@@ -253,13 +292,14 @@ def main(
         steps: prepare, train, measure, page.
         cores: processes at once.
         only: detectors to measure; none = all.
+        device: of the query networks.
     """
     if "prepare" in steps:
         prepare(runs)
     if "train" in steps:
         train(runs, cores)
     if "measure" in steps:
-        measure(runs, cores, cases(runs, only or detectors()))
+        measure(runs, cores, cases(runs, only or detectors(), device))
     if "page" in steps:
         fill(PAGE, {"own frames": tables(read_json(JSON)["outcomes"])})
 

@@ -28,6 +28,7 @@ import imgcal
 from imgcal.association import Proposer, Sight, Snapshot, match_to_rig
 from imgcal.detection import DetectionOptions, detect_snapshot, to_detections
 from imgcal.errors import RefusedError
+from imgcal.io import MODEL
 from imgcal.matching import MatchedFilter
 from imgcal.networks import Expectation, load_infrared, load_measurer
 from imgcal.pipeline.learned_proposer import LearnedProposer
@@ -152,26 +153,30 @@ def trainings(runs: Path, markers: Sequence[str] = MARKERS) -> list[list[str]]:
     ]  # fmt: skip
 
 
-def measured(shape: str, runs: Path) -> dict[str, Any]:
-    """Run the filter, the shipped network and the adapted ones on the same snapshots."""
-    torch.set_num_threads(1)
-    models = ROOT / "data" / "models"
-    file = "model.safetensors"
-    methods: dict[str, Proposer] = {"matched filter": MatchedFilter()}
-    pairs = {"ir-cnn": (models / "ir-cnn.safetensors", models / "measurer-cnn.safetensors")} | {
+def methods(shape: str, runs: Path) -> dict[str, tuple[Path, Path] | None]:
+    """Files of query network and measurer of each method that there is; None = the matched filter."""
+    shipped = ROOT / "data" / "models"
+    pairs = {"ir-cnn": (shipped / "ir-cnn.safetensors", shipped / "measurer-cnn.safetensors")} | {
         f"{count} frames, seed {seed}": (
-            runs / f"{shape}-{count}-{seed}" / file, runs / f"{shape}-{count}-{seed}{MEASURER}" / file,
+            runs / f"{shape}-{count}-{seed}" / MODEL, runs / f"{shape}-{count}-{seed}{MEASURER}" / MODEL,
         )
         for count, seeds in FRAMES.items() for seed in seeds
     }  # fmt: skip
-    for name, (network, measurer) in pairs.items():
-        if network.is_file() and measurer.is_file():
-            methods[name] = LearnedProposer(load_infrared(network).network, load_measurer(measurer).network)
-    tallies = {name: Tally() for name in methods}
+    there = {name: pair for name, pair in pairs.items() if all(path.is_file() for path in pair)}
+    return {"matched filter": None, **there}
+
+
+def measured(shape: str, name: str, runs: Path) -> dict[str, Any]:
+    """Run a method on the same snapshots as all others."""
+    torch.set_num_threads(1)
+    pair = methods(shape, runs)[name]
+    method: Proposer = MatchedFilter()
+    if pair is not None:
+        method = LearnedProposer(load_infrared(pair[0]).network, load_measurer(pair[1]).network)
+    tally = Tally()
     for number, (_, case) in enumerate(snapshots(imgcal.load_rig("O10"), shape, SNAPSHOTS, 77)):
-        for name, method in methods.items():
-            ask(partial(_detections, method), case, 1.0, number, tallies[name])
-    return {name: tally.result() for name, tally in tallies.items()}
+        ask(partial(_detections, method), case, 1.0, number, tally)
+    return tally.result()
 
 
 def _detections(method: Proposer, snapshot: Snapshot) -> Detections:
@@ -208,11 +213,14 @@ def main(runs: Path, steps: tuple[str, ...] = ("prepare", "train", "measure", "p
         prepare(runs)
     if "train" in steps:
         for arguments in trainings(runs):
-            if not (Path(arguments[4]) / "model.safetensors").is_file():
+            if not (Path(arguments[4]) / MODEL).is_file():
                 subprocess.run([sys.executable, "-m", "imgcal", "train", *arguments], check=True, env={**os.environ})
     if "measure" in steps:
+        todo = [(shape, name) for shape in MARKERS for name in methods(shape, runs)]
         with ProcessPoolExecutor(cores) as pool:
-            found = dict(zip(MARKERS, pool.map(measured, MARKERS, [runs] * len(MARKERS)), strict=True))
+            results = list(pool.map(measured, *zip(*todo, strict=True), [runs] * len(todo)))
+        found = {shape: {name: each for (of, name), each in zip(todo, results, strict=True) if of == shape}
+                 for shape in MARKERS}  # fmt: skip
         write_json(JSON, surroundings() | {"snapshots": SNAPSHOTS, "markers": found})
     if "page" in steps:
         fill(PAGE, {"unlike markers": tables(read_json(JSON)["markers"])})

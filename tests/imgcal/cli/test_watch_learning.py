@@ -1,5 +1,6 @@
 import os
 import pickle
+import re
 import shutil
 import signal
 import subprocess
@@ -14,14 +15,24 @@ import numpy as np
 import pytest
 import torch
 
+from imgcal.association import Proposal, proposal_rows
 from imgcal.cli import watch_learning as module
 from imgcal.cli.main import main
 from imgcal.cli.watch_learning import Learner, Scores, ask
 from imgcal.detection import DetectionOptions
 from imgcal.io import data_path, load_object, model_file, read_rig, save_detections
-from imgcal.networks import load_infrared
+from imgcal.networks import load_infrared, load_measurer
 from imgcal.pipeline import load_proposer
-from imgcal.synthesis import FrameModel, PhysicalDrift, simulate_frames, simulate_truth, true_detections
+from imgcal.pipeline.learned_proposer import LearnedProposer
+from imgcal.synthesis import (
+    Difficulty,
+    FrameModel,
+    PhysicalDrift,
+    simulate_frames,
+    simulate_shots,
+    simulate_truth,
+    true_detections,
+)
 from imgcal.training import load_patches, load_splits
 from imgcal.watch import SUBJECTS, LearningPlan, LearningTask, Moment, Outcome, adapted_networks
 
@@ -82,7 +93,8 @@ def test_a_better_network_is_published_with_its_card(moments, ruined, tmp_path, 
     assert networks == tuple(str(tmp_path / "learning" / "adapted" / name) for name in SUBJECTS)
     assert load_proposer(*networks).network.config == load_proposer().network.config
     card = (tmp_path / "learning" / "adapted" / "README.md").read_text()
-    assert "| before | 0.0 | 0.0 | 0 of 3 |" in card and "| adapted | 100.0 | 0.0 | 3 of 3 |" in card
+    assert "| before | 0.0 | 0.0 | 0.00 | 0 of 3 |" in card
+    assert re.search(r"\| adapted \| 100.0 \| 0.0 \| 0.[012]. \| 3 of 3 \|", card)
     assert sorted(path.name for path in (tmp_path / "learning").iterdir()) == ["adapted", "dataset"]
     # It is what the next candidate is compared with.
     found._adapt()
@@ -155,14 +167,18 @@ def test_a_training_that_fails_is_reported(moments, tmp_path, monkeypatch):
 
 
 def test_a_gain_must_be_larger_than_its_uncertainty():
-    def scores(*right, claimed=8, decided=True):
-        return Scores(*(np.array(n) for n in ([8] * len(right), right, [claimed] * len(right), [decided] * len(right))))
+    def scores(*right, claimed=8, off=0.2, decided=True):
+        each = (8, right, claimed, np.array(right) * off**2, decided)
+        return Scores(*(np.broadcast_to(value, len(right)) for value in each))
 
     assert scores(8, 8, 8, 8).is_better(scores(7, 6, 7, 7))
     assert not scores(8, 5, 8, 6).is_better(scores(7, 6, 7, 6))  # better on average
     assert not scores(8, 8, 8, 8).is_better(scores(8, 8, 8, 8))
     assert not scores(8, 8, 8, 8, decided=False).is_better(scores(7, 6, 7, 7))
     assert scores(6, 6, claimed=6).is_better(scores(6, 6, claimed=8))  # fewer wrong claims
+    assert not scores(8, 8, off=2.0).is_better(scores(6, 6, off=1.0))  # a measurer that learnt wrong places
+    assert scores(8, 8, off=1.1).is_better(scores(6, 6, off=1.0))
+    assert scores(8, 8, off=3.0).is_better(scores(0, 0, claimed=0))
 
 
 def test_networks_are_asked_from_the_same_pose_nearby(moments, ruined):
@@ -173,8 +189,59 @@ def test_networks_are_asked_from_the_same_pose_nearby(moments, ruined):
     off = (first.apply(middle) - moments[2].rig_from_object.apply(middle)).norm()
     far = (moments[2].rig.positions - moments[2].rig_from_object.apply(middle)).norm(dim=-1).mean()
     assert float(off / far) == pytest.approx(0.01, abs=1e-6)
-    assert ask(load_proposer(), moments[2], task) == (32, 32, 32, True)
-    assert ask(load_proposer(ruined), moments[2], task) == (32, 0, 0, False)
+    *counts, squared, decided = ask(load_proposer(), moments[2], task)
+    assert counts == [32, 32, 32] and decided and 0 < squared < 32 * 0.3**2
+    assert ask(load_proposer(ruined), moments[2], task) == (32, 0, 0, 0.0, False)
+
+
+def test_claims_of_markers_that_nobody_can_see_gain_nothing():
+    rig, generator = read_rig("T4").resized(torch.tensor([512, 272])), torch.Generator().manual_seed(4)
+    truth = simulate_truth(rig, OBJECT, 4, generator, PhysicalDrift())
+    shots = list(simulate_shots(truth, OBJECT, FrameModel(difficulty=Difficulty(hidden=0.4)), generator))
+    task = LearningTask(Path("out"), OBJECT, DetectionOptions(), PLAN, SUBJECTS)
+    blobs, rows = true_detections(truth), {"honest": [], "boastful": []}
+    for number, (shot, pose) in enumerate(zip(shots, truth.rig_from_object, strict=True)):
+        seen = (shot.seen > 0).numpy()
+        found = blobs.of_snapshots(number, number + 1)
+        found = found.select(seen[found.camera, found.fiducial])
+        moment = Moment(number, True, shot.frames, found, truth.rig, pose, None)
+        for name, claimed in (("honest", seen), ("boastful", np.ones_like(seen))):
+            size, radius = np.full(seen.shape, 0.2), np.full(seen.shape, 5.0)
+            claims = proposal_rows(truth.uv[number].numpy(), size, claimed, radius, found)
+            proposer = SimpleNamespace(propose=lambda _, claims=claims, pose=pose: Proposal(claims, pose, 1e3))
+            rows[name].append(ask(proposer, moment, task))
+        assert rows["honest"][-1][:3] == (seen.sum(),) * 3 and seen.sum() < seen.size
+    honest, boastful = (Scores(*(np.array(column) for column in zip(*each, strict=True))) for each in rows.values())
+    assert not boastful.is_better(honest) and boastful.shares() == honest.shares() == (100.0, 0.0)
+
+
+def test_a_network_whose_encoder_is_shuffled_is_dropped(moments, ruined, tmp_path, monkeypatch):
+    def load(network, measurer):
+        proposer = load_proposer(network, measurer)
+        if network != "ir-cnn":  # the adapted one
+            search = proposer.network.search
+            monkeypatch.setattr(proposer.network, "search", lambda maps, *more: search(maps.roll(1, 0), *more))
+        return proposer
+
+    trained = {name: name for name in SUBJECTS}
+    found, said, _ = learner(tmp_path, monkeypatch, running=SUBJECTS, trained=trained)
+    monkeypatch.setattr(module, "load_proposer", load)
+    for moment in moments:
+        found.take(moment)
+    right, before = (
+        float(share) for share in re.findall(r"right ([0-9.]+) %.*?before: ([0-9.]+)", said[-1].message)[0]
+    )
+    assert not said[-1].adopted and "no better and is dropped" in said[-1].message and right < 80 < before
+    assert adapted_networks(tmp_path) is None
+
+
+def test_labels_that_do_not_fit_the_rig_are_not_learnt(moments, tmp_path, monkeypatch):
+    found, said, asked = learner(tmp_path, monkeypatch, running=SUBJECTS, trained={name: name for name in SUBJECTS})
+    for moment in moments:
+        order = np.random.default_rng(moment.number).permutation(8)
+        wrong = replace(moment.blobs, fiducial=order[moment.blobs.fiducial])
+        found.take(replace(moment, blobs=wrong))
+    assert not said and not asked and not list(tmp_path.iterdir())
 
 
 DYING = """
@@ -266,3 +333,30 @@ def test_what_cannot_learn_is_one_line(workplace, moments, tmp_path, capsys):
     assert main(["watch", str(tmp_path / "blobs.csv"), *given, "--object", "asymmetric8"]) == 2
     assert "--learn: found blobs without frames (" in capsys.readouterr().err
     assert not out.exists() or not list(out.iterdir())
+
+
+def test_a_network_of_your_own_runs_with_its_own_measurer(workplace, tmp_path, monkeypatch, capsys):
+    own = tmp_path / "measurer"
+    own.mkdir()
+    measurer = load_measurer(model_file("measurer-cnn"))
+    with torch.no_grad():
+        next(measurer.network.parameters()).mul_(0.99)
+    measurer.save(own / "model.safetensors")
+    expected = load_measurer(own / "model.safetensors").network.state_dict()
+    asked = []
+    propose = LearnedProposer.propose
+    monkeypatch.setattr(
+        LearnedProposer, "propose", lambda self, snapshot: asked.append(self) or propose(self, snapshot)
+    )
+    networks = ["--detector", str(model_file("ir-cnn")), "--measurer", str(own)]
+    assert watch(workplace, tmp_path / "out", *networks) == 0
+    assert asked and all(torch.equal(each, expected[name]) for name, each in asked[0].measurer.state_dict().items())
+    capsys.readouterr()
+    for detector in ("classical", "auto", "both"):
+        assert watch(workplace, tmp_path / "out", "--detector", detector, "--measurer", str(own)) == 2
+        said = f"--measurer: found --detector {detector}, expected --detector learned or a network of your own"
+        assert capsys.readouterr().err == f"imgcal: {said}\n"
+    assert watch(workplace, tmp_path / "out", "--detector", "learned", "--measurer", "measurer-vitt") == 2
+    assert "measurer: found 'measurer-vitt'" in capsys.readouterr().err
+    assert watch(workplace, tmp_path / "out", "--detector", "learned", "--learn", "--measurer", str(own)) == 2
+    assert "--learn: found --measurer " in capsys.readouterr().err
