@@ -40,6 +40,12 @@ class PaddedBlobs:
         variance, valid = self.sigma**2, self.row >= 0
         return variance, float(np.median(variance[valid])) if valid.any() else 0.0
 
+    @cached_property
+    def left_to_right(self) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """The blobs of each camera by u: `ideal` (C, M, 2) in this order, and the number of each (C, M)."""
+        order = np.argsort(self.ideal[..., 0], axis=1, kind="stable")
+        return np.take_along_axis(self.ideal, order[..., None], axis=1), order
+
     def select_camera(self, camera: int) -> PaddedBlobs:
         """Keep one camera; labels keep their numbers."""
         one = [camera]

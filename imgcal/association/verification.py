@@ -20,7 +20,7 @@ from imgcal.association.assignment import assign
 from imgcal.association.blobs import PaddedBlobs
 from imgcal.association.hypotheses import Poses
 from imgcal.association.innovation import THRESHOLD, Innovations, find_contested, innovations, one_or_some
-from imgcal.estimation import Problem, Solution, State, levenberg_marquardt_cpu, pose_at
+from imgcal.estimation import Problem, Solution, State, cauchy, levenberg_marquardt_cpu, pose_at
 from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig
 
@@ -177,16 +177,36 @@ def evidence(scene: Scene, fits: Fits) -> NDArray[np.float64]:
     return np.where(labelled, gain, 0).sum((1, 2)) - fits.cost - 0.5 * (found.complexity + sizes)
 
 
-def most_evidence(scene: Scene, fits: Fits, labels: NDArray[np.int64]) -> float:
-    """Estimate the evidence that another labelling (C, N) in the place of a fitted one has at most.
+def most_evidence(scene: Scene, fits: Fits, labels: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Estimate the evidence (K,) that other labellings (K, C, N) in the place of a fitted one have at most.
 
-    All its labels fit exactly then, and so do all blobs that the fitted one leaves unlabelled.
+    All their labels fit exactly then, and so do all blobs that the fitted one leaves unlabelled.
     """
     unlabelled = scene.blobs.count - (fits.labels[0] >= 0).sum(1)
-    count = np.minimum((labels >= 0).sum(1) + unlabelled, scene.obj.num_fiducials).sum()
+    count = np.minimum((labels >= 0).sum(2) + unlabelled, scene.obj.num_fiducials).sum(1)
     precision = -np.log(2 * np.pi * scene.blobs.sigma[scene.blobs.row >= 0] ** 2).mean()
-    gain = _label_gain(scene, fits, count[None])[0] + precision
-    return float(count * gain - 0.5 * _require_innovations(fits).complexity[0])
+    gain = _label_gain(scene, fits, count) + precision
+    return np.asarray(count * gain - 0.5 * _require_innovations(fits).complexity[0])
+
+
+def part_of_camera(scene: Scene, fits: Fits, camera: int) -> Fits:
+    """Keep one camera's labels of fitted labellings, and their cost in this fit; see `Scene.select_camera`.
+
+    A fit of that camera alone costs at most as much.
+    """
+    one = slice(camera, camera + 1)
+    found, labels, offset = _require_innovations(fits), fits.labels[:, one], fits.state.offset[:, one]
+    parts = (getattr(found, field.name) for field in fields(Innovations))
+    variance = (_blob_noise(scene, fits) + fits.sigma[:, None, None] ** 2)[:, one]
+    squared = np.where(labels >= 0, found.residual[:, one] / variance, 0)
+    loss = cauchy(torch.from_numpy(squared), THRESHOLD)[0].sum((1, 2))
+    return Fits(
+        labels,
+        replace(fits.state, offset=offset),
+        fits.sigma,
+        0.5 * (loss + offset.square().sum((1, 2))).numpy(),
+        Innovations(*(part if part.ndim == 1 else part[:, one] for part in parts)),
+    )
 
 
 def predictions(fits: Fits) -> NDArray[np.float64]:
