@@ -27,7 +27,7 @@ from imgcal.association.hypotheses import (
 )
 from imgcal.association.identity import Identity, IdentityOptions, Status
 from imgcal.association.minimal_labels import compare_labellings, has_minimal_blobs
-from imgcal.association.search import VERIFIED, Search, distinct, match_on_lattice
+from imgcal.association.search import VERIFIED, Search, match_on_lattice
 from imgcal.association.stick_poses import fit_sticks
 from imgcal.association.verification import (
     STAGES,
@@ -135,13 +135,12 @@ def _track(scene: Scene, rig_from_object: RigidTransform, options: IdentityOptio
         match_on_lattice(scene, predicted, vote(scene.blobs, predicted, reach, gate).shift, 1.25 * reach)
         for reach in tolerances
     ]
-    rows, labels = distinct(obj, np.zeros(len(attempts), dtype=np.int64), np.concatenate(attempts))
-    fits = start(scene, poses.select(rows), labels)
+    fits = start(scene, poses.select(np.zeros(len(attempts), dtype=int)), np.concatenate(attempts))
     fits = fit_and_label(scene, fits, STAGES[0])
-    share = max(_share(scene, fits.select(np.array([k])), options) for k in range(len(rows)))
+    share = max(_share(scene, fits.select(np.array([k])), options) for k in range(len(attempts)))
     if share < options.least_share:  # the object is elsewhere: further fits would not find it
         return _refuse(scene, _too_little(obj.name, share, share, options.least_share))
-    if len(rows) > 1 and np.array_equal(*fits.labels):
+    if len(attempts) > 1 and np.array_equal(*fits.labels):
         fits = fits.select(np.array([0]))
     return _decide(scene, refine(scene, fits, STAGES[1:]), options, pose_known)
 
