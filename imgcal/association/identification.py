@@ -36,6 +36,7 @@ from imgcal.association.verification import (
     certain,
     evidence,
     fit_and_label,
+    is_settled,
     join,
     most_evidence,
     part_of_camera,
@@ -136,13 +137,14 @@ def _track(scene: Scene, rig_from_object: RigidTransform, options: IdentityOptio
         for reach in tolerances
     ]
     fits = start(scene, poses.select(np.zeros(len(attempts), dtype=int)), np.concatenate(attempts))
-    fits = fit_and_label(scene, fits, STAGES[0])
+    before, fits = fits.labels, fit_and_label(scene, fits, STAGES[0])
     share = max(_share(scene, fits.select(np.array([k])), options) for k in range(len(attempts)))
     if share < options.least_share:  # the object is elsewhere: further fits would not find it
         return _refuse(scene, _too_little(obj.name, share, share, options.least_share))
+    stages = () if is_settled(before, fits) else STAGES[1:]
     if len(attempts) > 1 and np.array_equal(*fits.labels):
         fits = fits.select(np.array([0]))
-    return _decide(scene, refine(scene, fits, STAGES[1:]), options, pose_known)
+    return _decide(scene, refine(scene, fits, stages), options, pose_known)
 
 
 def relocalize(

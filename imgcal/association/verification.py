@@ -113,10 +113,20 @@ def start(scene: Scene, poses: Poses, labels: NDArray[np.int64]) -> Fits:
 
 
 def refine(scene: Scene, fits: Fits, stages: tuple[float, ...] = STAGES) -> Fits:
-    """Alternate fitting and labelling through all stages; the last labels are fitted, too."""
+    """Alternate fitting and labelling through all stages; the last labels are fitted, too.
+
+    Stages end early where the labels stay and the blobs' own errors explain the residuals.
+    """
     for sigma in stages:
-        fits = fit_and_label(scene, fits, sigma)
+        before, fits = fits.labels, fit_and_label(scene, fits, sigma)
+        if is_settled(before, fits):
+            break
     return settle_labels(scene, fit(scene, fits), rounds=1)
+
+
+def is_settled(before: NDArray[np.int64], fits: Fits) -> bool:
+    """Tell whether more stages would change nothing: labels are those of before, and their own errors explain all."""
+    return np.array_equal(before, fits.labels) and not fits.sigma.any()
 
 
 def fit_and_label(scene: Scene, fits: Fits, sigma: float) -> Fits:
