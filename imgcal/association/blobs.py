@@ -132,7 +132,7 @@ def pattern_prior(std: Tensor, rig: CameraRig, distance: float) -> PatternPrior:
         rig: factory rig.
         distance: mm, approximate distance from the cameras to the object.
     """
-    s, focal = std.numpy(), rig.focal_length.mean(-1).numpy()
+    s, focal = std.numpy(), rig.focal_length.numpy().mean(-1)
     turn, travel = np.sqrt((s[:, :3] ** 2).mean(1)), np.sqrt((s[:, 3:6] ** 2).mean(1)) / distance
     principal, scale = np.sqrt((s[:, 8:10] ** 2).mean(1)), np.sqrt((s[:, 6:8] ** 2).mean(1)) / focal
     shift = np.sqrt(principal**2 + (focal * turn) ** 2 + (focal * travel) ** 2)

@@ -444,7 +444,7 @@ def _bounds(scene: Scene, distance: float, pose_known: bool) -> tuple[float, flo
     length, which shifts the images of cameras elsewhere.
     """
     pattern: PatternPrior = pattern_prior(scene.std, scene.rig, distance)
-    focal = float(scene.rig.focal_length.mean())
+    focal = float(scene.rig.focal_length.numpy().mean())
     positions = scene.rig.positions.numpy()
     baseline = float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
     parallax = 2 * pattern.shape * focal * baseline / distance
@@ -455,15 +455,16 @@ def _bounds(scene: Scene, distance: float, pose_known: bool) -> tuple[float, flo
 
 def _guess_distance(scene: Scene) -> float:
     """Distance (mm) at which the object looks about as large as the cloud of blobs."""
-    focal = scene.rig.focal_length.mean(-1).numpy()
+    focal = scene.rig.focal_length.numpy().mean(-1)
     guesses = []
     for camera in np.flatnonzero(scene.blobs.count >= 4):
         uv = scene.blobs.ideal[camera, : scene.blobs.count[camera]]
-        away = np.hypot(*(uv - np.median(uv, axis=0)).T)  # may be huge if the lens is far from the truth
+        middle = np.sort(uv, axis=0)[[(len(uv) - 1) // 2, len(uv) // 2]].mean(0)  # quicker than np.median
+        away = np.hypot(*(uv - middle).T)  # may be huge if the lens is far from the truth
         guesses.append(focal[camera] * scene.obj.size / max(float(away.mean()), 1.0))
     return float(np.median(guesses))
 
 
 def _distances(rig: CameraRig, poses: Poses, obj: CalibrationObject) -> NDArray[np.float64]:
-    centre = poses.rotation[0] @ obj.points.mean(0).numpy() + poses.translation[0]
+    centre = poses.rotation[0] @ obj.points.numpy().mean(0) + poses.translation[0]
     return np.linalg.norm(rig.positions.numpy() - centre, axis=1)

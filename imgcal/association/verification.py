@@ -62,6 +62,11 @@ class Scene:
             prior_std=self.std.expand(1, -1, -1),
         )
 
+    @cached_property
+    def solver(self) -> levenberg_marquardt_cpu.RigSolver:
+        """Fits of one labelling after the other."""
+        return levenberg_marquardt_cpu.RigSolver(self.problem)
+
     def select_camera(self, camera: int) -> Scene:
         """Keep one camera."""
         return Scene(self.blobs.select_camera(camera), self.obj, self.rig.select([camera]), self.std[[camera]])
@@ -105,9 +110,8 @@ def start(scene: Scene, poses: Poses, labels: NDArray[np.int64]) -> Fits:
     """Start with the factory rig at poses (K,) with rough labels (K, C, N)."""
     u, _, vh = np.linalg.svd(poses.rotation)
     rotation = torch.from_numpy(u @ vh)
-    centre = torch.from_numpy(np.ascontiguousarray(poses.translation)) + rotation @ scene.obj.points.mean(0).to(
-        rotation
-    )
+    centroid = scene.problem.centroid.to(rotation)
+    centre = torch.from_numpy(np.ascontiguousarray(poses.translation)) + rotation @ centroid
     offset = rotation.new_zeros(len(poses), *scene.std.shape)
     return Fits(labels, State(offset, rotation[:, None], centre[:, None]), np.zeros(len(poses)), np.zeros(len(poses)))
 
@@ -272,17 +276,17 @@ def fit(scene: Scene, fits: Fits) -> Fits:
     # Sequentially: on a busy machine, starting threads takes longer than a few small fits.
     problem = make_problem(scene, fits)
     if len(fits.labels) == 1:
-        solution = _minimize(problem, fits.state)
+        solution = _minimize(scene, problem, fits.state)
     else:
         bare = replace(fits, innovations=None)
         each = (bare.select(np.array([k])) for k in range(len(fits.labels)))
-        solution = _stack_solutions([_minimize(make_problem(scene, one), one.state) for one in each])
+        solution = _stack_solutions([_minimize(scene, make_problem(scene, one), one.state) for one in each])
     found = innovations(scene.blobs, fits.labels, fits.sigma, problem, solution)
     return replace(fits, state=solution.state, cost=solution.equations.cost.numpy(), innovations=found)
 
 
-def _minimize(problem: Problem, state: State) -> Solution:
-    return levenberg_marquardt_cpu.minimize(problem, state, "cauchy", THRESHOLD, 8, 1e-3)
+def _minimize(scene: Scene, problem: Problem, state: State) -> Solution:
+    return scene.solver.minimize(problem, state, "cauchy", THRESHOLD, 8, 1e-3)
 
 
 def _stack_solutions(solutions: Sequence[Solution]) -> Solution:
@@ -337,7 +341,7 @@ def _clutter(scene: Scene, uv: NDArray[np.float64], labelled: NDArray[np.int64])
     middle, half = (low + high) / 2, 0.75 * (high - low) + 10
     inside = (np.abs(scene.blobs.uv[None] - middle[:, :, None]) < half[:, :, None]).all(-1).sum((1, 2))
     local = (np.maximum(inside - labelled, 0) + 1) / (4 * half.prod(-1)).sum(1)
-    overall = (scene.blobs.count.sum() - labelled + 1) / scene.rig.image_size.prod(1).sum().item()
+    overall = (scene.blobs.count.sum() - labelled + 1) / scene.rig.image_size.numpy().prod(1).sum()
     return np.maximum(local, overall)
 
 

@@ -36,7 +36,7 @@ class Votes:
 def predict_ideal(rig: CameraRig, points: NDArray[np.float64], poses: Poses) -> NDArray[np.float64]:
     """Project fiducials (N, 3) without distortion, from the principal point: (K, C, N, 2) px, -1e7 behind a camera."""
     transform = rig.cam_from_rig
-    focal = rig.focal_length.mean(-1).numpy()
+    focal = rig.focal_length.numpy().mean(-1)
     uv = np.full((len(poses.rotation), rig.num_cameras, len(points), 2), -1e7)
     given = (
         transform.rotation.numpy(),
