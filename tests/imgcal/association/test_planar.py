@@ -11,7 +11,7 @@ import torch
 
 from imgcal.association.blobs import PaddedBlobs, gather
 from imgcal.association.hypotheses import Poses
-from imgcal.association.planar import _affinity, _fit_homography, _pose, _rotation, _whiten, planar_poses
+from imgcal.association.planar import _affinity, _count_shifts, _fit_homography, _pose, _rotation, _whiten, planar_poses
 from imgcal.geometry import rotation_from_vector
 from tests.imgcal.association.scenes import degrees_between, make_object, take
 
@@ -157,3 +157,13 @@ def test_a_lattice_is_found_though_half_of_it_is_hidden(o10) -> None:
             for r, t in zip(poses.rotation, poses.translation, strict=True)
         ]
         assert min(error, default=np.inf) < 0.02 * float(o10.working_distance)
+
+
+def test_shifts_of_cells_are_counted() -> None:
+    random = np.random.default_rng(8)
+    source, target = (np.unique(random.integers(-5, 6, (20, 2)), axis=0) for _ in range(2))
+    counts, low = _count_shifts(source, target)
+    expected = np.zeros_like(counts)
+    np.add.at(expected, tuple((target[:, None] - source - low).reshape(-1, 2).T), 1)
+    np.testing.assert_array_equal(counts, expected)
+    assert counts.sum() == len(source) * len(target)
