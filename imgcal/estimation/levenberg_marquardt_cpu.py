@@ -102,9 +102,9 @@ class RigSolver:
         best = _minimize_rig(
             (*self._shared, uv, root_weight, *self._given), states, tuple(parts), cost, converged, iterations,
             (cameras_first, LOSS_CODES[loss], threshold, max_iterations), uv.dtype.type(tolerance + rounding),
-        )  # type: ignore[call-arg]  # fmt: skip
+        )  # fmt: skip
         one = slice(best, best + 1)
-        blocks = _Blocks(cameras_first, *(torch.from_numpy(part[one]) for part in parts), torch.from_numpy(cost[:1]))
+        blocks = _Blocks(cameras_first, *(torch.from_numpy(part) for part in (*(p[one] for p in parts), cost[:1])))
         found = State(*(torch.from_numpy(state[one]) for state in states))
         if not len(own):
             found = replace(found, object_offset=None)
