@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -14,6 +16,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject
 
 LEAST_OVERLAP = 0.6  # minimum share of fiducials that fall onto others for a shift to be confusing
+TOLERANCE_STEP = 0.05  # of the logarithm: a tolerance is rounded up, so that few different ones occur in a capture
 MOST_SHIFTS = 8  # the smallest ones; larger ones are combinations of them
 
 
@@ -58,12 +61,17 @@ def near_symmetries(obj: CalibrationObject, tolerance: float) -> list[Ambiguity]
     Sizes of fiducials are ignored here: only the blobs can show that they break a symmetry.
     """
     exact = {motion.permutation.tobytes() for motion in obj.symmetries}
-    turns = replace(obj, radius=None).near_symmetries(min(tolerance, 0.2 * obj.size))
-    return [
-        Ambiguity(turn.rotation, turn.translation, turn.permutation)
-        for turn in turns
-        if turn.permutation.tobytes() not in exact
-    ]
+    wider = math.exp(math.ceil(math.log(tolerance) / TOLERANCE_STEP) * TOLERANCE_STEP)
+    turns = _near_symmetries(obj.points.double().cpu().numpy().tobytes(), min(wider, 0.2 * obj.size))
+    return [turn for turn in turns if turn.permutation.tobytes() not in exact]
+
+
+@lru_cache(maxsize=64)
+def _near_symmetries(coordinates: bytes, tolerance: float) -> tuple[Ambiguity, ...]:
+    """Find the rotations once per object and tolerance."""
+    points = torch.frombuffer(bytearray(coordinates), dtype=torch.float64).reshape(-1, 3)
+    turns = CalibrationObject(points, torch.zeros_like(points)).near_symmetries(tolerance)
+    return tuple(Ambiguity(turn.rotation, turn.translation, turn.permutation) for turn in turns)
 
 
 def relabel(

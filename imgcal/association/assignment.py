@@ -19,7 +19,7 @@ def mutual_nearest(places, blobs, reach, labels):
 
     Args:
         places: (N, 2) pixels.
-        blobs: (M, 2) pixels.
+        blobs: (M, 2) pixels, from left to right.
         reach: pixels; only closer pairs are made.
         labels: (N,), filled with the blob of each place, -1 = none.
     """
@@ -28,8 +28,10 @@ def mutual_nearest(places, blobs, reach, labels):
         back[m], nearest[m] = -1, np.inf
     for n in range(len(places)):
         labels[n], least = -1, np.inf
-        for m in range(len(blobs)):
+        for m in range(first_beyond(blobs, places[n, 0] - reach), len(blobs)):
             u, v = blobs[m, 0] - places[n, 0], blobs[m, 1] - places[n, 1]
+            if u > reach:
+                break
             squared = u * u + v * v
             if squared < least:
                 labels[n], least = m, squared
@@ -39,6 +41,19 @@ def mutual_nearest(places, blobs, reach, labels):
         m = labels[n]
         if m >= 0 and (back[m] != n or nearest[m] >= reach * reach):
             labels[n] = -1
+
+
+@njit(cache=True)
+def first_beyond(blobs, u):
+    """Index of the first of M blobs (M, 2), given from left to right, that is not left of `u`; M = all are."""
+    low, high = 0, len(blobs)
+    while low < high:
+        middle = (low + high) // 2
+        if blobs[middle, 0] < u:
+            low = middle + 1
+        else:
+            high = middle
+    return low
 
 
 def spacing(places: NDArray[np.float64]) -> float:

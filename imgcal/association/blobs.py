@@ -40,6 +40,12 @@ class PaddedBlobs:
         variance, valid = self.sigma**2, self.row >= 0
         return variance, float(np.median(variance[valid])) if valid.any() else 0.0
 
+    @cached_property
+    def left_to_right(self) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """The blobs of each camera by u: `ideal` (C, M, 2) in this order, and the number of each (C, M)."""
+        order = np.argsort(self.ideal[..., 0], axis=1, kind="stable")
+        return np.take_along_axis(self.ideal, order[..., None], axis=1), order
+
     def select_camera(self, camera: int) -> PaddedBlobs:
         """Keep one camera; labels keep their numbers."""
         one = [camera]
@@ -126,7 +132,7 @@ def pattern_prior(std: Tensor, rig: CameraRig, distance: float) -> PatternPrior:
         rig: factory rig.
         distance: mm, approximate distance from the cameras to the object.
     """
-    s, focal = std.numpy(), rig.focal_length.mean(-1).numpy()
+    s, focal = std.numpy(), rig.focal_length.numpy().mean(-1)
     turn, travel = np.sqrt((s[:, :3] ** 2).mean(1)), np.sqrt((s[:, 3:6] ** 2).mean(1)) / distance
     principal, scale = np.sqrt((s[:, 8:10] ** 2).mean(1)), np.sqrt((s[:, 6:8] ** 2).mean(1)) / focal
     shift = np.sqrt(principal**2 + (focal * turn) ** 2 + (focal * travel) ** 2)

@@ -219,7 +219,7 @@ def single_camera_poses(
         tolerance: minimum distance (px) within which a predicted fiducial counts as seen.
         keep: number of poses to keep for each blob triple.
     """
-    focal = rig.focal_length.mean(-1).numpy()
+    focal = rig.focal_length.numpy().mean(-1)
     rays = blobs.ideal[cameras[:, None], triples].astype(np.float64) / focal[cameras, None, None]
     seen = blobs.ideal[blobs.row >= 0]
     cell = max(tolerance / CELLS, float(np.ptp(seen, axis=0).max()) / MOST_CELLS)

@@ -27,7 +27,7 @@ from imgcal.association.hypotheses import (
 )
 from imgcal.association.identity import Identity, IdentityOptions, Status
 from imgcal.association.minimal_labels import compare_labellings, has_minimal_blobs
-from imgcal.association.search import VERIFIED, Search
+from imgcal.association.search import VERIFIED, Search, match_on_lattice
 from imgcal.association.stick_poses import fit_sticks
 from imgcal.association.verification import (
     STAGES,
@@ -36,8 +36,10 @@ from imgcal.association.verification import (
     certain,
     evidence,
     fit_and_label,
+    is_settled,
     join,
     most_evidence,
+    part_of_camera,
     predictions,
     refine,
     rig_and_pose,
@@ -45,7 +47,7 @@ from imgcal.association.verification import (
     settle_labels,
     start,
 )
-from imgcal.association.voting import match, predict_ideal, vote
+from imgcal.association.voting import predict_ideal, vote
 from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
@@ -131,17 +133,18 @@ def _track(scene: Scene, rig_from_object: RigidTransform, options: IdentityOptio
     gap = spacing(predicted[0])
     tolerances = [tolerance, max(3.0, 0.2 * gap)] if tolerance > 0.4 * gap else [tolerance]
     attempts = [
-        match(scene.blobs, predicted, vote(scene.blobs, predicted, reach, gate).shift, 1.25 * reach)
+        match_on_lattice(scene, predicted, vote(scene.blobs, predicted, reach, gate).shift, 1.25 * reach)
         for reach in tolerances
     ]
     fits = start(scene, poses.select(np.zeros(len(attempts), dtype=int)), np.concatenate(attempts))
-    fits = fit_and_label(scene, fits, STAGES[0])
+    before, fits = fits.labels, fit_and_label(scene, fits, STAGES[0])
     share = max(_share(scene, fits.select(np.array([k])), options) for k in range(len(attempts)))
     if share < options.least_share:  # the object is elsewhere: further fits would not find it
         return _refuse(scene, _too_little(obj.name, share, share, options.least_share))
+    stages = () if is_settled(before, fits) else STAGES[1:]
     if len(attempts) > 1 and np.array_equal(*fits.labels):
         fits = fits.select(np.array([0]))
-    return _decide(scene, refine(scene, fits, STAGES[1:]), options, pose_known)
+    return _decide(scene, refine(scene, fits, stages), options, pose_known)
 
 
 def relocalize(
@@ -302,9 +305,9 @@ def _margin(scene: Scene, best: Fits, others: Fits) -> float:
     return float(evidence(scene, best)[0] - max([0.0, *rivals]))
 
 
-def _least_margin(scene: Scene, best: Fits, labels: NDArray[np.int64]) -> float:
-    """Estimate the least log odds of a labelling against another one (C, N) in its place, without fitting that."""
-    return float(evidence(scene, best)[0]) - most_evidence(scene, best, labels)
+def _least_margins(scene: Scene, best: Fits, labels: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Estimate the least log odds (K,) of a labelling against others (K, C, N) in its place, without fitting these."""
+    return np.asarray(evidence(scene, best)[0] - most_evidence(scene, best, labels))
 
 
 def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, float]:
@@ -333,8 +336,9 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
             if _margin(scene, best, fit) < 0:
                 best = settle_labels(scene, fit)
                 continue
-        rivals = [relabel(pose, labels, [motion]) for motion in shifts + turns]
-        least = [_least_margin(scene, best, changed[0]) for _, changed in rivals]
+        where, changed = relabel(pose, labels, shifts + turns)
+        rivals = [(where.select(np.array([k])), changed[[k]]) for k in range(len(changed))]
+        least = _least_margins(scene, best, changed).tolist()
         excluded = [margin for margin in (*least, *(margin for margin, _, _ in alone)) if margin >= EXCLUDED]
         rivals = [rival for margin, rival in zip(least, rivals, strict=True) if margin < EXCLUDED]
         rivals += [(_one_snapshot(pose), rival[None]) for margin, _, rival in alone if margin < EXCLUDED]
@@ -355,8 +359,9 @@ def _compare_with_shifts(
 ) -> list[tuple[float, int, NDArray[np.int64]]]:
     """Compare a labelling with those in which a single camera sees the object shifted, by that camera's own fit.
 
-    A single camera with a free pose only shows which labelling explains more of its blobs. A shift that it rejects is
-    also rejected by the rig, where the camera's prior must bear the shift as well.
+    Its part in the fit of the whole rig suffices where that excludes the shifts. A single camera with a free pose only
+    shows which labelling explains more of its blobs. A shift that it rejects is also rejected by the rig, where the
+    camera's prior must bear the shift as well.
 
     Args:
         scene: the snapshot.
@@ -370,10 +375,11 @@ def _compare_with_shifts(
         undecided.
     """
     labels, found = best.labels[0], []
+    within = [displacement(predictions(best), motion) < reach for motion in shifts]
     for camera in range(scene.rig.num_cameras):
         key = camera, labels[camera].tobytes()
         if key not in compared:
-            near = [motion for motion in shifts if displacement(predictions(best)[[camera]], motion)[0] < reach[camera]]
+            near = [motion for motion, reached in zip(shifts, within, strict=True) if reached[camera]]
             compared[key] = _margins_over_shifts(scene, best, camera, near)
         for margin, shifted in compared[key]:
             alone = labels.copy()
@@ -386,17 +392,21 @@ def _margins_over_shifts(
     scene: Scene, best: Fits, camera: int, shifts: list[Ambiguity]
 ) -> list[tuple[float, NDArray[np.int64]]]:
     """Margins of a labelling over the shifted ones in one camera, and the shifted labels (N,); 0 = undecided."""
-    pose, labels = select_pose(scene, best, 0), best.labels[0, [camera]]
-    part, mine, found = scene.select_camera(camera), None, []
-    if shifts and (labels >= 0).sum() >= LEAST_ALONE:
-        mine = refine(part, start(part, _one_snapshot(pose), labels[None]), STAGES[:1])
-    for motion in shifts:
-        where, shifted = relabel(pose, labels, [motion])
-        margin = 0.0 if mine is None else _least_margin(part, mine, shifted[0])
-        if mine is not None and margin < EXCLUDED:
-            margin = _margin(part, mine, refine(part, start(part, where, shifted), STAGES[:1]))
-        found.append((margin, shifted[0, 0]))
-    return found
+    pose, labels, part = select_pose(scene, best, 0), best.labels[0, [camera]], scene.select_camera(camera)
+    if not shifts:
+        return []
+    where, shifted = relabel(pose, labels, shifts)
+    margins = np.zeros(len(shifts))
+    if (labels >= 0).sum() >= LEAST_ALONE:
+        margins = _least_margins(part, part_of_camera(scene, best, camera), shifted)
+        if margins.min() < EXCLUDED:
+            mine = refine(part, start(part, _one_snapshot(pose), labels[None]), STAGES[:1])
+            margins = _least_margins(part, mine, shifted)
+            for k in np.flatnonzero(margins < EXCLUDED):
+                rows = np.array([k])
+                rival = refine(part, start(part, where.select(rows), shifted[rows]), STAGES[:1])
+                margins[k] = _margin(part, mine, rival)
+    return list(zip(margins.tolist(), shifted[:, 0], strict=True))
 
 
 def _prefer_shifts(
@@ -434,7 +444,7 @@ def _bounds(scene: Scene, distance: float, pose_known: bool) -> tuple[float, flo
     length, which shifts the images of cameras elsewhere.
     """
     pattern: PatternPrior = pattern_prior(scene.std, scene.rig, distance)
-    focal = float(scene.rig.focal_length.mean())
+    focal = float(scene.rig.focal_length.numpy().mean())
     positions = scene.rig.positions.numpy()
     baseline = float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
     parallax = 2 * pattern.shape * focal * baseline / distance
@@ -445,15 +455,16 @@ def _bounds(scene: Scene, distance: float, pose_known: bool) -> tuple[float, flo
 
 def _guess_distance(scene: Scene) -> float:
     """Distance (mm) at which the object looks about as large as the cloud of blobs."""
-    focal = scene.rig.focal_length.mean(-1).numpy()
+    focal = scene.rig.focal_length.numpy().mean(-1)
     guesses = []
     for camera in np.flatnonzero(scene.blobs.count >= 4):
         uv = scene.blobs.ideal[camera, : scene.blobs.count[camera]]
-        away = np.hypot(*(uv - np.median(uv, axis=0)).T)  # may be huge if the lens is far from the truth
+        middle = np.sort(uv, axis=0)[[(len(uv) - 1) // 2, len(uv) // 2]].mean(0)  # quicker than np.median
+        away = np.hypot(*(uv - middle).T)  # may be huge if the lens is far from the truth
         guesses.append(focal[camera] * scene.obj.size / max(float(away.mean()), 1.0))
     return float(np.median(guesses))
 
 
 def _distances(rig: CameraRig, poses: Poses, obj: CalibrationObject) -> NDArray[np.float64]:
-    centre = poses.rotation[0] @ obj.points.mean(0).numpy() + poses.translation[0]
+    centre = poses.rotation[0] @ obj.points.numpy().mean(0) + poses.translation[0]
     return np.linalg.norm(rig.positions.numpy() - centre, axis=1)

@@ -64,20 +64,21 @@ def innovations(
     residual, freedom, uv = np.zeros(shape), np.zeros(shape), np.zeros((*shape, 2))
     complexity = np.full(count, np.inf)
     equations, state = solution.equations, solution.state
-    factory, step = problem.factory, state.offset * problem.prior_std
+    factory, prior_std = problem.factory, problem.prior_std.numpy()
+    step = state.offset.numpy() * prior_std
     lenses = lens_codes(factory.lens_model, *factory.distortion.shape[-2:])
     given = [
-        np.ascontiguousarray(tensor.numpy())
-        for tensor in (
-            factory.cam_from_rig.rotation,
+        np.ascontiguousarray(array)
+        for array in (
+            factory.cam_from_rig.rotation.numpy(),
             step[..., :3],
-            levenberg_marquardt_cpu.camera_positions(factory) + step[..., 3:6],
-            factory.focal_length + step[..., 6:8],
-            factory.principal_point + step[..., 8:10],
-            factory.distortion + step[..., 10:],
-            problem.prior_std,
-            problem.points @ state.rotation[:, 0].mT,
-            state.centre[:, 0],
+            levenberg_marquardt_cpu.camera_positions(factory).numpy() + step[..., 3:6],
+            factory.focal_length.numpy() + step[..., 6:8],
+            factory.principal_point.numpy() + step[..., 8:10],
+            factory.distortion.numpy() + step[..., 10:],
+            prior_std,
+            problem.points.numpy() @ state.rotation.numpy()[:, 0].swapaxes(-1, -2),
+            state.centre.numpy()[:, 0],
         )
     ]
     for k, fitted in enumerate(np.isfinite(equations.cost.numpy())):

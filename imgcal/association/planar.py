@@ -7,6 +7,7 @@ needs nearly all of the plane in view. A lattice is grown from a few neighbours,
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
@@ -44,8 +45,8 @@ CLOSE = 0.9  # of the best placement's fiducials, that another one must show
 MOST_PLACEMENTS = 16  # of a lattice, that poses are made of
 
 
-def planar_poses(blobs: PaddedBlobs, rig: CameraRig, camera: int, obj: CalibrationObject) -> Poses:
-    """Find poses under which one camera's blobs look like a mostly visible planar object.
+def planar_poses(blobs: PaddedBlobs, rig: CameraRig, camera: int, obj: CalibrationObject) -> Iterator[Poses]:
+    """Find poses under which one camera's blobs look like a planar object: by its lattice, then by its whole shape.
 
     Args:
         blobs: the snapshot.
@@ -53,31 +54,40 @@ def planar_poses(blobs: PaddedBlobs, rig: CameraRig, camera: int, obj: Calibrati
         camera: index of the camera.
         obj: a planar object.
 
-    Returns:
-        Poses that explain different sets of blobs, possibly none; a lattice has several.
+    Yields:
+        Poses that explain different sets of blobs, possibly none; a lattice has several, those with most blobs first.
     """
     focal = float(rig.focal_length[camera].mean())
     count = blobs.count[camera]
     ordinary = _ordinary(blobs.radius[camera, :count])
     every = blobs.ideal[camera, :count][ordinary].astype(np.float64) / focal
-    seen = _drop_strays(every)
     points = obj.points.double().cpu().numpy()
     centroid = points.mean(0)
     axes = np.linalg.svd(points - centroid)[2]
     axes[2] = np.cross(axes[0], axes[1])
     flat = (points - centroid) @ axes[:2].T
-    tree = cKDTree(seen)
-    homographies = _lattice_homographies(flat, _lattice_steps(obj, axes), every)
-    for turn in (1.0, -1.0):  # the front of the plane, and its back
-        for angle in _best_angles(_whiten(flat * [1, turn])[0], _whiten(seen)[0]):
-            homography = _grow(flat, tree, _affinity(flat * [1, turn], seen, angle) @ np.diag([1, turn, 1]))
-            if homography is not None:
-                homographies.append(homography)
+    yield _poses(rig, camera, _lattice_homographies(flat, _lattice_steps(obj, axes), every), axes, centroid)
+    yield _poses(rig, camera, _whole_homographies(flat, _drop_strays(every)), axes, centroid)
+
+
+def _poses(rig: CameraRig, camera: int, homographies: list[Floats], axes: Floats, centroid: Floats) -> Poses:
+    """Poses of an object whose plane has axes (3, 3) and centroid (3,), from images of the plane in one camera."""
     poses = [_pose(homography) for homography in homographies]
     cam_from_rig, offset = rig.cam_from_rig.rotation[camera].numpy(), rig.cam_from_rig.translation[camera].numpy()
     rotation = np.array([cam_from_rig.T @ r @ axes for r, _ in poses]).reshape(-1, 3, 3)
     centre = np.array([cam_from_rig.T @ (t - offset) for _, t in poses]).reshape(-1, 3)
     return Poses(rotation, centre - rotation @ centroid)
+
+
+def _whole_homographies(flat: Floats, seen: Floats) -> list[Floats]:
+    """Find homographies (3, 3) from fiducials (N, 2) to blobs (M, 2), nearly all of which must be in view."""
+    tree, homographies = cKDTree(seen), []
+    for turn in (1.0, -1.0):  # the front of the plane, and its back
+        for angle in _best_angles(_whiten(flat * [1, turn])[0], _whiten(seen)[0]):
+            homography = _grow(flat, tree, _affinity(flat * [1, turn], seen, angle) @ np.diag([1, turn, 1]))
+            if homography is not None:
+                homographies.append(homography)
+    return homographies
 
 
 def _ordinary(radius: Floats) -> NDArray[np.bool_]:
@@ -284,11 +294,9 @@ def _place(cells: Cells, numbers: NDArray[np.int64]) -> list[tuple[NDArray[np.in
     placements: list[tuple[int, NDArray[np.int64], NDArray[np.int64]]] = []
     for turn in TURNS:
         turned = seen @ turn
-        shifts = (numbers[:, None] - turned).reshape(-1, 2)
-        low, wide = shifts.min(0), int(np.ptp(shifts[:, 1])) + 1
-        counts = np.bincount((shifts[:, 0] - low[0]) * wide + shifts[:, 1] - low[1])
-        for code in np.flatnonzero(counts >= CLOSE * counts.max()).tolist():
-            placements.append((int(counts[code]), turn, low + np.array(divmod(code, wide))))
+        counts, low = _count_shifts(turned, numbers)
+        for shift in np.argwhere(counts >= CLOSE * counts.max()):
+            placements.append((int(counts[tuple(shift)]), turn, low + shift))
     most, covers, result = max(count for count, _, _ in placements), set(), []
     for count, turn, shift in placements:
         if count < CLOSE * most:
@@ -302,6 +310,16 @@ def _place(cells: Cells, numbers: NDArray[np.int64]) -> list[tuple[NDArray[np.in
         fiducial = np.array([index.get((int(i), int(j)), -1) for i, j in where])
         result.append((fiducial[fiducial >= 0], blobs[fiducial >= 0]))
     return result
+
+
+def _count_shifts(source: NDArray[np.int64], target: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Count the pairs of cells (N, 2), (M, 2) that each shift takes onto each other, and give the least shift (2,)."""
+    first, low = source.max(0), target.min(0)
+    shape = tuple((np.ptp(source, axis=0) + np.ptp(target, axis=0) + 1).tolist())
+    images = np.zeros((2, *shape))
+    images[0][tuple((first - source).T)] = 1
+    images[1][tuple((target - low).T)] = 1
+    return np.rint(np.fft.irfft2(np.fft.rfft2(images).prod(0), shape)).astype(np.int64), low - first
 
 
 def _apply(homography: Floats, points: Floats) -> Floats:

@@ -10,7 +10,7 @@ from operator import add
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.association.ambiguities import conflicts
+from imgcal.association.ambiguities import conflicts, lattice_shifts
 from imgcal.association.hypotheses import (
     FiducialTriples,
     Poses,
@@ -32,6 +32,7 @@ PLANAR_EFFORT = 50_000  # hypotheses that take as long as a camera's poses of a 
 VOTES_A_HYPOTHESIS = 500  # comparisons of a fiducial with a blob that take as long as a hypothesis
 EDGES_TRIED = 2  # cameras in which neighbours on the hull are taken for an edge of the object
 MANY = 40  # fiducials of a planar object above which there are too many triples
+MOST_STEPS = 6  # of a lattice, by which a camera's image is moved
 VERIFIED = 2  # number of best different labellings to fit per round
 DECISIVE = 0.7  # labelled share of what could be seen that no wrong labelling of a whole rig reaches
 DECISIVE_CAMERAS = 3  # in which it must have labels
@@ -61,7 +62,7 @@ class Search:
     bounds: tuple[float, float]  # see `_bounds`
     alone: bool = True  # no other object is in view: a labelling of nearly all blobs ends a round
     hypotheses: int = 0  # number so far; for planar objects, the equivalent in time
-    planar: dict[int, Poses] = field(default_factory=dict)  # by camera: they are the same in every round
+    planar: dict[int, list[Poses]] = field(default_factory=dict)  # by camera: they are the same in every round
     likely: dict[tuple[int, bool], NDArray[np.int64]] = field(default_factory=dict)  # by arguments of `likely_blobs`
     triples: FiducialTriples | None = None  # to match blobs with, once they are needed
 
@@ -94,12 +95,13 @@ class Search:
         if obj.planar and obj.num_fiducials > MANY:
             for camera in generator.permutation(self.cameras)[:2].tolist():
                 self.hypotheses += PLANAR_EFFORT
-                yield self._planar_poses(camera)
+                for poses in self._planar_poses(camera):
+                    yield from _best_first(poses)
             return
         edges = edge_triples(obj, generator) if self.triples is None else None
         if edges is not None:
             for camera in generator.permutation(self.cameras)[:EDGES_TRIED]:
-                yield self._single_camera_poses(camera[None], 1, edges, generator)
+                yield from _best_first(self._single_camera_poses(camera[None], 1, edges, generator))
         if self.triples is None:
             self.triples = fiducial_triples(obj, generator)
         cameras = generator.permutation(self.cameras)
@@ -141,7 +143,8 @@ class Search:
         return everywhere and (labelled > 0).sum() >= DECISIVE_CAMERAS and labelled.sum() >= DECISIVE * most
 
     def _match(self, ballot: _Ballot, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        return match(self.scene.blobs, ballot.predicted[rows], ballot.votes.shift[rows], 1.25 * self.bounds[0])
+        shift = ballot.votes.shift[rows]
+        return match_on_lattice(self.scene, ballot.predicted[rows], shift, 1.25 * self.bounds[0])
 
     def _likely_blobs(self, camera: int, edges: bool) -> NDArray[np.int64]:
         key = camera, edges or has_many_triples(self.scene.obj)
@@ -149,10 +152,42 @@ class Search:
             self.likely[key] = likely_blobs(self.scene.blobs, *key)
         return self.likely[key]
 
-    def _planar_poses(self, camera: int) -> Poses:
-        if camera not in self.planar:
-            self.planar[camera] = planar_poses(self.scene.blobs, self.scene.rig, camera, self.scene.obj)
-        return self.planar[camera]
+    def _planar_poses(self, camera: int) -> Iterator[Poses]:
+        if camera in self.planar:
+            yield from self.planar[camera]
+            return
+        found: list[Poses] = []
+        for poses in planar_poses(self.scene.blobs, self.scene.rig, camera, self.scene.obj):
+            found.append(poses)
+            yield poses
+        self.planar[camera] = found
+
+
+def _best_first(poses: Poses) -> Iterator[Poses]:
+    """Give the first of some poses alone: for a large object, the rig's votes take longer than to make poses."""
+    yield poses.select(np.arange(min(len(poses), 1)))
+    yield poses.select(np.arange(1, len(poses)))
+
+
+def match_on_lattice(
+    scene: Scene, predicted: NDArray[np.float64], shift: NDArray[np.float64], tolerance: float
+) -> NDArray[np.int64]:
+    """Do the work of `match`, and move each camera's image by steps of the object's lattice while that pairs more."""
+    labels = match(scene.blobs, predicted, shift, tolerance)
+    falls = [(motion.permutation, motion.permutation >= 0) for motion in lattice_shifts(scene.obj)]
+    if not falls:
+        return labels
+    cameras = np.arange(labels.shape[1])
+    for k, (uv, place) in enumerate(zip(predicted, shift, strict=True)):
+        moves = [np.median(uv[:, onto[fall]] - uv[:, fall], axis=1) for onto, fall in falls]
+        steps = np.stack((np.zeros_like(place), *moves))  # (T, C, 2)
+        for _ in range(MOST_STEPS):
+            tried = match(scene.blobs, uv[None].repeat(len(steps), 0), place + steps, tolerance)
+            best = (tried >= 0).sum(-1).argmax(0)
+            labels[k], place = tried[best, cameras], place + steps[best, cameras]
+            if not best.any():
+                break
+    return labels
 
 
 def distinct(

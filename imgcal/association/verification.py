@@ -20,7 +20,7 @@ from imgcal.association.assignment import assign
 from imgcal.association.blobs import PaddedBlobs
 from imgcal.association.hypotheses import Poses
 from imgcal.association.innovation import THRESHOLD, Innovations, find_contested, innovations, one_or_some
-from imgcal.estimation import Problem, Solution, State, levenberg_marquardt_cpu, pose_at
+from imgcal.estimation import Problem, Solution, State, cauchy, levenberg_marquardt_cpu, pose_at
 from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig
 
@@ -61,6 +61,11 @@ class Scene:
             factory=self.rig.expand(1),
             prior_std=self.std.expand(1, -1, -1),
         )
+
+    @cached_property
+    def solver(self) -> levenberg_marquardt_cpu.RigSolver:
+        """Fits of one labelling after the other."""
+        return levenberg_marquardt_cpu.RigSolver(self.problem)
 
     def select_camera(self, camera: int) -> Scene:
         """Keep one camera."""
@@ -105,18 +110,27 @@ def start(scene: Scene, poses: Poses, labels: NDArray[np.int64]) -> Fits:
     """Start with the factory rig at poses (K,) with rough labels (K, C, N)."""
     u, _, vh = np.linalg.svd(poses.rotation)
     rotation = torch.from_numpy(u @ vh)
-    centre = torch.from_numpy(np.ascontiguousarray(poses.translation)) + rotation @ scene.obj.points.mean(0).to(
-        rotation
-    )
+    centroid = scene.problem.centroid.to(rotation)
+    centre = torch.from_numpy(np.ascontiguousarray(poses.translation)) + rotation @ centroid
     offset = rotation.new_zeros(len(poses), *scene.std.shape)
     return Fits(labels, State(offset, rotation[:, None], centre[:, None]), np.zeros(len(poses)), np.zeros(len(poses)))
 
 
 def refine(scene: Scene, fits: Fits, stages: tuple[float, ...] = STAGES) -> Fits:
-    """Alternate fitting and labelling through all stages; the last labels are fitted, too."""
+    """Alternate fitting and labelling through all stages; the last labels are fitted, too.
+
+    Stages end early where the labels stay and the blobs' own errors explain the residuals.
+    """
     for sigma in stages:
-        fits = fit_and_label(scene, fits, sigma)
+        before, fits = fits.labels, fit_and_label(scene, fits, sigma)
+        if is_settled(before, fits):
+            break
     return settle_labels(scene, fit(scene, fits), rounds=1)
+
+
+def is_settled(before: NDArray[np.int64], fits: Fits) -> bool:
+    """Tell whether more stages would change nothing: labels are those of before, and their own errors explain all."""
+    return np.array_equal(before, fits.labels) and not fits.sigma.any()
 
 
 def fit_and_label(scene: Scene, fits: Fits, sigma: float) -> Fits:
@@ -177,16 +191,36 @@ def evidence(scene: Scene, fits: Fits) -> NDArray[np.float64]:
     return np.where(labelled, gain, 0).sum((1, 2)) - fits.cost - 0.5 * (found.complexity + sizes)
 
 
-def most_evidence(scene: Scene, fits: Fits, labels: NDArray[np.int64]) -> float:
-    """Estimate the evidence that another labelling (C, N) in the place of a fitted one has at most.
+def most_evidence(scene: Scene, fits: Fits, labels: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Estimate the evidence (K,) that other labellings (K, C, N) in the place of a fitted one have at most.
 
-    All its labels fit exactly then, and so do all blobs that the fitted one leaves unlabelled.
+    All their labels fit exactly then, and so do all blobs that the fitted one leaves unlabelled.
     """
     unlabelled = scene.blobs.count - (fits.labels[0] >= 0).sum(1)
-    count = np.minimum((labels >= 0).sum(1) + unlabelled, scene.obj.num_fiducials).sum()
+    count = np.minimum((labels >= 0).sum(2) + unlabelled, scene.obj.num_fiducials).sum(1)
     precision = -np.log(2 * np.pi * scene.blobs.sigma[scene.blobs.row >= 0] ** 2).mean()
-    gain = _label_gain(scene, fits, count[None])[0] + precision
-    return float(count * gain - 0.5 * _require_innovations(fits).complexity[0])
+    gain = _label_gain(scene, fits, count) + precision
+    return np.asarray(count * gain - 0.5 * _require_innovations(fits).complexity[0])
+
+
+def part_of_camera(scene: Scene, fits: Fits, camera: int) -> Fits:
+    """Keep one camera's labels of fitted labellings, and their cost in this fit; see `Scene.select_camera`.
+
+    A fit of that camera alone costs at most as much.
+    """
+    one = slice(camera, camera + 1)
+    found, labels, offset = _require_innovations(fits), fits.labels[:, one], fits.state.offset[:, one]
+    parts = (getattr(found, field.name) for field in fields(Innovations))
+    variance = (_blob_noise(scene, fits) + fits.sigma[:, None, None] ** 2)[:, one]
+    squared = np.where(labels >= 0, found.residual[:, one] / variance, 0)
+    loss = cauchy(torch.from_numpy(squared), THRESHOLD)[0].sum((1, 2))
+    return Fits(
+        labels,
+        replace(fits.state, offset=offset),
+        fits.sigma,
+        0.5 * (loss + offset.square().sum((1, 2))).numpy(),
+        Innovations(*(part if part.ndim == 1 else part[:, one] for part in parts)),
+    )
 
 
 def predictions(fits: Fits) -> NDArray[np.float64]:
@@ -242,17 +276,17 @@ def fit(scene: Scene, fits: Fits) -> Fits:
     # Sequentially: on a busy machine, starting threads takes longer than a few small fits.
     problem = make_problem(scene, fits)
     if len(fits.labels) == 1:
-        solution = _minimize(problem, fits.state)
+        solution = _minimize(scene, problem, fits.state)
     else:
         bare = replace(fits, innovations=None)
         each = (bare.select(np.array([k])) for k in range(len(fits.labels)))
-        solution = _stack_solutions([_minimize(make_problem(scene, one), one.state) for one in each])
+        solution = _stack_solutions([_minimize(scene, make_problem(scene, one), one.state) for one in each])
     found = innovations(scene.blobs, fits.labels, fits.sigma, problem, solution)
     return replace(fits, state=solution.state, cost=solution.equations.cost.numpy(), innovations=found)
 
 
-def _minimize(problem: Problem, state: State) -> Solution:
-    return levenberg_marquardt_cpu.minimize(problem, state, "cauchy", THRESHOLD, 8, 1e-3)
+def _minimize(scene: Scene, problem: Problem, state: State) -> Solution:
+    return scene.solver.minimize(problem, state, "cauchy", THRESHOLD, 8, 1e-3)
 
 
 def _stack_solutions(solutions: Sequence[Solution]) -> Solution:
@@ -307,7 +341,7 @@ def _clutter(scene: Scene, uv: NDArray[np.float64], labelled: NDArray[np.int64])
     middle, half = (low + high) / 2, 0.75 * (high - low) + 10
     inside = (np.abs(scene.blobs.uv[None] - middle[:, :, None]) < half[:, :, None]).all(-1).sum((1, 2))
     local = (np.maximum(inside - labelled, 0) + 1) / (4 * half.prod(-1)).sum(1)
-    overall = (scene.blobs.count.sum() - labelled + 1) / scene.rig.image_size.prod(1).sum().item()
+    overall = (scene.blobs.count.sum() - labelled + 1) / scene.rig.image_size.numpy().prod(1).sum()
     return np.maximum(local, overall)
 
 

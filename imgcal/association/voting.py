@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.association.assignment import mutual_nearest
+from imgcal.association.assignment import first_beyond, mutual_nearest
 from imgcal.association.blobs import PaddedBlobs
 from imgcal.association.hypotheses import Poses
 from imgcal.types import CameraRig
@@ -36,7 +36,7 @@ class Votes:
 def predict_ideal(rig: CameraRig, points: NDArray[np.float64], poses: Poses) -> NDArray[np.float64]:
     """Project fiducials (N, 3) without distortion, from the principal point: (K, C, N, 2) px, -1e7 behind a camera."""
     transform = rig.cam_from_rig
-    focal = rig.focal_length.mean(-1).numpy()
+    focal = rig.focal_length.numpy().mean(-1)
     uv = np.full((len(poses.rotation), rig.num_cameras, len(points), 2), -1e7)
     given = (
         transform.rotation.numpy(),
@@ -101,6 +101,11 @@ def _vote_one(predicted, ideal, number, width, gate, windows, count, shift):
     fiducials = predicted.shape[1]
     for c in range(len(predicted)):
         most, best_i, best_j = 0, 0, 0
+        if 4 * fiducials * number[c] > windows.size:
+            most, best_i, best_j = _fullest_of_many(windows, predicted[c], ideal[c], number[c], width, gate)
+            count[c] = min(most, fiducials)
+            shift[c, 0], shift[c, 1] = best_i * width - gate, best_j * width - gate
+            continue
         for n in range(fiducials):
             for m in range(number[c]):
                 u, v = ideal[c, m, 0] - predicted[c, n, 0] + gate, ideal[c, m, 1] - predicted[c, n, 1] + gate
@@ -114,21 +119,40 @@ def _vote_one(predicted, ideal, number, width, gate, windows, count, shift):
                                 most, best_i, best_j = votes, a, b
         count[c] = min(most, fiducials)
         shift[c, 0], shift[c, 1] = best_i * width - gate, best_j * width - gate
-        _clear(windows, predicted[c], ideal[c], number[c], width, gate)
+        for n in range(fiducials):
+            for m in range(number[c]):
+                u, v = ideal[c, m, 0] - predicted[c, n, 0] + gate, ideal[c, m, 1] - predicted[c, n, 1] + gate
+                if u >= 0 and v >= 0 and u < 2 * gate and v < 2 * gate:
+                    i, j = int(u / width), int(v / width)
+                    windows[i, j] = windows[i + 1, j] = windows[i, j + 1] = windows[i + 1, j + 1] = 0
 
 
 @njit(cache=True)
-def _clear(windows, predicted, ideal, number, width, gate):
-    """Set windows to zero: all of them, or only those with votes where these are few."""
-    if 4 * len(predicted) * number > windows.size:
-        windows[:] = 0
-        return
+def _fullest_of_many(windows, predicted, ideal, number, width, gate):
+    """Do the same for one camera with more votes than windows: count each vote once, and then add the neighbours.
+
+    Returns:
+        Votes of the fullest window, its row and its column.
+    """
     for n in range(len(predicted)):
         for m in range(number):
             u, v = ideal[m, 0] - predicted[n, 0] + gate, ideal[m, 1] - predicted[n, 1] + gate
             if u >= 0 and v >= 0 and u < 2 * gate and v < 2 * gate:
-                i, j = int(u / width), int(v / width)
-                windows[i, j] = windows[i + 1, j] = windows[i, j + 1] = windows[i + 1, j + 1] = 0
+                windows[int(u / width), int(v / width)] += 1
+    most, best_i, best_j = 0, 0, 0
+    for i in range(len(windows) - 1, -1, -1):
+        for j in range(windows.shape[1] - 1, -1, -1):
+            votes = windows[i, j]
+            if i > 0:
+                votes += windows[i - 1, j]
+            if j > 0:
+                votes += windows[i, j - 1]
+            if i > 0 and j > 0:
+                votes += windows[i - 1, j - 1]
+            windows[i, j] = 0
+            if votes >= most:
+                most, best_i, best_j = votes, i, j
+    return most, best_i, best_j
 
 
 def match(
@@ -146,29 +170,35 @@ def match(
         (K, C, N) blob of each fiducial, -1 = none.
     """
     labels = np.empty(predicted.shape[:3], dtype=np.int64)
-    _match(predicted, blobs.ideal, blobs.count, np.asarray(shift, dtype=np.float64), tolerance, labels)
+    shifts = np.asarray(shift, dtype=np.float64)
+    _match(predicted, *blobs.left_to_right, blobs.count, shifts, tolerance, labels)
     return labels
 
 
 @njit(cache=True)
-def _match(predicted, ideal, number, shifts, tolerance, labels):
+def _match(predicted, ideal, order, number, shifts, tolerance, labels):
     for k in range(len(predicted)):
         for c in range(len(number)):
             blobs, places, shift = ideal[c, : number[c]], predicted[k, c].copy(), shifts[k, c].copy()
             for reach in (1.5, 1.2):
-                shift += _mean_residual(predicted[k, c], blobs, shift, (reach * tolerance) ** 2)
+                shift += _mean_residual(predicted[k, c], blobs, shift, reach * tolerance)
             places += shift
             mutual_nearest(places, blobs, tolerance, labels[k, c])
+            for n in range(len(places)):
+                if labels[k, c, n] >= 0:
+                    labels[k, c, n] = order[c, labels[k, c, n]]
 
 
 @njit(cache=True)
-def _mean_residual(places, blobs, shift, reach_squared):
-    """Mean residual to the nearest blobs, weighted by nearness: (2,)."""
-    total, step = 0.0, np.zeros(2)
+def _mean_residual(places, blobs, shift, reach):
+    """Mean residual to the nearest blobs, given from left to right, weighted by nearness: (2,)."""
+    total, step, reach_squared = 0.0, np.zeros(2), reach**2
     for n in range(len(places)):
         least, nearest_u, nearest_v = reach_squared, 0.0, 0.0
-        for m in range(len(blobs)):
+        for m in range(first_beyond(blobs, places[n, 0] + shift[0] - reach), len(blobs)):
             u, v = blobs[m, 0] - places[n, 0] - shift[0], blobs[m, 1] - places[n, 1] - shift[1]
+            if u > reach:
+                break
             squared = u * u + v * v
             if squared < least:
                 least, nearest_u, nearest_v = squared, u, v

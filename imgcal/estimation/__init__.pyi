@@ -54,7 +54,7 @@ from .rig_error import displace, error_between, step_by_error
 from .rig_from_points import PointStart, cold_start_from_points, move_to_pair_frame, prior_of_pair
 from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens, robust_std, single_camera_poses
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion, uncertainty_over
-from .robust_losses import squared
+from .robust_losses import cauchy, squared
 from .snapshot_scatter import BlockScatter, block_scatter
 from .variance_components import BENT, ObjectQuestion, Start, estimate_variance_components
 
@@ -94,6 +94,7 @@ __all__ = [
     "block_scatter",
     "camera_covariance",
     "camera_std",
+    "cauchy",
     "cold_start",
     "cold_start_from_points",
     "correlation_time",

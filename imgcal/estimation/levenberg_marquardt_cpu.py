@@ -56,24 +56,59 @@ def minimize(
         tolerance: see `levenberg_marquardt.minimize`.
     """
     count = len(problem.uv)
-    own_std, state = _object_spread(problem, start, rows=max(count, 2))
-    blocks = _Blocks.of(problem, rows=max(count, 2))
+    if count == 1:
+        return RigSolver(problem).minimize(problem, start, loss, threshold, max_iterations, tolerance)
+    own_std, state = _object_spread(problem, start, rows=count)
+    blocks = _Blocks.of(problem, rows=count)
     converged = np.zeros(count, dtype=np.bool_)
     iterations = np.zeros(count, dtype=np.int64)
     shared, given = shared_arrays(problem), _arrays((*_problem_arrays(problem), own_std))
     compiled = (_arrays(_parts(state)), _arrays(blocks.parts), *_arrays((blocks.cost,)), converged, iterations)
     limits = (blocks.cameras_first, LOSS_CODES[loss], threshold, max_iterations)
     tolerances = (tolerance + pixel_rounding(problem)).numpy()
-    if count == 1:
-        one = (*shared, *(array[0] for array in given))
-        best = _minimize_rig(one, *compiled, limits, tolerances[0])  # type: ignore[call-arg]
-        state, blocks = State(*(part[best : best + 1] for part in _parts(state))), blocks.only(best)
-    else:
-        with _threads_of_torch():
-            _minimize_all((*shared, *given), *compiled, limits, tolerances)  # type: ignore[call-arg]
+    with _threads_of_torch():
+        _minimize_all((*shared, *given), *compiled, limits, tolerances)  # type: ignore[call-arg]
     if not own_std.shape[1]:
         state = replace(state, object_offset=None)
     return Solution(state, blocks.equations(), torch.from_numpy(converged), int(iterations.max()))
+
+
+class RigSolver:
+    """Fits of a single rig to many sets of observations: what these share is converted for compiled code once."""
+
+    def __init__(self, problem: Problem) -> None:
+        """Take everything but the observations from a problem of one rig."""
+        given = _arrays(_problem_arrays(problem)[2:])
+        own = problem.object_prior_std
+        own_std = np.empty(0, given[0].dtype) if own is None else own.detach().contiguous().numpy()[0]
+        self._shared = shared_arrays(problem)
+        self._given = (*(array[0] for array in given), own_std)
+
+    def minimize(
+        self, problem: Problem, start: State, loss: str, threshold: float, max_iterations: int, tolerance: float
+    ) -> Solution:
+        """Do the work of `minimize` for a problem that differs from this one's in its observations."""
+        uv, root_weight = (array[0] for array in _arrays((problem.uv, problem.root_weight)))
+        offset = start.object_offset
+        own = np.zeros_like(self._given[-1]) if offset is None else offset.detach().numpy()[0]
+        first = (*(part.detach().numpy()[0] for part in (start.offset, start.rotation, start.centre)), own)
+        states = tuple(np.empty((2, *part.shape), uv.dtype) for part in first)
+        for state, part in zip(states, first, strict=True):
+            state[0] = part
+        cameras_first, sizes = _sizes_of_blocks(problem)
+        *parts, cost = (np.empty((2, *size), uv.dtype) for size in sizes)
+        converged, iterations = np.zeros(1, np.bool_), np.zeros(1, np.int64)
+        rounding = (4 * np.finfo(uv.dtype).eps) ** 2 * np.square(uv * root_weight[..., None, :]).sum()
+        best = _minimize_rig(
+            (*self._shared, uv, root_weight, *self._given), states, tuple(parts), cost, converged, iterations,
+            (cameras_first, LOSS_CODES[loss], threshold, max_iterations), uv.dtype.type(tolerance + rounding),
+        )  # fmt: skip
+        one = slice(best, best + 1)
+        blocks = _Blocks(cameras_first, *(torch.from_numpy(part) for part in (*(p[one] for p in parts), cost[:1])))
+        found = State(*(torch.from_numpy(state[one]) for state in states))
+        if not len(own):
+            found = replace(found, object_offset=None)
+        return Solution(found, blocks.equations(), torch.from_numpy(converged), int(iterations[0]))
 
 
 @contextmanager
@@ -116,20 +151,8 @@ class _Blocks:
     @classmethod
     def of(cls, problem: Problem, rows: int) -> _Blocks:
         """Allocate the blocks of a problem for `rows` rows."""
-        _, snapshots, cameras, _, fiducials = problem.uv.shape
-        own = 0 if problem.object_prior_std is None else problem.object_prior_std.shape[1]
-        free = problem.prior_std.shape[-1]
-        cameras_first = 6 * snapshots <= free * cameras
-        shape = (cameras, free, 6 * snapshots + own) if cameras_first else (snapshots, 6, free * cameras + own)
-        sizes = (
-            (cameras, free, free), shape, (snapshots, 6, 6), (own, shape[-1]),
-            (cameras, free), (snapshots, 6), (own,), (snapshots, cameras, 2, fiducials), (),
-        )  # fmt: skip
+        cameras_first, sizes = _sizes_of_blocks(problem)
         return cls(cameras_first, *(problem.uv.new_empty(rows, *size) for size in sizes))
-
-    def only(self, row: int) -> _Blocks:
-        """Select one row. The cost has only one."""
-        return _Blocks(self.cameras_first, *[*(part[row : row + 1] for part in self.parts), self.cost[:1]])
 
     @property
     def parts(self) -> tuple[Tensor, ...]:
@@ -156,6 +179,19 @@ class _Blocks:
         lower = self.border[..., wide:]
         square = lower.tril() + lower.tril(-1).mT
         return replace(equations, object=ObjectEquations(*pair, square, self.own_gradient))
+
+
+def _sizes_of_blocks(problem: Problem) -> tuple[bool, tuple[tuple[int, ...], ...]]:
+    """Tell whether cameras are eliminated first, and the sizes of one rig's blocks, the cost last."""
+    _, snapshots, cameras, _, fiducials = problem.uv.shape
+    own = 0 if problem.object_prior_std is None else problem.object_prior_std.shape[1]
+    free = problem.prior_std.shape[-1]
+    cameras_first = 6 * snapshots <= free * cameras
+    shape = (cameras, free, 6 * snapshots + own) if cameras_first else (snapshots, 6, free * cameras + own)
+    return cameras_first, (
+        (cameras, free, free), shape, (snapshots, 6, 6), (own, shape[-1]),
+        (cameras, free), (snapshots, 6), (own,), (snapshots, cameras, 2, fiducials), (),
+    )  # fmt: skip
 
 
 def _object_spread(problem: Problem, state: State, rows: int) -> tuple[Tensor, State]:

@@ -36,7 +36,7 @@ def near_prediction(blobs: Detections, predicted: NDArray[np.float64]) -> NDArra
     labels = np.full(len(blobs), -1, dtype=np.int64)
     gaps = distances_to_nearest(predicted)
     reach = 0.25 * median(gaps)
-    order = np.argsort(blobs.camera, kind="stable")
+    order = np.lexsort((blobs.uv[:, 0], blobs.camera))
     ends = np.searchsorted(blobs.camera[order], np.arange(len(predicted) + 1))
     for places, crowded, begin, end in zip(predicted, gaps < TOO_NEAR, ends[:-1], ends[1:], strict=True):
         rows, found = order[begin:end], np.empty(len(places), dtype=np.int64)

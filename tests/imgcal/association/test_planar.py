@@ -1,6 +1,8 @@
 """Poses of planar objects against the truth, homographies against OpenCV's."""
 
 from dataclasses import replace
+from functools import reduce
+from operator import add
 
 import cv2
 import numpy as np
@@ -8,9 +10,14 @@ import pytest
 import torch
 
 from imgcal.association.blobs import PaddedBlobs, gather
-from imgcal.association.planar import _affinity, _fit_homography, _pose, _rotation, _whiten, planar_poses
+from imgcal.association.hypotheses import Poses
+from imgcal.association.planar import _affinity, _count_shifts, _fit_homography, _pose, _rotation, _whiten, planar_poses
 from imgcal.geometry import rotation_from_vector
 from tests.imgcal.association.scenes import degrees_between, make_object, take
+
+
+def every_pose(*arguments) -> Poses:
+    return reduce(add, planar_poses(*arguments))
 
 
 def random_rotation(random):
@@ -30,7 +37,7 @@ def test_one_of_the_poses_is_the_true_one(seed, flat, o10) -> None:
     snapshot = take(o10, flat, seed, drift=None, noise=0.05, false=4, missing=6)
     blobs = gather(snapshot.detections, o10)
     camera = 2 * seed
-    poses = planar_poses(blobs, o10, camera, flat)
+    poses = every_pose(blobs, o10, camera, flat)
     points, true = flat.points.numpy(), snapshot.pose.apply(flat.points).numpy()
     error = [
         np.linalg.norm(points @ r.T + t - true, axis=1).max()
@@ -50,7 +57,7 @@ def test_the_order_of_blobs_does_not_matter(flat, o10) -> None:
     order = np.random.default_rng(1).permutation(blobs.count[0])
     parts = (part[:1][:, order] for part in (blobs.uv, blobs.ideal, blobs.sigma, blobs.radius, blobs.row))
     shuffled = PaddedBlobs(*parts, blobs.count[:1], blobs.rows)
-    one, other = planar_poses(blobs, o10, 0, flat), planar_poses(shuffled, o10, 0, flat)
+    one, other = every_pose(blobs, o10, 0, flat), every_pose(shuffled, o10, 0, flat)
     assert len(one) == len(other) > 0
     np.testing.assert_allclose(one.rotation, other.rotation, atol=1e-6)
     np.testing.assert_allclose(one.translation, other.translation, atol=1e-3)
@@ -65,7 +72,7 @@ def test_blobs_of_another_size_and_strays_are_not_of_the_plane(flat, o10) -> Non
     radius[0, big] = 20.0
     ideal = blobs.ideal.copy()
     ideal[0, big] += 400.0  # lamps beside the object
-    poses = planar_poses(replace(blobs, radius=radius, ideal=ideal), o10, 0, flat)
+    poses = every_pose(replace(blobs, radius=radius, ideal=ideal), o10, 0, flat)
     assert degrees_between(poses.rotation, snapshot.pose.rotation.numpy()).min() < 2
 
 
@@ -73,7 +80,7 @@ def test_blobs_of_something_else_have_no_pose(flat, o10) -> None:
     blobs = gather(take(o10, flat, 1).detections, o10)
     random = np.random.default_rng(2).uniform(-600, 600, blobs.ideal.shape).astype(np.float32)
     random[0, : random.shape[1] // 2] *= 0.01  # half of them in a heap
-    assert len(planar_poses(replace(blobs, ideal=random), o10, 0, flat)) == 0
+    assert len(every_pose(replace(blobs, ideal=random), o10, 0, flat)) == 0
 
 
 @pytest.mark.parametrize("count", [4, 30])
@@ -142,7 +149,7 @@ def test_a_lattice_is_found_though_half_of_it_is_hidden(o10) -> None:
             np.arange(len(kept))[None],
         )  # fmt: skip
         assert 25 < shown.sum() < 60
-        poses = planar_poses(PaddedBlobs(*parts, np.array([len(kept)]), len(kept)), o10.select([camera]), 0, grid)
+        poses = every_pose(PaddedBlobs(*parts, np.array([len(kept)]), len(kept)), o10.select([camera]), 0, grid)
         points, truth = grid.points.numpy(), snapshot.pose.apply(grid.points).numpy()
         # A square has eight poses, and steps of the lattice are as good as long as they show as many of the rest.
         error = [
@@ -150,3 +157,13 @@ def test_a_lattice_is_found_though_half_of_it_is_hidden(o10) -> None:
             for r, t in zip(poses.rotation, poses.translation, strict=True)
         ]
         assert min(error, default=np.inf) < 0.02 * float(o10.working_distance)
+
+
+def test_shifts_of_cells_are_counted() -> None:
+    random = np.random.default_rng(8)
+    source, target = (np.unique(random.integers(-5, 6, (20, 2)), axis=0) for _ in range(2))
+    counts, low = _count_shifts(source, target)
+    expected = np.zeros_like(counts)
+    np.add.at(expected, tuple((target[:, None] - source - low).reshape(-1, 2).T), 1)
+    np.testing.assert_array_equal(counts, expected)
+    assert counts.sum() == len(source) * len(target)

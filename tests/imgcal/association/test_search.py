@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imgcal.association.ambiguities import conflicts
-from imgcal.association.search import PLANAR_EFFORT, VERIFIED, Search, distinct
+from imgcal.association.ambiguities import conflicts, lattice_shifts
+from imgcal.association.search import PLANAR_EFFORT, VERIFIED, Search, distinct, match_on_lattice
 from imgcal.association.verification import evidence
+from imgcal.association.voting import match, predict_ideal
 from imgcal.io import load_object
 from tests.imgcal.association.scenes import make_object, scene_of, take
 
@@ -57,6 +58,22 @@ def test_edges_of_the_hull_find_an_object_with_little_hidden(fiducials, o10) -> 
         fits = search.run_round(8000, np.random.default_rng(seed))
         assert fits is not None and conflicts(obj, snapshot.labels(scene.blobs, fiducials), fits.labels[0]) < 0.05
         assert search.triples is None  # no other hypotheses were made
+
+
+def test_every_camera_is_moved_to_the_step_of_a_lattice_that_pairs_most(o10) -> None:
+    rows, columns = np.meshgrid(np.arange(9.0), np.arange(7.0), indexing="ij")
+    obj = make_object(np.c_[20 * columns.ravel() - 60, 20 * rows.ravel() - 80, np.zeros(63)])
+    rig = o10.select([0, 3, 6])
+    snapshot = take(rig, obj, 1, drift=None)
+    scene = scene_of(snapshot, rig, obj)
+    truth = snapshot.labels(scene.blobs, 63)
+    predicted = predict_ideal(rig, obj.points.numpy(), snapshot.poses())
+    step = lattice_shifts(obj)[0].permutation
+    falls = step >= 0
+    shift = np.median(predicted[0][:, step[falls]] - predicted[0][:, falls], axis=1)
+    off = np.stack((shift[0], np.zeros(2), -2 * shift[2]))[None]  # as if the first and the last camera saw it shifted
+    assert not np.array_equal(match(scene.blobs, predicted, off, 4.0)[0], truth)
+    np.testing.assert_array_equal(match_on_lattice(scene, predicted, off, 4.0)[0], truth)
 
 
 def test_where_edges_mislead_all_triples_are_tried(o10) -> None:

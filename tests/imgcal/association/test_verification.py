@@ -15,9 +15,11 @@ from imgcal.association.verification import (
     certain,
     evidence,
     fit,
+    is_settled,
     join,
     make_problem,
     most_evidence,
+    part_of_camera,
     predictions,
     refine,
     rig_and_pose,
@@ -160,14 +162,33 @@ def test_no_shifted_lattice_has_more_evidence_than_estimated(missing, rig) -> No
     scene = scene_of(snapshot, rig, obj)
     labels = snapshot.labels(scene.blobs, 20)
     best = refine(scene, started(scene, snapshot, labels))
-    assert most_evidence(scene, best, labels) >= evidence(scene, best)[0]
+    assert most_evidence(scene, best, labels[None])[0] >= evidence(scene, best)[0]
     for motion in lattice_shifts(obj):
         poses, shifted = relabel(select_pose(scene, best, 0), best.labels[0], [motion])
         rival = refine(scene, start(scene, poses, shifted), STAGES[:1])
         if differ(obj, best.labels[0], rival.labels[0]):
-            assert most_evidence(scene, best, shifted[0]) >= evidence(scene, rival)[0]
+            assert most_evidence(scene, best, shifted)[0] >= evidence(scene, rival)[0]
         # What a row of blobs adds is not given away: hidden blobs are, since the shifted lattice may lack the same.
-        assert missing or most_evidence(scene, best, shifted[0]) < evidence(scene, best)[0] - 60
+        assert missing or most_evidence(scene, best, shifted)[0] < evidence(scene, best)[0] - 60
+
+
+def test_the_part_of_a_camera_has_its_share_of_the_cost(scene, snapshot) -> None:
+    fits = refine(scene, started(scene, snapshot, snapshot.labels(scene.blobs, 8)))
+    parts = [part_of_camera(scene, fits, camera) for camera in range(3)]
+    np.testing.assert_allclose(sum(part.cost for part in parts), fits.cost, rtol=1e-6)
+    for camera, part in enumerate(parts):
+        np.testing.assert_array_equal(part.labels[0, 0], fits.labels[0, camera])
+        alone = scene.select_camera(camera)
+        assert fit(alone, replace(part, innovations=None)).cost <= part.cost + 1e-6
+
+
+def test_a_fit_is_settled_where_labels_stay_and_their_errors_explain_all(scene, snapshot) -> None:
+    truth = snapshot.labels(scene.blobs, 8)
+    fits = refine(scene, started(scene, snapshot, truth))
+    exact = replace(fits, sigma=np.zeros(1))
+    assert is_settled(fits.labels, exact)
+    assert not is_settled(fits.labels, replace(fits, sigma=np.array([0.2])))
+    assert not is_settled(np.roll(fits.labels, 1, axis=2), exact)
 
 
 def test_evidence_does_not_care_about_the_order_of_cameras_and_fiducials(scene, snapshot, rig, asymmetric8) -> None:
