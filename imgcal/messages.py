@@ -20,6 +20,11 @@ def quote(text: str) -> str:
     return text if len(text) <= MOST_QUOTED else text[: MOST_QUOTED - 3] + "..."
 
 
+def plural(count: int, noun: str) -> str:
+    """Write a count with its noun: `1 camera`, `1,200 cameras`."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
 def list_names(names: Iterable[str]) -> str:
     """Join names by commas; a long list shows only the first few and the total."""
     whole = list(names)

@@ -25,7 +25,7 @@ from imgcal.errors import InputError
 from imgcal.formats import find_format, is_foreign, load_rig, read_foreign_rig
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import Capture, Frame
-from imgcal.messages import list_names, shorten
+from imgcal.messages import list_names, plural, shorten
 from imgcal.pipeline import LearnedMeasurer, detect_capture
 from imgcal.types import Board, CameraRig, Detections
 
@@ -90,7 +90,9 @@ def read_detections(
     first, last = parse_range(snapshots)
     count = len(source.snapshot_names)
     if first >= count:
-        raise InputError(f"--snapshots: found {snapshots}, expected a range within the {count} snapshots of the input")
+        raise InputError(
+            f"--snapshots: found {snapshots}, expected a range within the {plural(count, 'snapshot')} of the input"
+        )
     if isinstance(source, Detections):
         if measurer is not None:
             raise InputError(f"--measurer {measurer.name}: found blobs without frames, expected a capture with frames")

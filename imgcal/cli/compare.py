@@ -18,6 +18,7 @@ from imgcal.cli.evaluate import WORK, evaluate_models, open_workers
 from imgcal.errors import InputError
 from imgcal.fleet import StoredResults
 from imgcal.io import load_object, nearest, object_text, publishing, rig_text, write_text
+from imgcal.messages import plural
 
 if TYPE_CHECKING:
     from imgcal.evaluation import Contender, Scene
@@ -49,7 +50,7 @@ class Compare(arguments.Compare):
                 "captured frames: --captures 20 simulates 20 at every difficulty"
             )
         if len(self.models) < 2:
-            raise InputError(f"compare: found {len(self.models)} models, expected two or more")
+            raise InputError(f"compare: found {plural(len(self.models), 'model')}, expected two or more")
         evaluate_models(self.models, self.setting, self.baselines, self.out)
 
     def _check_options(self) -> None:
@@ -148,8 +149,8 @@ def describe(scene: Scene, captures: int, seed: int) -> str:
     """One line on what the captures were."""
     drift = ", ".join(f"{name} {value:g}" for name, value in vars(scene.drift).items())
     return (
-        f"Rig {scene.rig.name}, object {scene.obj.name}, {captures} captures a difficulty of {scene.snapshots} "
-        f"snapshots, seed {seed}; drift of all values, standard deviations: {drift}."
+        f"Rig {scene.rig.name}, object {scene.obj.name}, {plural(captures, 'capture')} a difficulty of "
+        f"{plural(scene.snapshots, 'snapshot')}, seed {seed}; drift of all values, standard deviations: {drift}."
     )
 
 

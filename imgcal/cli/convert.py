@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from imgcal.formats import (
     write_into,
 )
 from imgcal.io import load_rig_covariance, publishing, read_rig, write_bytes
-from imgcal.messages import list_names, shorten
+from imgcal.messages import list_names, plural, shorten
 
 
 class Convert(arguments.Convert):
@@ -38,7 +37,7 @@ class Convert(arguments.Convert):
             return
         to = self._target()
         rig, title = self._read()
-        print(f"{title}: {len(rig.cameras)} camera{'s' if len(rig.cameras) > 1 else ''}; frame: {rig.frame}")
+        print(f"{title}: {plural(len(rig.cameras), 'camera')}; frame: {rig.frame}")
         for note in rig.notes:
             print(f"note: {note}")
         made = convert_rig(rig, to, self.out.stem, self.fit_limit, self.out_unit, hold_distortion=self.hold_distortion)
@@ -48,7 +47,7 @@ class Convert(arguments.Convert):
         models = f"{made.between_models:.2g} px" if made.between_models > 1e-6 else "the same"
         print(
             f"wrote {list_names(map(str, written))} ({to}); re-read: worst difference {made.round_trip:.1e} px on "
-            f"{made.points} points, lens models {models}"
+            f"{plural(made.points, 'point')}, lens models {models}"
         )
 
     def _write_back(self) -> None:
@@ -74,14 +73,14 @@ class Convert(arguments.Convert):
         written = self._write(files)
         where = list_names(map(str, written))
         print(
-            f"{made.title}: {_count_cameras(made.changed)} replaced"
-            + (f", {_count_cameras(made.kept)} kept" if made.kept else "")
+            f"{made.title}: {plural(len(made.changed), 'camera')} replaced"
+            + (f", {plural(len(made.kept), 'camera')} kept" if made.kept else "")
         )
         if made.loss is not None:
             print(
                 f"lens models: worst {made.loss.worst:.2g} px, RMS {made.loss.rms:.2g} px (limit {self.fit_limit:g} px)"
             )
-        print(f"wrote {where}; re-read: worst difference {made.reread:.1e} px on {made.points} points")
+        print(f"wrote {where}; re-read: worst difference {made.reread:.1e} px on {plural(made.points, 'point')}")
 
     def _check_held(self) -> None:
         if self.hold_distortion:
@@ -148,10 +147,6 @@ class Convert(arguments.Convert):
             for name, content in files.items():
                 write_bytes(folder / name, content)
         return written
-
-
-def _count_cameras(names: Sequence[str]) -> str:
-    return f"{len(names)} camera{'s' if len(names) != 1 else ''}"
 
 
 def _size(text: str) -> tuple[str, tuple[int, int]]:

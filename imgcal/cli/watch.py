@@ -23,7 +23,7 @@ from imgcal.cli.watch_display import Display
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice, missing
 from imgcal.io import Fiducials, holding, load_objects, open_input
-from imgcal.messages import shorten
+from imgcal.messages import plural, shorten
 from imgcal.online import Event, RigKeeper
 from imgcal.types import CalibrationObject, CameraRig, Detections, object_difference, rig_difference
 from imgcal.watch import (
@@ -156,7 +156,7 @@ class Watch(arguments.Watch):
             loop.run(intake, stopped, display.draw)
         tally = loop.tally
         said = display.result(self.out / CURRENT)
-        if lost := [f"{output.name}: {output.lost:,} poses" for output in poses if output.lost]:
+        if lost := [f"{output.name}: {plural(output.lost, 'pose')}" for output in poses if output.lost]:
             said = f"{said} | not written: {'; '.join(lost)}"
         if learning is not None:
             said = f"{said} | {learning.summary}"
@@ -169,7 +169,7 @@ class Watch(arguments.Watch):
             raise InputError(f"watch: {said}")
         before = intake.known_before + (source.known_before() if isinstance(source, Folder) else 0)
         if tally.snapshots == 0 and before:
-            read = f"all {before:,} snapshots of {self.input} had been read before"
+            read = f"all {plural(before, 'snapshot')} of {self.input} had been read before"
             said = f"{read}; --fresh starts from the factory rig | {said}"
         elif tally.latest is None or tally.learnt == 0:
             raise RefusedError(_nothing(tally, intake))

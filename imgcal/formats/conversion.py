@@ -18,7 +18,7 @@ from imgcal.formats.limits import LIMIT
 from imgcal.formats.values import name_cameras
 from imgcal.geometry import LENS_MODELS, RigidTransform, lens_label, lens_width
 from imgcal.io import RigCovariance
-from imgcal.messages import shorten
+from imgcal.messages import plural, shorten
 from imgcal.types import CameraRig, check_rig
 
 BROWN, RATIONAL, FISHEYE = "brown_conrady", "rational", "equidistant"
@@ -184,7 +184,7 @@ def describe_lens(lens: Lens) -> str:
     """Describe a lens in a few words."""
     kinds = {"opencv": "OpenCV", "fisheye": "fisheye, equidistant", "to_ideal": "image to ideal"}
     skew = ", skewed" if lens.skew else ""
-    return f"{kinds[lens.model]}, {lens.length} coefficient{'s' if lens.length != 1 else ''}{skew}"
+    return f"{kinds[lens.model]}, {plural(lens.length, 'coefficient')}{skew}"
 
 
 def to_camera_rig(rig: ForeignRig, name: str) -> CameraRig:

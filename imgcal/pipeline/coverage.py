@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from imgcal.messages import plural
 from imgcal.pipeline.calibration import Calibration
 
 FIELDS = 8
@@ -38,7 +39,8 @@ class Place:
         parts = [
             f"{value:+.0f} mm in {axis}" for axis, value in zip("xyz", self.offset, strict=True) if abs(value) >= 1
         ]
-        return f"{', '.join(parts) or 'where it was'} ({self.fields} new fields in {self.cameras} cameras)"
+        new = f"{plural(self.fields, 'new field')} in {plural(self.cameras, 'camera')}"
+        return f"{', '.join(parts) or 'where it was'} ({new})"
 
 
 @dataclass(frozen=True)
