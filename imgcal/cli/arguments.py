@@ -245,10 +245,10 @@ class Watch:
 class Score:
     """Measure the reprojection error of a rig that is held fixed; only the object's pose is fitted in each snapshot.
 
-    Prints JSON: median_px, p95_px, rms_px, outliers, rms_px_with_outliers, points, snapshots_used, snapshots_rejected,
-    per_camera. All are of distances in the image; the RMS is that of OpenCV's calibrateCamera, sqrt(2) times the
-    paper's RE. Outliers are much farther off than most of their camera, as half-hidden markers are; they count in
-    median_px and p95_px.
+    Prints a table on a terminal, and JSON into a file or pipe: median_px, p95_px, rms_px, outliers,
+    rms_px_with_outliers, points, snapshots_used, snapshots_rejected, per_camera. All errors are lengths in pixels; the
+    RMS is that of OpenCV's calibrateCamera, sqrt(2) times the paper's RE. Outliers are points much farther off than
+    most in their camera, such as half-hidden markers; median_px and p95_px include them.
     Example: imgcal score my_capture --rig out/rig.yaml --object object.csv
     """
 
@@ -257,6 +257,7 @@ class Score:
     object: tuple[str, ...]
     """object file, or the name of a shipped object; several, any of which may be in view: INPUT --object A B; lights =
     every blob may be a marker of its own"""
+    json: bool = False  #: print JSON on a terminal, too
     snapshots: str | None = None  #: A:B, numbers in file order from 0, B excluded
     videos_differ: bool = False  #: accept videos whose lengths or time stamps differ: frames go together by number
     detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)

@@ -7,6 +7,7 @@ import math
 import os
 import re
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -30,6 +31,7 @@ from imgcal.pipeline import LearnedMeasurer, detect_capture
 from imgcal.types import Board, CameraRig, Detections
 
 Item = TypeVar("Item")
+EVERY = 60.0  # s between lines on progress without a terminal
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # as glibc's malloc.h numbers them
 KEPT, LARGEST = 256 << 20, 32 << 20  # bytes: that are free and kept, and of an array that is
 
@@ -154,15 +156,37 @@ def check_folder(path: Path) -> None:
 
 @contextmanager
 def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar on standard error, if that is a terminal; yields a function to call with each advance."""
+    """Show progress on standard error: a bar on a terminal, a line a minute elsewhere.
+
+    Args:
+        what: that is done.
+        total: number of items.
+
+    Yields:
+        A function to call with the number of items that have been done since the last call.
+    """
     console = Console(file=sys.stderr)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     if not console.is_terminal:  # some versions of rich write a line even where it is disabled
-        yield lambda done: None
+        yield _count_by_lines(what, total)
         return
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda done: bar.advance(task, done)
+
+
+def _count_by_lines(what: str, total: int) -> Callable[[int], None]:
+    """Make a function that counts what is done, and says so at most once in `EVERY` seconds."""
+    count, said = 0, time.monotonic()
+
+    def advance(done: int) -> None:
+        nonlocal count, said
+        count += done
+        if count < total and time.monotonic() - said > EVERY:
+            said = time.monotonic()
+            print(f"{what}: {count:,} of {total:,}", file=sys.stderr, flush=True)
+
+    return advance
 
 
 def keep_memory() -> bool:

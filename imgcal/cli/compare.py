@@ -103,9 +103,12 @@ def compare_captures(
         if one.detector != "classical":
             choose_proposer(one.detector)  # found out now, not when captures are made
     total = len(models) * chosen.captures
+    each = f"{plural(chosen.captures, 'capture')} of each difficulty, {', '.join(names)}"
     kept = None if out is None else StoredResults(out / WORK, _scope(contenders, scene))
-    with open_workers(setting, total, kept) as mapped, progress_bar("calibrating captures", total) as advance:
-        outcomes = compare_detectors(contenders, scene, chosen.captures, seed, advance, mapped)
+    with open_workers(setting, total, kept) as mapped:
+        print(f"calibrating {each}, with {', '.join(map(str, detectors))}", file=sys.stderr, flush=True)
+        with progress_bar("calibrating captures", total) as advance:
+            outcomes = compare_detectors(contenders, scene, chosen.captures, seed, advance, mapped)
     tables = detector_tables(outcomes)
     text = f"{describe(scene, chosen.captures, seed)}\n\n" + "\n".join(table.markdown() for table in tables)
     if sys.stdout.isatty():

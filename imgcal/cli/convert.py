@@ -13,6 +13,7 @@ from imgcal.formats import (
     OURS,
     Files,
     ForeignRig,
+    Format,
     convert_rig,
     fill_image_sizes,
     find_format,
@@ -43,11 +44,15 @@ class Convert(arguments.Convert):
         made = convert_rig(rig, to, self.out.stem, self.fit_limit, self.out_unit, hold_distortion=self.hold_distortion)
         for note in made.notes:
             print(f"note: {note}")
+        if self.to is None and (named := _format_named(self.out.stem)):
+            print(
+                f"note: --out ends in .yaml, so an imgcal rig file is written; --to {named.name} writes a {named.title}"
+            )
         written = self._write(made.files)
         models = f"{made.between_models:.2g} px" if made.between_models > 1e-6 else "the same"
         print(
-            f"wrote {list_names(map(str, written))} ({to}); re-read: worst difference {made.round_trip:.1e} px on "
-            f"{plural(made.points, 'point')}, lens models {models}"
+            f"wrote {list_names(map(str, written))} ({'imgcal rig file' if to == OURS else to}); re-read: worst "
+            f"difference {made.round_trip:.1e} px on {made.points} points, lens models {models}"
         )
 
     def _write_back(self) -> None:
@@ -80,7 +85,7 @@ class Convert(arguments.Convert):
             print(
                 f"lens models: worst {made.loss.worst:.2g} px, RMS {made.loss.rms:.2g} px (limit {self.fit_limit:g} px)"
             )
-        print(f"wrote {where}; re-read: worst difference {made.reread:.1e} px on {plural(made.points, 'point')}")
+        print(f"wrote {where}; re-read: worst difference {made.reread:.1e} px on {made.points} points")
 
     def _check_held(self) -> None:
         if self.hold_distortion:
@@ -147,6 +152,12 @@ class Convert(arguments.Convert):
             for name, content in files.items():
                 write_bytes(folder / name, content)
         return written
+
+
+def _format_named(stem: str) -> Format | None:
+    """Find the format that the name of a file suggests."""
+    words = re.split(r"[^a-z0-9]+", stem.lower())
+    return next((one for one in FORMATS if one.write and {one.name, one.stem} & {*words}), None)
 
 
 def _size(text: str) -> tuple[str, tuple[int, int]]:

@@ -23,6 +23,9 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice
 from imgcal.messages import one_line, quote, shorten
 
+ONE_OF = {"calibrate": ("--rig", "--cameras")}
+"""Options of which a command needs one; the parser knows each as optional."""
+
 SEVERAL_OBJECTS = ("simulate", "calibrate", "score")
 """Commands whose `--object` may be several."""
 
@@ -88,11 +91,13 @@ def parse(arguments: list[str]) -> Runnable:
     except SystemExit as stop:
         if stop.code in (None, DONE):
             raise
-        raise InputError(_strip_boxes(drawn.getvalue(), arguments[0] if arguments else "")) from None
+        raise InputError(_strip_boxes(drawn.getvalue(), arguments)) from None
 
 
 def _parse(arguments: list[str]) -> Runnable:
-    first = arguments[0] if arguments else ""
+    if not arguments:
+        raise InputError(f"no command given, expected one of {', '.join(COMMANDS)}; see imgcal --help")
+    first = arguments[0]
     if first == VERSION:
         print(f"imgcal {imgcal.__version__}")
         raise SystemExit(DONE)
@@ -157,14 +162,14 @@ def _summary(name: str) -> Any:
     return make_dataclass(name.capitalize(), (), namespace={"__doc__": words})
 
 
-def _strip_boxes(box: str, first: str = "") -> str:
-    """Strip the box that tyro draws around a message."""
+def _strip_boxes(box: str, arguments: list[str]) -> str:
+    """Strip the box that tyro draws around a message about a command line."""
     rows = (line.strip("│╭╮╰╯─| ") for line in box.splitlines()[1:])
     text = " ".join(row for row in rows if row.strip("-+"))
     problem, _, hint = text.partition("For full helptext, ")
     problem = problem.partition("Argument helptext:")[0].replace("__tyro-dummy-inner__.", "")
     command = re.search(r"imgcal[a-z ]* --help", hint)
-    return f"{_shorten(problem.strip(), first)}; see {command[0] if command else 'imgcal --help'}"
+    return f"{_shorten(problem.strip(), arguments)}; see {command[0] if command else 'imgcal --help'}"
 
 
 def list_options(command: str) -> list[str]:
@@ -180,8 +185,9 @@ def list_options(command: str) -> list[str]:
     return names(_arguments(command))
 
 
-def _shorten(problem: str, command: str = "") -> str:
+def _shorten(problem: str, arguments: list[str]) -> str:
     """Describe the first problem of a command line in a few words."""
+    command = arguments[0]
     if unknown := re.search(r"Unrecognized options: (.*?)(?: Perhaps you meant:? (.*))?$", problem):
         words, near = unknown[1].split(", "), re.search(r"--[\w.-]+", unknown[2] or "")
         options = [word for word in words if word.startswith("-")]
@@ -194,7 +200,20 @@ def _shorten(problem: str, command: str = "") -> str:
         entries = problem.partition(": ")[2].split("(required)")[:-1]
         parts = [entry.split() for entry in entries]
         named = [p[0] if p[0].startswith("--") else f"{p[0]} ({' '.join(p[1:])})" for p in parts if p]
+        needed = ONE_OF.get(command, ())
+        if needed and not set(needed) & {argument.partition("=")[0] for argument in arguments}:
+            named.append(" or ".join(needed))
         return f"missing {', '.join(named)}"
+    if choice := re.search(r"[Ii]nvalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*?),?\)", problem):
+        words = {word.strip("' ") for word in choice[3].split(",")} - {"None"}
+        known = sorted(words, key=lambda word: (word.isdigit() and int(word), word))
+        close = difflib.get_close_matches(choice[1], known, 1)
+        hint = f"; did you mean {close[0]}?" if close else ""
+        return f"{choice[2]}: found {shorten(choice[1])}, expected {_one_of(known)}{hint}"
+    if group := re.match(r"Expected one of \{(.*)\}", problem):
+        return f"expected {_one_of(group[1].split(', '))} after `imgcal {command}`"
+    if short := re.search(r"Missing value for argument '(\S+)'\. Expected (\d+) values", problem):
+        return f"{short[1]}: found too few values, expected {short[2]}"
     if count := re.search(
         r"Error parsing (\S+): .*input length (\d+) did not match expected argument count (\d+)", problem
     ):
@@ -206,7 +225,11 @@ def _shorten(problem: str, command: str = "") -> str:
         numbers = re.search(r"tuple\[((?:(?:float|int)(?:, )?)+)\]", problem)
         expected = f"{len(numbers[1].split(', '))} numbers" if numbers else "another value"
         return f"{union[1]}: found {shorten(union[2].replace(chr(39), '').replace(',', ''))}, expected {expected}"
-    return re.sub(r"\[/?[a-z ]+\]", "", problem)
+    return re.sub(r"\[/?[a-z ]+\]|^Error parsing \w+: ", "", problem)
+
+
+def _one_of(words: list[str]) -> str:
+    return f"{', '.join(words[:-1])} or {words[-1]}" if len(words) > 1 else words[0]
 
 
 def _verdict(error: BaseException, given: list[str]) -> tuple[int, str]:

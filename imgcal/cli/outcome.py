@@ -313,8 +313,8 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
         shares = [camera["found"] for camera in lights["held_out"].values()]
         share = f"{100 * min(shares):.0f} to {100 * max(shares):.0f} %"
         print(
-            f"{plural(lights['markers'], 'marker')} used; in held-out snapshots, each camera sees {share} of the markers "
-            "that the other cameras find in its view, without matches by chance"
+            f"{plural(lights['markers'], 'marker')} used; in held-out snapshots, each camera sees {share} of the "
+            "markers that the other cameras find in its view, without matches by chance"
         )
         if lights["note"]:
             print(f"note: {lights['note']}", file=sys.stderr)

@@ -183,5 +183,6 @@ def _write(rig: ForeignRig) -> Files:
 
 
 FORMAT = Format(
-    "kalibr", TITLE, _recognizes, _read, _write, Holds((4,), fisheye=True), states_unit=True, from_first=True
-)
+    "kalibr", TITLE, _recognizes, _read, _write, Holds((4,), fisheye=True), states_unit=True, from_first=True,
+    stem="camchain",
+)  # fmt: skip

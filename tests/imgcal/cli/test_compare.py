@@ -1,6 +1,10 @@
 """`imgcal compare --captures`: detectors on simulated captures."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -40,6 +44,26 @@ def test_captures_that_are_done_are_not_done_again(tmp_path, capsys, monkeypatch
     assert judged == [0, 1, 1]
     assert [one["capture"] for one in json.loads((out / "captures.json").read_text())["outcomes"]] == [0, 1]
     assert not (out / ".work").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_beside_worker_processes_ends_it_with_one_line(number):
+    pytest.importorskip("ray", reason="no ray (extra fleet)")
+    command = [sys.executable, "-m", "imgcal", "compare", "points-O10-cube8", "vit-O10-cube8", "--cores", "2"]
+    environment = os.environ | {"PYTHONPATH": str(Path.cwd())}
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    assert process.stderr is not None
+    started = next(line for line in process.stderr if not line.startswith("imgcal: compiling"))
+    expected = "evaluating points-O10-cube8, vit-O10-cube8, "
+    assert started.startswith(expected) and started.endswith("on 3 trials of 20,000 random rigs (--trials, --count)\n")
+    process.send_signal(number)
+    printed, error = process.communicate(timeout=120)
+    said = [line for line in error.splitlines() if not line.startswith("imgcal: compiling")]
+    assert (process.returncode, printed) == (130, "")
+    assert said == ["imgcal: terminated" if number == signal.SIGTERM else "imgcal: interrupted"]
 
 
 @pytest.mark.parametrize(
