@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import difflib
+import inspect
 import io
 import re
 import sys
@@ -11,7 +13,9 @@ import traceback
 import warnings
 from dataclasses import fields, is_dataclass, make_dataclass
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Protocol, Union, get_type_hints
 
 import tyro
@@ -40,9 +44,11 @@ COMMANDS = (
 """Each has a class of its name, among the arguments and in the module of its name."""
 DESCRIPTION = """Recalibrate infrared multi-camera rigs from images of a known calibration object.
 
-imgcal COMMAND --help tells more, imgcal --version which one this is. Exit codes: 0 done, 2 unusable input (or a fault
-of imgcal's own, which says so), 3 refused (the data cannot decide), 130 interrupted. With --debug anywhere on the
-command line, a failure also shows its traceback."""
+A first try: imgcal calibrate sample:O10 --rig O10 --object asymmetric8 --out result
+
+imgcal COMMAND --help describes a command, imgcal --version prints the version. Exit codes: 0 done, 2 unusable input (or
+an internal error), 3 refused (the data cannot decide), 130 interrupted. With --debug anywhere on the command line, a
+failure also shows its traceback."""
 
 
 class Runnable(Protocol):
@@ -103,6 +109,8 @@ def _parse(arguments: list[str]) -> Runnable:
         raise SystemExit(DONE)
     if first in COMMANDS:
         options = _objects_last(first, arguments[1:])
+        if {"-h", "--help"} & {*options}:
+            _join_help_lines()
         given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=options)
         _check_values(given, options)
         with end_at_once():  # imports take a while
@@ -154,6 +162,19 @@ def _check_values(given: Any, arguments: list[str]) -> None:
 def _arguments(name: str) -> Any:
     with end_at_once():
         return getattr(import_module("imgcal.cli.arguments"), name.capitalize())
+
+
+def _join_help_lines() -> None:
+    """Give tyro the help of every option on one line: it would keep the line breaks of a docstring in the source."""
+    kinds = import_module("imgcal.cli.arguments")
+    for node in ast.parse(inspect.getsource(kinds)).body:
+        if not isinstance(node, ast.ClassDef):
+            continue
+        options = {option.name: option for option in fields(getattr(kinds, node.name))}
+        for entry, after in pairwise(node.body):
+            match entry, after:
+                case ast.AnnAssign(target=ast.Name(name)), ast.Expr(ast.Constant(str(words))):
+                    options[name].metadata = MappingProxyType({"help": " ".join(words.split())})
 
 
 def _summary(name: str) -> Any:

@@ -46,24 +46,20 @@ def test_captures_that_are_done_are_not_done_again(tmp_path, capsys, monkeypatch
     assert not (out / ".work").exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_beside_worker_processes_ends_it_with_one_line(number):
+def test_sigterm_beside_worker_processes_is_one_line():
     pytest.importorskip("ray", reason="no ray (extra fleet)")
     command = [sys.executable, "-m", "imgcal", "compare", "points-O10-cube8", "vit-O10-cube8", "--cores", "2"]
     environment = os.environ | {"PYTHONPATH": str(Path.cwd())}
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )  # fmt: skip
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     assert process.stderr is not None
     started = next(line for line in process.stderr if not line.startswith("imgcal: compiling"))
     expected = "evaluating points-O10-cube8, vit-O10-cube8, "
     assert started.startswith(expected) and started.endswith("on 3 trials of 20,000 random rigs (--trials, --count)\n")
-    process.send_signal(number)
+    process.send_signal(signal.SIGTERM)
     printed, error = process.communicate(timeout=120)
     said = [line for line in error.splitlines() if not line.startswith("imgcal: compiling")]
     assert (process.returncode, printed) == (130, "")
-    assert said == ["imgcal: terminated" if number == signal.SIGTERM else "imgcal: interrupted"]
+    assert said == ["imgcal: terminated"]
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,7 @@ def test_an_interruption_during_start_up_is_one_line(slow, arguments, tmp_path):
         (["calibrate", "x", "--object", "cube8", "--cameras=c.yaml"], "missing --out; see imgcal calibrate --help"),
         (["export", "m", "--out", "m.onnx", "--to", "onx"],
          "--to: found onx, expected onnx or pt2; did you mean onnx?; see imgcal export --help"),
-        (["describe", "me"], "WHAT: found me, expected experiments; see imgcal describe --help"),
+        (["describe", "me"], "what: found me, expected experiments; see imgcal describe --help"),
         (["rig"], "expected look-at or cameras after `imgcal rig`; see imgcal rig --help"),
         (["simulate", "--rig", "T4", "--object", "cube8", "--out", "o", "--phi-deg", "9"],
          "--phi-deg: found too few values, expected 2; see imgcal simulate --help"),
