@@ -58,9 +58,7 @@ def parse_range(text: str | None) -> tuple[int, int | None]:
         return 0, None
     match = re.fullmatch(r"(\d{0,18}):(\d{0,18})", text)
     if not match:
-        raise InputError(
-            f"--snapshots: found {shorten(text)!r}, expected A:B, numbers in file order from 0, B excluded"
-        )
+        raise InputError(f"--snapshots: found {shorten(text)!r}, expected A:B, numbers in file order from 0, without B")
     first, last = int(match[1] or 0), int(match[2]) if match[2] else None
     if last is not None and last <= first:
         raise InputError(f"--snapshots: found the empty range {text!r}, expected A < B")

@@ -61,16 +61,16 @@ class Compare(arguments.Compare):
         """
         unread: list[tuple[arguments.Setting | Compare | arguments.Captures, str]]
         if self.captured.captures:
-            how, meant = "with", "networks are compared on points"
+            how, meant = "with", "networks on points"
             unread = [(self.setting, name) for name in vars(self.setting) if name not in OF_BOTH]
             unread.append((self, "baselines"))
         else:
-            how, meant = "without", "detectors are compared on captured frames"
+            how, meant = "without", "detectors on captured frames"
             unread = [(self.captured, name) for name in vars(self.captured)]
         for options, name in unread:
             if getattr(options, name) != getattr(type(options), name):
                 option = name.replace("_", "-")
-                raise InputError(f"--{option}: found it {how} --captures, expected it where {meant}")
+                raise InputError(f"--{option}: cannot be used {how} --captures; it is for comparing {meant}")
 
 
 def compare_captures(

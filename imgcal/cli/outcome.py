@@ -73,7 +73,7 @@ class Findings:
         """What is printed."""
         lines = [self.motion.sentence] if self.motion.sentence and not self.from_scratch else []
         if self.knowledge.sentences:
-            lines.append("not known: " + " ".join(self.knowledge.sentences))
+            lines.append(" ".join(self.knowledge.sentences))
         if self.untimed:
             which = "all cameras" if len(self.untimed) == len(self.knowledge.camera_names) else list_names(self.untimed)
             lines.append(

@@ -132,7 +132,7 @@ def rig_from_model(
         FormatError: neither is there, or the cameras were not fixed to each other.
     """
     known = {camera.id: camera for camera in cameras}
-    notes = ["COLMAP's pixels begin half a pixel earlier: cx and cy are 0.5 less here"]
+    notes = ["COLMAP's pixels begin half a pixel earlier: cx and cy are smaller by 0.5 here"]
     together = [rig for rig in rigs if len(rig.sensors) > 1]
     if together:
         chosen = together[chosen_rig(_rig_names(together, images), wanted)]
@@ -265,8 +265,8 @@ def _check_steady(frames: dict[str, dict[str, ColmapImage]], first: dict[str, Co
             moved = float(np.linalg.norm(now[1] - then[1]))
             if turned > ROTATION_STEADY or moved > PLACE_STEADY * size:
                 raise FormatError(
-                    f"found no rigs.txt, and camera {camera} stands otherwise to {root} in {frame!r}: the cameras are "
-                    "not fixed to each other, or the model was made without a rig (see COLMAP's rig_configurator)"
+                    f"found no rigs.txt, and camera {camera} has another pose relative to {root} in {frame!r}: the "
+                    "cameras are not fixed to each other, or the model was made without a rig (see COLMAP's rig_configurator)"
                 )
 
 

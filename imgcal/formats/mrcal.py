@@ -46,9 +46,9 @@ def _read(source: Source) -> ForeignRig:
     cameras = [_camera(document.path, values) for document, values in source.mappings if _is_model(values)]
     notes = []
     if len(cameras) > 1 and not any(camera.translation.any() for camera in cameras):
-        raise FormatError("all cameras stand at the origin of their reference: extrinsics were never calibrated")
+        raise FormatError("all cameras are at the origin of their reference: extrinsics were never calibrated")
     if len(cameras) == 1:
-        notes.append("one camera; the others of its set are files of their own: give all, or their folder")
+        notes.append("this is one camera; the others are in files of their own: give all, or their folder")
     return ForeignRig(FORMAT.name, tuple(cameras), None, "mrcal's reference frame", tuple(notes))
 
 

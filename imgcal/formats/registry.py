@@ -146,7 +146,7 @@ def _check_requested(source: Source, one: Format) -> Format:
             return one
     except FormatError as error:
         raise InputError(f"{source.where}: {error}") from error
-    raise InputError(f"{source.where}: this is no {one.title}: {_other(source) or _instead(source)}")
+    raise InputError(f"{source.where}: this is not a {one.title}: {_other(source) or _instead(source)}")
 
 
 def _other(source: Source) -> str:

@@ -59,7 +59,7 @@ def _read(source: Source) -> ForeignRig:
     if lost:
         notes.append(f"{name_cameras(lost)}: left out, without a KeyFrame")
     if several:
-        notes.append(f"{name_cameras(several)}: moves (several KeyFrames); the first is taken")
+        notes.append(f"{name_cameras(several)}: moves (several KeyFrames); the first is used")
     return ForeignRig(FORMAT.name, tuple(cameras), "mm", "Vicon's world", tuple(notes))
 
 

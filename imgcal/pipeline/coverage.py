@@ -62,8 +62,8 @@ class Coverage:
             for name, cameras in self.undetermined.items():
                 by_cameras.setdefault(cameras, []).append(name)
             parts = [f"{', '.join(names)} in {_cameras(cameras, count)}" for cameras, names in by_cameras.items()]
-            stands = "what was assumed stands" if self.from_scratch else "the factory's values stand"
-            words.append(f"Not determined by these data, {stands}: {'; '.join(parts)}.")
+            kept = "assumed" if self.from_scratch else "factory"
+            words.append(f"Not determined by these data ({kept} values kept): {'; '.join(parts)}.")
         low, high = (round(100 * f(self.coverage)) for f in (min, max))
         if low < 100 * LITTLE:
             share = f"{low}" if low == high else f"{low} to {high}"

@@ -106,7 +106,7 @@ def calibrate_from_scratch(
         True
     """
     if distance is not None and obj.pose_rank > 3:
-        raise InputError("distance: found an object of known size, expected unknown markers, which know no scale")
+        raise InputError("distance: found an object of known size, which sets the scale; expected unknown markers")
     if obj.parts:
         obj.require_rigid("to calibrate without a factory calibration")
     started, cameras, options = time.perf_counter(), _set_prior(cameras), options.of_object(obj)

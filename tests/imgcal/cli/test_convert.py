@@ -92,7 +92,7 @@ def test_nothing_is_guessed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     [
         (["--out", "x.toml"], "--to: cannot tell the format from x.toml"),
         (["--out", "x.yaml", "--to", "calibr"], "found the format 'calibr'"),
-        (["--out", "x.yaml", "--to", "motive"], "is only read"),
+        (["--out", "x.yaml", "--to", "motive"], "can only be read"),
         (["--out", "x.yaml", "--unit", "m"], "in mm, expected neither"),
         (["--out", "x.yaml", "--image-size", "12"], "--image-size: found '12'"),
         (["--out", "x.yaml", "--image-size", "cam01=1x1"], "--image-size says 1x1"),

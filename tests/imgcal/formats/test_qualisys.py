@@ -60,7 +60,7 @@ def test_theia_s_variant_has_plain_pixels(tmp_path: Path) -> None:
 
 
 def test_it_is_only_read(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="Qualisys calibration is only read"):
+    with pytest.raises(InputError, match="Qualisys calibration can only be read"):
         convert_rig(rig_of(brown(), brown()), "qualisys", "x")
     with pytest.raises(InputError, match="this is a Qualisys calibration: 17: no focalLengthU"):
         read(tmp_path, camera().replace("focalLengthU", "x"))
