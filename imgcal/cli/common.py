@@ -26,7 +26,7 @@ from imgcal.errors import InputError
 from imgcal.formats import find_format, is_foreign, load_rig, read_foreign_rig
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import Capture, Frame
-from imgcal.messages import list_names, plural, shorten
+from imgcal.messages import list_names, plural, shorten, with_article
 from imgcal.pipeline import LearnedMeasurer, detect_capture
 from imgcal.types import Board, CameraRig, Detections
 
@@ -46,7 +46,7 @@ def open_rig(given: str) -> CameraRig:
     if rig.num_cameras == 1 and path.exists() and is_foreign(path):
         title = find_format(read_foreign_rig(path).format).title
         raise InputError(
-            f"{given}: this is a {title} of one camera, without its pose in the rig; give the folder "
+            f"{given}: this is {with_article(title)} of one camera, without its pose in the rig; give the folder "
             f"of all files, or make a rig from this one camera: imgcal convert {given} --out rig.yaml"
         )
     return rig

@@ -25,7 +25,7 @@ from imgcal.formats import (
     write_into,
 )
 from imgcal.io import load_rig_covariance, publishing, read_rig, write_bytes
-from imgcal.messages import list_names, plural, shorten
+from imgcal.messages import list_names, plural, shorten, with_article
 
 
 class Convert(arguments.Convert):
@@ -45,9 +45,8 @@ class Convert(arguments.Convert):
         for note in made.notes:
             print(f"note: {note}")
         if self.to is None and (named := _format_named(self.out.stem)):
-            print(
-                f"note: --out ends in .yaml, so an imgcal rig file is written; --to {named.name} writes a {named.title}"
-            )
+            other = f"--to {named.name} writes {with_article(named.title)}"
+            print(f"note: --out ends in {self.out.suffix}, so an imgcal rig file is written; {other}")
         written = self._write(made.files)
         models = f"{made.between_models:.2g} px" if made.between_models > 1e-6 else "the same"
         print(

@@ -266,7 +266,8 @@ def _check_steady(frames: dict[str, dict[str, ColmapImage]], first: dict[str, Co
             if turned > ROTATION_STEADY or moved > PLACE_STEADY * size:
                 raise FormatError(
                     f"found no rigs.txt, and camera {camera} has another pose relative to {root} in {frame!r}: the "
-                    "cameras are not fixed to each other, or the model was made without a rig (see COLMAP's rig_configurator)"
+                    "cameras are not fixed to each other, or the model was made without a rig (see COLMAP's "
+                    "rig_configurator)"
                 )
 
 

@@ -150,10 +150,8 @@ def fit_to_target(rig: ForeignRig, holds: Holds, title: str, limit: float = LIMI
         assert camera.image_size is not None
         fit = fit_lens(camera.lens, camera.image_size, holds)
         if not fit.worst <= limit:
-            off = f"by {fit.worst:.3g} px" if np.isfinite(fit.worst) else "by any amount in a part of the image"
             raise RefusedError(
-                f"camera {camera.name}: {title} cannot express its lens ({describe_lens(camera.lens)}): the "
-                f"nearest lens is off {off}, more than the limit of {limit:g} px",
+                lens_refusal(camera, fit, title, "the nearest lens", limit),
                 command="--fit-limit allows more",
                 python="`fit_limit` allows more",
             )
@@ -166,8 +164,8 @@ def lens_refusal(camera: ForeignCamera, fit: Fit, title: str, nearest: str, limi
     """Explain that no lens of the target comes near enough; `nearest` names the one that comes nearest."""
     off = f"by {fit.worst:.3g} px" if np.isfinite(fit.worst) else "by any amount in a part of the image"
     return (
-        f"camera {camera.name}: {title} cannot express its lens ({describe_lens(camera.lens)}): {nearest} is off {off}, "
-        f"more than the limit of {limit:g} px"
+        f"camera {camera.name}: {title} cannot express its lens ({describe_lens(camera.lens)}): {nearest} is "
+        f"off {off}, more than the limit of {limit:g} px"
     )
 
 

@@ -30,6 +30,7 @@ from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
 from imgcal.formats.format import Files, Format
 from imgcal.formats.source import Source
 from imgcal.io import is_file_name
+from imgcal.messages import with_article
 from imgcal.types import limits
 
 FORMATS = (  # asked in this order: who knows a file by more comes before who knows it by less
@@ -146,7 +147,7 @@ def _check_requested(source: Source, one: Format) -> Format:
             return one
     except FormatError as error:
         raise InputError(f"{source.where}: {error}") from error
-    raise InputError(f"{source.where}: this is not a {one.title}: {_other(source) or _instead(source)}")
+    raise InputError(f"{source.where}: this is not {with_article(one.title)}: {_other(source) or _instead(source)}")
 
 
 def _other(source: Source) -> str:
@@ -155,7 +156,7 @@ def _other(source: Source) -> str:
         found = recognize_format(source)
     except InputError:
         return ""
-    return f"it is a {found.title} ({found.name})"
+    return f"it is {with_article(found.title)} ({found.name})"
 
 
 def is_foreign(path: Path) -> bool:
@@ -200,7 +201,7 @@ def _read(source: Source, one: Format) -> ForeignRig:
     try:
         rig = one.read(source)
     except FormatError as error:
-        raise InputError(f"{source.where}: this is a {one.title}: {error}") from error
+        raise InputError(f"{source.where}: this is {with_article(one.title)}: {error}") from error
     if len(rig.cameras) > limits.MOST_CAMERAS:
         raise InputError(f"{source.where}: found {len(rig.cameras)} cameras, expected at most {limits.MOST_CAMERAS}")
     return _make_names_sound(replace(rig, format=one.name))

@@ -19,6 +19,7 @@ from imgcal.formats.registry import find_format, is_foreign, read_back, read_for
 from imgcal.formats.source import SUFFIXES, Source
 from imgcal.formats.values import name_cameras
 from imgcal.io import read_bytes
+from imgcal.messages import with_article
 
 DIGITS = (0, 9, 12, 17)  # tried in this order: those of the file first
 ROUNDING = 1e-3  # px that the digits of a file may cost: a hundredth of how well markers are measured
