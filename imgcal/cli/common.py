@@ -174,14 +174,15 @@ def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
 
 
 def _count_by_lines(what: str, total: int) -> Callable[[int], None]:
-    """Make a function that counts what is done, and says so at most once in `EVERY` seconds."""
-    count, said = 0, time.monotonic()
+    """Make a function that counts what is done, and prints the count at most once in `EVERY` seconds."""
+    count, printed = 0, math.inf
 
     def advance(done: int) -> None:
-        nonlocal count, said
-        count += done
-        if count < total and time.monotonic() - said > EVERY:
-            said = time.monotonic()
+        nonlocal count, printed
+        now = time.monotonic()
+        count, printed = count + done, min(printed, now)
+        if count < total and now - printed > EVERY:
+            printed = now
             print(f"{what}: {count:,} of {total:,}", file=sys.stderr, flush=True)
 
     return advance
