@@ -234,7 +234,7 @@ class Watch:
     tolerance: float = Timing.tolerance  #: s, largest difference of time stamps within a snapshot
     patience: float = Timing.patience  #: s to wait for a missing camera
     keep_all: bool = False  #: never drop snapshots that come too fast: for recordings that are played live
-    rate: float | None = None  #: snapshots per second of a table of blobs (30)
+    rate: float | None = None  #: snapshots per second of a table of blobs; default: 30
     topic: tuple[str, ...] = ()  #: CAMERA=TOPIC, for a recording whose topics do not name the cameras
     videos_differ: bool = False  #: accept videos whose lengths or time stamps differ; match frames by time
     until_idle: float | None = None  #: s without a new frame in the folder after which to end
@@ -336,7 +336,7 @@ class Convert:
     image_size: tuple[str, ...] = ()
     """WIDTHxHEIGHT of all cameras, or NAME=WIDTHxHEIGHT of one, if SOURCE does not state it"""
     cameras: tuple[str, ...] = ()
-    """cameras to keep, in the order to write them (default: all)"""
+    """cameras to keep, in the order to write them; default: all"""
     out_unit: str | None = None
     """unit to write, if the format leaves it open; with --into, the unit of that file"""
     hold_distortion: bool = False

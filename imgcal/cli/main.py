@@ -44,7 +44,7 @@ COMMANDS = (
 """Each has a class of its name, among the arguments and in the module of its name."""
 DESCRIPTION = """Recalibrate infrared multi-camera rigs from images of a known calibration object.
 
-A first try: imgcal calibrate sample:O10 --rig O10 --object asymmetric8 --out result
+A first try: imgcal calibrate sample:O10 --rig sample:O10 --object sample:O10 --out result
 
 imgcal COMMAND --help describes a command, imgcal --version prints the version. Exit codes: 0 done, 2 unusable input (or
 an internal error), 3 refused (the data cannot decide), 130 interrupted. With --debug anywhere on the command line, a
