@@ -213,7 +213,7 @@ def _shorten(problem: str, arguments: list[str]) -> str:
         words, near = unknown[1].split(", "), re.search(r"--[\w.-]+", unknown[2] or "")
         options = [word for word in words if word.startswith("-")]
         if not options:
-            return f"found {quote(' '.join(words))!r}, expected no more than was given before it"
+            return f"unexpected argument `{quote(' '.join(words))}`"
         option = options[0].split()[0]
         close = [near[0]] if near else difflib.get_close_matches(option.partition("=")[0], list_options(command), 1)
         return f"unknown option `{shorten(option)}`" + (f"; did you mean `{close[0]}`?" if close else "")
@@ -272,7 +272,7 @@ def _verdict(error: BaseException, given: list[str]) -> tuple[int, str]:
     ours = [frame for frame in traceback.extract_tb(error.__traceback__) if "imgcal" in Path(frame.filename).parts]
     place = f" ({Path(ours[-1].filename).name}:{ours[-1].lineno})" if ours else ""
     what = quote(f"{type(error).__name__}: {error}")
-    return UNUSABLE, f"internal error{place}: {what}; this input found a fault of imgcal, {DEBUG} shows where"
+    return UNUSABLE, f"internal error{place}: {what}; this is a fault of imgcal; {DEBUG} shows where"
 
 
 def run() -> None:

@@ -124,8 +124,8 @@ def doubtful_cameras(calibration: Calibration) -> list[str]:
     doubtful = np.flatnonzero(unexplained > DOUBTFUL * np.maximum(kept + unexplained, 1))
     stopped = [str(camera) for camera in calibration.doubtful]
     return [f"{late}; these took no part" for late in calibration.late] or stopped + [
-        f"camera {calibration.rig.camera_names[c]}: {unexplained[c]} blobs may be fiducials and are not where these "
-        f"should be, {kept[c]} are"
+        f"camera {calibration.rig.camera_names[c]}: {unexplained[c]} blobs may be fiducials but are not where "
+        f"fiducials should be; {kept[c]} are"
         for c in doubtful
     ]
 

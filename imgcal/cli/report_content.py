@@ -131,7 +131,7 @@ def _about_object(calibration: Calibration) -> str:
     if calibration.displaced:
         parts = [f"fiducial {d.fiducial} is {d.distance:.3g} ± {d.sigma:.1g} mm off" for d in calibration.displaced]
         words.append(
-            f"The object is not quite what its file says: {', '.join(parts)}. It was estimated with the rig; "
+            f"The object differs from its file: {', '.join(parts)}. It was estimated with the rig; "
             "object.csv beside this page holds it."
         )
     if calibration.lost:

@@ -151,7 +151,7 @@ class Watch(arguments.Watch):
             stopped = stack.enter_context(_stopping())
             stack.enter_context(display.show_tally(loop.tally))
             if restored or anew:
-                how = "started again from what was known" if restored else "begun anew with the factory calibration"
+                how = "resumed from the saved state" if restored else "started anew from the factory calibration"
                 loop.publish_event(Event(time.time(), 0, "restart", message=how))
             loop.run(intake, stopped, display.draw)
         tally = loop.tally
@@ -294,7 +294,7 @@ def _object_difference(obj: CalibrationObject, known: CalibrationObject) -> str 
 def _nothing(tally: Tally, intake: SourceReader) -> str:
     """Say why nothing was learnt."""
     if tally.latest is not None:
-        return f"watch: no snapshot taught anything: {tally.latest.refused}"
+        return f"watch: nothing could be learned from any snapshot: {tally.latest.refused}"
     if intake.reasons:
         return f"watch: no snapshot came: {intake.reasons[-1]}"
     return "watch: no snapshot came"

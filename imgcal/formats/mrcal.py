@@ -29,9 +29,9 @@ from imgcal.formats.values import (
 TITLE = "mrcal cameramodel"
 COUNTS = {"PINHOLE": 0, "NONE": 0, "OPENCV4": 4, "OPENCV5": 5, "OPENCV8": 8, "OPENCV12": 12}
 REASONS = {
-    "SPLINED": "a splined lens, which no other tool can say",
-    "CAHVOR": "a CAHVOR lens, which no other format here can say",
-    "STEREOGRAPHIC": "a stereographic projection, not a lens that others can say",
+    "SPLINED": "a splined lens, which no other format here can express",
+    "CAHVOR": "a CAHVOR lens, which no other format here can express",
+    "STEREOGRAPHIC": "a stereographic projection, which no other format here can express",
     "LONLAT": "a panorama (longitude, latitude), not a lens", "LATLON": "a panorama (latitude, longitude), not a lens",
 }  # fmt: skip
 

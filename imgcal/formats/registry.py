@@ -175,12 +175,13 @@ def _instead(source: Source) -> str:
     values = merge_storages(source)
     if is_matrix(values.get("camera_matrix")) or is_matrix(values.get("cameraMatrix")) or is_matrix(values.get("K")):
         return (
-            "this is an OpenCV calibration of one camera: extrinsics in it are those of its boards; a rig needs where "
-            "its cameras stand to each other"
+            "this is an OpenCV calibration of one camera: its extrinsics are those of the boards, and a rig needs the "
+            "poses of its cameras"
         )
     if {"R", "T"} <= values.keys() and is_matrix(values["R"]):
         return (
-            "this is an OpenCV file of extrinsics alone: give the file with M1, D1, M2, D2, too, or the folder of both"
+            "this is an OpenCV file with only extrinsics: give the file with M1, D1, M2, D2 as well, or the folder of "
+            "both"
         )
     if isinstance(values.get("frames"), list) and ("transform_matrix" in str(values["frames"][:1])):
         return "this is a transforms.json of nerfstudio: convert its COLMAP model instead"

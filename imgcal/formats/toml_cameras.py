@@ -283,7 +283,7 @@ def _read_freemocap(source: Source) -> ForeignRig:
         notes.append("the world is the board that lay on the ground")
     frame = "the board on the ground" if plane else "the file's world (near the first camera, or the board)"
     if any(camera.lens.length == 5 for camera in cameras):
-        notes.append("FreeMoCap itself drops k3 when it reads this file; here it counts")
+        notes.append("FreeMoCap itself drops k3 when it reads this file; imgcal uses it")
     return ForeignRig(FREEMOCAP.name, cameras, "mm", frame, tuple(notes))
 
 

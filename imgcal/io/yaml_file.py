@@ -36,7 +36,7 @@ DECIMAL = re.compile(r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))([eE][-+]?[0
 MERGE = object()  # stands for the key `<<`
 Mark = Any  # of PyYAML: where in the text
 INSTEAD = {
-    ("imgcal-rig/1", "imgcal-cameras/1"): ": these cameras have no places yet; imgcal calibrate finds them where the "
+    ("imgcal-rig/1", "imgcal-cameras/1"): ": these cameras have no poses yet; imgcal calibrate finds them if the "
     "file is given as --cameras instead of --rig (in Python: load_cameras, calibrate_from_scratch)",
 }
 """What to do with a file of another format (the second) than the one that was expected."""

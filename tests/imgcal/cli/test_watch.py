@@ -134,7 +134,7 @@ def test_a_killed_process_goes_on_and_ctrl_c_ends_it_cleanly(blobs, tmp_path):
     assert process.returncode == 130
     (line,) = [text for text in complaint.splitlines() if "compiling" not in text]
     assert line.startswith("imgcal: interrupted after ") and line.endswith("the same command resumes from there")
-    assert [event["event"] for event in events(out)].count("restart") == 1 and "restart: started again" in said
+    assert [event["event"] for event in events(out)].count("restart") == 1 and "restart: resumed" in said
     assert read_rig(out / "rig.yaml").num_cameras == 4
 
 
@@ -352,8 +352,8 @@ def test_fresh_leaves_nothing_to_go_on_from_even_before_it_has_learnt(blobs, tmp
     assert not (out / "state.json").exists() and not (out / "rig.yaml").exists()
     (put_aside,) = set(out.glob("history/*/*.yaml")) - kept
     assert put_aside.read_bytes() == known
-    assert [event["message"] for event in events(out)] == ["begun anew with the factory calibration"]
-    assert "restart: begun anew with the factory calibration" in capsys.readouterr().out
+    assert [event["message"] for event in events(out)] == ["started anew from the factory calibration"]
+    assert "restart: started anew from the factory calibration" in capsys.readouterr().out
     assert watch(tmp_path / "blobs.csv", out) == 0
     assert "4 snapshots" in capsys.readouterr().out  # all of them, once more
 

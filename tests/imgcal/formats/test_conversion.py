@@ -47,7 +47,7 @@ def test_image_sizes_are_asked_for_by_name() -> None:
         InputError, match=r"cameras side0, side1: the file does not state the size of the images.*side0=1280x720"
     ):
         fill_image_sizes(unknown, "file", {})
-    with pytest.raises(InputError, match="camera side1: the size"):
+    with pytest.raises(InputError, match="camera side1: the file does not state the size"):
         fill_image_sizes(unknown, "file", {"side0": (640, 480)})
     found = fill_image_sizes(unknown, "file", {"": (1280, 960), "side1": (640, 480)})
     assert [camera.image_size for camera in found.cameras] == [(1280, 960), (640, 480)]

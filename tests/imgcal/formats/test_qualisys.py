@@ -47,7 +47,7 @@ def test_the_sensor_s_numbers(tmp_path: Path) -> None:
     assert np.allclose(one.in_camera(ahead[None]), [[0, 0, 500.0]])
     assert one.in_camera((ahead + AXES[1])[None])[0, 1] < 0
     said = " ".join(rig.notes)
-    assert "camera 18: mounted turned" in said
+    assert "camera 18: mounted rotated" in said
     assert "camera 19: left out" in said
     assert "half a pixel" in said
 
