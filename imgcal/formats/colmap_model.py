@@ -228,8 +228,8 @@ def _convert_images(
         frames[frame][camera] = image
     if len(folders) == 1 and len({image.camera for image in images}) == 1 and len(images) > 2:
         notes.append(
-            f"found no rigs.txt, and {len(images)} images with one set of intrinsics: treated as that many cameras at one "
-            "moment, which is wrong if one camera moved"
+            f"found no rigs.txt, and {len(images)} images with one set of intrinsics: treated as that many cameras at "
+            "one moment, which is wrong if one camera moved"
         )
     first = max(frames.values(), key=len)
     frame = next(key for key, value in frames.items() if value is first)
