@@ -20,6 +20,16 @@ def quote(text: str) -> str:
     return text if len(text) <= MOST_QUOTED else text[: MOST_QUOTED - 3] + "..."
 
 
+def plural(count: int, noun: str) -> str:
+    """Write a count with its noun: `1 camera`, `1,200 cameras`."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def with_article(noun: str) -> str:
+    """Put the indefinite article before a noun: `a camera`, `an object`."""
+    return f"{'an' if noun[:1].lower() in 'aeio' else 'a'} {noun}"
+
+
 def list_names(names: Iterable[str]) -> str:
     """Join names by commas; a long list shows only the first few and the total."""
     whole = list(names)

@@ -28,7 +28,16 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
 WORK = ROOT / "out" / "work"
 """Progress of campaigns that can be resumed."""
+COLOURS = 128
+"""Of a screenshot."""
 BLUE, RED, GREEN, GREY = "#1f5fa8", "#c43c2f", "#2e8b57", "#777777"
+
+
+def save_picture(screenshot: bytes, path: Path) -> None:
+    """Save the screenshot of a page as a small PNG: its colours are few."""
+    packed, picture = io.BytesIO(), Image.open(io.BytesIO(screenshot)).convert("RGB")
+    picture.quantize(COLOURS, dither=Image.Dither.NONE).save(packed, "png", optimize=True)
+    write_bytes(path, packed.getvalue())
 
 
 def machine(device: str = "cpu") -> str:

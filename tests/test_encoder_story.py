@@ -60,7 +60,7 @@ def _others_that_load_it(capsys):
     assert main(["calibrate", blobs, *known, "--first-guess", "out/mine"]) == 2
     assert "--trust mine:Encoder" in capsys.readouterr().err
     assert main(["calibrate", blobs, *known, "--trust", "mine:Encoder"]) == 2
-    assert "--trust: found mine:Encoder, expected --first-guess with it" in capsys.readouterr().err
+    assert "--trust: found mine:Encoder without --first-guess" in capsys.readouterr().err
     assert main(["calibrate", blobs, *known, "--first-guess", "out/mine", "--trust", "mine"]) == 2
     assert "expected a class as package.module:Class" in capsys.readouterr().err
     assert main(["calibrate", blobs, *known, "--first-guess", "out/mine", "--trust", "mine:Encoder"]) in (0, 3)

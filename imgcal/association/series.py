@@ -16,7 +16,7 @@ from imgcal.association.tracker import SnapshotIdentity, Tracker, to_observation
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import ON_A_LINE
 from imgcal.geometry import RigidTransform
-from imgcal.messages import list_names
+from imgcal.messages import list_names, plural
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 
 NOT_TRIED = "not tried: nothing could be decided in many snapshots before"
@@ -282,7 +282,7 @@ def _why(snapshots: Sequence[SnapshotIdentity]) -> str:
         return "found no snapshot"
     reasons = Counter(snapshot.reason for snapshot in snapshots if snapshot.reason != NOT_TRIED)
     reason, times = reasons.most_common(1)[0]
-    tried = f"{reasons.total()} snapshots" + (
+    tried = plural(reasons.total(), "snapshot") + (
         f" tried, {len(snapshots)} in all" if reasons.total() < len(snapshots) else ""
     )
     return f"{reason} ({times} of {tried})"

@@ -50,7 +50,7 @@ def associate_several(
         InputError: the options give a pose of the first snapshot, but not of which object.
     """
     if options.start_pose is not None:
-        raise InputError("start pose: found one beside several objects, expected a single object with it")
+        raise InputError("start pose: found several objects, expected a single one")
     options = replace(options, identity=replace(options.identity, others_in_view=True))
     learnt = LearntRig(rig, obj, options, MOST_REMEMBERED * len(obj.parts))
     first = np.searchsorted(obj.part_of, np.arange(len(obj.parts)))

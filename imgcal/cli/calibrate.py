@@ -85,7 +85,7 @@ class Calibrate(arguments.Calibrate):
         measurer = None if self.measurer is None else LearnedMeasurer.load(self.measurer)
         detector = self._detector(source, measurer)
         if self.trust and self.first_guess == "none":
-            raise InputError(f"--trust: found {shorten(self.trust[0])}, expected --first-guess with it")
+            raise InputError(f"--trust: found {shorten(self.trust[0])} without --first-guess, which it is for")
         named, trusted = self.first_guess, self.trust
         initializer = None if named == "none" else load_initializer(named, rig, obj, trusted=trusted)
         loaded = time.perf_counter()
@@ -184,8 +184,9 @@ class Calibrate(arguments.Calibrate):
     def _rig(self) -> CameraRig:
         """What is known of the cameras."""
         if (self.rig is None) == (self.cameras is None):
-            found = "neither" if self.rig is None else "both"
-            raise InputError(f"found {found} of --rig and --cameras, expected one: a factory calibration, or none")
+            if self.rig is None:
+                raise InputError("missing --rig (a factory calibration) or --cameras (to calibrate without one)")
+            raise InputError("found both --rig and --cameras, expected one: with or without a factory calibration")
         if self.rig is not None:
             if self.distance is not None:
                 raise InputError("--distance: cannot be used with --rig, whose cameras give the scale; use --cameras")

@@ -7,6 +7,7 @@ import math
 import os
 import re
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -25,11 +26,12 @@ from imgcal.errors import InputError
 from imgcal.formats import find_format, is_foreign, load_rig, read_foreign_rig
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import Capture, Frame
-from imgcal.messages import list_names, shorten
+from imgcal.messages import list_names, plural, shorten, with_article
 from imgcal.pipeline import LearnedMeasurer, detect_capture
 from imgcal.types import Board, CameraRig, Detections
 
 Item = TypeVar("Item")
+EVERY = 60.0  # s between lines on progress without a terminal
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # as glibc's malloc.h numbers them
 KEPT, LARGEST = 256 << 20, 32 << 20  # bytes: that are free and kept, and of an array that is
 
@@ -44,7 +46,7 @@ def open_rig(given: str) -> CameraRig:
     if rig.num_cameras == 1 and path.exists() and is_foreign(path):
         title = find_format(read_foreign_rig(path).format).title
         raise InputError(
-            f"{given}: this is a {title} of one camera, without its pose in the rig; give the folder "
+            f"{given}: this is {with_article(title)} of one camera, without its pose in the rig; give the folder "
             f"of all files, or make a rig from this one camera: imgcal convert {given} --out rig.yaml"
         )
     return rig
@@ -56,9 +58,7 @@ def parse_range(text: str | None) -> tuple[int, int | None]:
         return 0, None
     match = re.fullmatch(r"(\d{0,18}):(\d{0,18})", text)
     if not match:
-        raise InputError(
-            f"--snapshots: found {shorten(text)!r}, expected A:B, numbers in file order from 0, B excluded"
-        )
+        raise InputError(f"--snapshots: found {shorten(text)!r}, expected A:B, numbers in file order from 0, without B")
     first, last = int(match[1] or 0), int(match[2]) if match[2] else None
     if last is not None and last <= first:
         raise InputError(f"--snapshots: found the empty range {text!r}, expected A < B")
@@ -90,7 +90,9 @@ def read_detections(
     first, last = parse_range(snapshots)
     count = len(source.snapshot_names)
     if first >= count:
-        raise InputError(f"--snapshots: found {snapshots}, expected a range within the {count} snapshots of the input")
+        raise InputError(
+            f"--snapshots: found {snapshots}, expected a range within the {plural(count, 'snapshot')} of the input"
+        )
     if isinstance(source, Detections):
         if measurer is not None:
             raise InputError(f"--measurer {measurer.name}: found blobs without frames, expected a capture with frames")
@@ -152,15 +154,38 @@ def check_folder(path: Path) -> None:
 
 @contextmanager
 def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar on standard error, if that is a terminal; yields a function to call with each advance."""
+    """Show progress on standard error: a bar on a terminal, a line a minute elsewhere.
+
+    Args:
+        what: that is done.
+        total: number of items.
+
+    Yields:
+        A function to call with the number of items that have been done since the last call.
+    """
     console = Console(file=sys.stderr)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     if not console.is_terminal:  # some versions of rich write a line even where it is disabled
-        yield lambda done: None
+        yield _count_by_lines(what, total)
         return
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda done: bar.advance(task, done)
+
+
+def _count_by_lines(what: str, total: int) -> Callable[[int], None]:
+    """Make a function that counts what is done, and prints the count at most once in `EVERY` seconds."""
+    count, printed = 0, math.inf
+
+    def advance(done: int) -> None:
+        nonlocal count, printed
+        now = time.monotonic()
+        count, printed = count + done, min(printed, now)
+        if count < total and now - printed > EVERY:
+            printed = now
+            print(f"{what}: {count:,} of {total:,}", file=sys.stderr, flush=True)
+
+    return advance
 
 
 def keep_memory() -> bool:

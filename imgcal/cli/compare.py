@@ -18,6 +18,7 @@ from imgcal.cli.evaluate import WORK, evaluate_models, open_workers
 from imgcal.errors import InputError
 from imgcal.fleet import StoredResults
 from imgcal.io import load_object, nearest, object_text, publishing, rig_text, write_text
+from imgcal.messages import plural
 
 if TYPE_CHECKING:
     from imgcal.evaluation import Contender, Scene
@@ -49,7 +50,7 @@ class Compare(arguments.Compare):
                 "captured frames: --captures 20 simulates 20 at every difficulty"
             )
         if len(self.models) < 2:
-            raise InputError(f"compare: found {len(self.models)} models, expected two or more")
+            raise InputError(f"compare: found {plural(len(self.models), 'model')}, expected two or more")
         evaluate_models(self.models, self.setting, self.baselines, self.out)
 
     def _check_options(self) -> None:
@@ -60,16 +61,16 @@ class Compare(arguments.Compare):
         """
         unread: list[tuple[arguments.Setting | Compare | arguments.Captures, str]]
         if self.captured.captures:
-            how, meant = "with", "networks are compared on points"
+            how, meant = "with", "networks on points"
             unread = [(self.setting, name) for name in vars(self.setting) if name not in OF_BOTH]
             unread.append((self, "baselines"))
         else:
-            how, meant = "without", "detectors are compared on captured frames"
+            how, meant = "without", "detectors on captured frames"
             unread = [(self.captured, name) for name in vars(self.captured)]
         for options, name in unread:
             if getattr(options, name) != getattr(type(options), name):
                 option = name.replace("_", "-")
-                raise InputError(f"--{option}: found it {how} --captures, expected it where {meant}")
+                raise InputError(f"--{option}: cannot be used {how} --captures; it is for comparing {meant}")
 
 
 def compare_captures(
@@ -102,9 +103,12 @@ def compare_captures(
         if one.detector != "classical":
             choose_proposer(one.detector)  # found out now, not when captures are made
     total = len(models) * chosen.captures
+    each = f"{plural(chosen.captures, 'capture')} of each difficulty, {', '.join(names)}"
     kept = None if out is None else StoredResults(out / WORK, _scope(contenders, scene))
-    with open_workers(setting, total, kept) as mapped, progress_bar("calibrating captures", total) as advance:
-        outcomes = compare_detectors(contenders, scene, chosen.captures, seed, advance, mapped)
+    with open_workers(setting, total, kept) as mapped:
+        print(f"calibrating {each}, with {', '.join(map(str, detectors))}", file=sys.stderr, flush=True)
+        with progress_bar("calibrating captures", total) as advance:
+            outcomes = compare_detectors(contenders, scene, chosen.captures, seed, advance, mapped)
     tables = detector_tables(outcomes)
     text = f"{describe(scene, chosen.captures, seed)}\n\n" + "\n".join(table.markdown() for table in tables)
     if sys.stdout.isatty():
@@ -148,8 +152,8 @@ def describe(scene: Scene, captures: int, seed: int) -> str:
     """One line on what the captures were."""
     drift = ", ".join(f"{name} {value:g}" for name, value in vars(scene.drift).items())
     return (
-        f"Rig {scene.rig.name}, object {scene.obj.name}, {captures} captures a difficulty of {scene.snapshots} "
-        f"snapshots, seed {seed}; drift of all values, standard deviations: {drift}."
+        f"Rig {scene.rig.name}, object {scene.obj.name}, {plural(captures, 'capture')} a difficulty of "
+        f"{plural(scene.snapshots, 'snapshot')}, seed {seed}; drift of all values, standard deviations: {drift}."
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from imgcal.formats import (
     OURS,
     Files,
     ForeignRig,
+    Format,
     convert_rig,
     fill_image_sizes,
     find_format,
@@ -25,7 +25,7 @@ from imgcal.formats import (
     write_into,
 )
 from imgcal.io import load_rig_covariance, publishing, read_rig, write_bytes
-from imgcal.messages import list_names, shorten
+from imgcal.messages import list_names, plural, shorten, with_article
 
 
 class Convert(arguments.Convert):
@@ -38,17 +38,20 @@ class Convert(arguments.Convert):
             return
         to = self._target()
         rig, title = self._read()
-        print(f"{title}: {len(rig.cameras)} camera{'s' if len(rig.cameras) > 1 else ''}; frame: {rig.frame}")
+        print(f"{title}: {plural(len(rig.cameras), 'camera')}; frame: {rig.frame}")
         for note in rig.notes:
             print(f"note: {note}")
         made = convert_rig(rig, to, self.out.stem, self.fit_limit, self.out_unit, hold_distortion=self.hold_distortion)
         for note in made.notes:
             print(f"note: {note}")
+        if self.to is None and (named := _format_named(self.out.stem)):
+            other = f"--to {named.name} writes {with_article(named.title)}"
+            print(f"note: --out ends in {self.out.suffix}, so an imgcal rig file is written; {other}")
         written = self._write(made.files)
         models = f"{made.between_models:.2g} px" if made.between_models > 1e-6 else "the same"
         print(
-            f"wrote {list_names(map(str, written))} ({to}); re-read: worst difference {made.round_trip:.1e} px on "
-            f"{made.points} points, lens models {models}"
+            f"wrote {list_names(map(str, written))} ({'imgcal rig file' if to == OURS else to}); re-read: worst "
+            f"difference {made.round_trip:.1e} px on {made.points} points, lens models {models}"
         )
 
     def _write_back(self) -> None:
@@ -74,8 +77,8 @@ class Convert(arguments.Convert):
         written = self._write(files)
         where = list_names(map(str, written))
         print(
-            f"{made.title}: {_count_cameras(made.changed)} replaced"
-            + (f", {_count_cameras(made.kept)} kept" if made.kept else "")
+            f"{made.title}: {plural(len(made.changed), 'camera')} replaced"
+            + (f", {plural(len(made.kept), 'camera')} kept" if made.kept else "")
         )
         if made.loss is not None:
             print(
@@ -150,8 +153,10 @@ class Convert(arguments.Convert):
         return written
 
 
-def _count_cameras(names: Sequence[str]) -> str:
-    return f"{len(names)} camera{'s' if len(names) != 1 else ''}"
+def _format_named(stem: str) -> Format | None:
+    """Find the format that the name of a file suggests."""
+    words = re.split(r"[^a-z0-9]+", stem.lower())
+    return next((one for one in FORMATS if one.write and {one.name, one.stem} & {*words}), None)
 
 
 def _size(text: str) -> tuple[str, tuple[int, int]]:

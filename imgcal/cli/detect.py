@@ -7,6 +7,7 @@ import sys
 from imgcal.cli import arguments
 from imgcal.cli.common import open_rig, read_detections
 from imgcal.io import open_capture, save_detections
+from imgcal.messages import plural
 from imgcal.pipeline import LearnedMeasurer
 
 
@@ -20,7 +21,7 @@ class Detect(arguments.Detect):
         detections, _ = read_detections(capture, self.snapshots, self.detection, measurer)
         save_detections(detections, self.out)
         print(
-            f"{len(detections)} blobs in {len(detections.snapshot_names)} snapshots of "
-            f"{len(detections.camera_names)} cameras written to {self.out}",
+            f"{plural(len(detections), 'blob')} in {plural(len(detections.snapshot_names), 'snapshot')} of "
+            f"{plural(len(detections.camera_names), 'camera')} written to {self.out}",
             file=sys.stderr,
         )

@@ -15,10 +15,12 @@ from rich.console import Console
 from imgcal.cli import arguments
 from imgcal.cli.arguments import Setting
 from imgcal.cli.common import check_folder, open_rig, progress_bar
+from imgcal.cli.interruption import unwind_at_termination
 from imgcal.errors import InputError
 from imgcal.extras import advice, missing
 from imgcal.fleet import StoredResults, workers
 from imgcal.io import load_object, publishing
+from imgcal.messages import plural
 
 if TYPE_CHECKING:
     from imgcal.evaluation import Conditions, Facts, Method, Model, Protocol, Summary
@@ -55,8 +57,10 @@ def evaluate_models(paths: tuple[Path, ...], setting: Setting, baselines: bool, 
     conditions = _conditions(models, setting)
     methods = {model.name: model.method for model in models}
     methods |= _select_suited(BASELINES if baselines else QUICK_BASELINES, conditions.rig)
+    each = f"{plural(protocol.trials, 'trial')} of {plural(protocol.count, 'random rig')}"
     kept = None if out is None else StoredResults(out / WORK, _scope(models))
     with open_workers(setting, protocol.batches, kept, models) as mapped:
+        print(f"evaluating {', '.join(methods)} on {each} (--trials, --count)", file=sys.stderr, flush=True)
         summary = _measure(methods, conditions, protocol, setting, mapped)
     summary = replace(summary, facts={model.name: _check_model(model, conditions, setting) for model in models})
     _print_tables(summary)
@@ -98,7 +102,7 @@ def open_workers(
         if batches >= FEW:
             print(f"note: running on one core: --cores {advice('ray')}", file=sys.stderr)
         cores = 1
-    with workers(setting.address, cores, kept) as mapped:
+    with unwind_at_termination(), workers(setting.address, cores, kept) as mapped:
         yield mapped
 
 

@@ -14,15 +14,16 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from imgcal.cli import arguments
-from imgcal.cli.common import check_folder, open_rig
+from imgcal.cli.common import EVERY, check_folder, open_rig
+from imgcal.cli.interruption import unwind_at_termination
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice, missing
 from imgcal.fleet import Dataset, Engine, FleetCount, KindOfRig, LearntPrior, Manifest, Settings, rig_kinds
 from imgcal.fleet import recalibrate_fleet as recalibrate
 from imgcal.io import load_object, write_text, yaml_text
+from imgcal.messages import plural
 from imgcal.types import RigPrior
 
-EVERY = 60.0  # s between lines without a terminal
 NEEDED = ("ray", "pyarrow", "fsspec", "filelock")
 
 
@@ -48,7 +49,7 @@ class Fleet(arguments.Fleet):
             pass  # it can be written, and no other run is using it
         settings = Settings(self.blind_cameras, self.detector, self.seconds, self.memory_mb, self.keep_rigs)
         started = time.perf_counter()
-        with Engine(self.address, self.cores) as engine, _show_progress() as tell:
+        with unwind_at_termination(), Engine(self.address, self.cores) as engine, _show_progress() as tell:
             count = recalibrate(manifest, dataset, engine, settings, again=self.again, tell=tell, batch=self.batch)
         print(f"{_print_line(count)}, {time.perf_counter() - started:.0f} s: {dataset.folder}")
         if self.keep_rigs:
@@ -69,7 +70,7 @@ class Fleet(arguments.Fleet):
             for spread in learnt.spreads:
                 camera = "" if spread.camera is None else f" of {spread.camera}"
                 print(f"{spread.kind}{camera}: spread {spread.value:.4g} +- {spread.sigma:.1g}")
-            print(f"{len(learnt.outliers)} outlier cameras; prior {self.out / 'prior.yaml'}")
+            print(f"{plural(len(learnt.outliers), 'outlier camera')}; prior {self.out / 'prior.yaml'}")
         for _, _, reason in taught:
             if reason:
                 print(f"note: no prior: {reason}", file=sys.stderr)
@@ -104,7 +105,7 @@ def _summary(kind: KindOfRig, learnt: LearntPrior) -> dict[str, Any]:
 def _print_line(count: FleetCount) -> str:
     parts = [f"{number} {status.replace('_', ' ')}" for status, number in count.status.most_common()]
     known = f"{count.known} done before" if count.known else ""
-    return ", ".join([f"{count.read} captures", *parts, *([known] if known else [])])
+    return ", ".join([plural(count.read, "capture"), *parts, *([known] if known else [])])
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from imgcal.cli import arguments
 from imgcal.cli.common import check_folder, open_rig, parse_range, progress, read_detections
 from imgcal.errors import RefusedError
 from imgcal.io import load_object, open_capture, publishing, write_text
+from imgcal.messages import plural
 from imgcal.pipeline import capture_sight
 from imgcal.training import (
     CARD,
@@ -82,7 +83,7 @@ class Harvest(arguments.Harvest):
         parts = self._split_patches(patches, count, rig.num_cameras)
         source = Source("imgcal harvest", str(self.capture), count, self.seed, rig, obj)
         write_dataset(self.out, splits, parts, source)
-        said = [f"{len(part)} crops with {_count_markers(part)} markers" for part in splits]
+        said = [f"{plural(len(part), 'crop')} with {_count_markers(part)} markers" for part in splits]
         print(f"{self.out}: {said[0]} for training, {said[1]} held out", file=sys.stderr)
 
     def _split_patches(self, patches: PatchDataset, snapshots: int, cameras: int) -> Sequence[PatchDataset]:

@@ -1,4 +1,4 @@
-"""Ctrl-C during imports; this module is light, so that it is loaded first."""
+"""Ctrl-C during imports, and SIGTERM beside worker processes; this module is light, so that it is loaded first."""
 
 import contextlib
 import os
@@ -21,6 +21,24 @@ def end_at_once() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@contextlib.contextmanager
+def unwind_at_termination() -> Iterator[None]:
+    """Let SIGTERM raise KeyboardInterrupt, so that worker processes are ended and the command says one line."""
+    ours = threading.current_thread() is threading.main_thread()
+    if not (ours and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL):  # other programs may have their handlers
+        yield
+        return
+    signal.signal(signal.SIGTERM, _unwind)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _unwind(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt("terminated")
 
 
 def _end(number: int, frame: FrameType | None) -> None:

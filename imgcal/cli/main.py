@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import difflib
+import inspect
 import io
 import re
 import sys
@@ -11,7 +13,9 @@ import traceback
 import warnings
 from dataclasses import fields, is_dataclass, make_dataclass
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Protocol, Union, get_type_hints
 
 import tyro
@@ -22,6 +26,9 @@ from imgcal.cli.interruption import end_at_once
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice
 from imgcal.messages import one_line, quote, shorten
+
+ONE_OF = {"calibrate": ("--rig", "--cameras")}
+"""Options of which a command needs one; the parser knows each as optional."""
 
 SEVERAL_OBJECTS = ("simulate", "calibrate", "score")
 """Commands whose `--object` may be several."""
@@ -37,9 +44,11 @@ COMMANDS = (
 """Each has a class of its name, among the arguments and in the module of its name."""
 DESCRIPTION = """Recalibrate infrared multi-camera rigs from images of a known calibration object.
 
-imgcal COMMAND --help tells more, imgcal --version which one this is. Exit codes: 0 done, 2 unusable input (or a fault
-of imgcal's own, which says so), 3 refused (the data cannot decide), 130 interrupted. With --debug anywhere on the
-command line, a failure also shows its traceback."""
+A first try: imgcal calibrate sample:O10 --rig sample:O10 --object sample:O10 --out result
+
+imgcal COMMAND --help describes a command, imgcal --version prints the version. Exit codes: 0 done, 2 unusable input (or
+an internal error), 3 refused (the data cannot decide), 130 interrupted. With --debug anywhere on the command line, a
+failure also shows its traceback."""
 
 
 class Runnable(Protocol):
@@ -88,16 +97,20 @@ def parse(arguments: list[str]) -> Runnable:
     except SystemExit as stop:
         if stop.code in (None, DONE):
             raise
-        raise InputError(_strip_boxes(drawn.getvalue(), arguments[0] if arguments else "")) from None
+        raise InputError(_strip_boxes(drawn.getvalue(), arguments)) from None
 
 
 def _parse(arguments: list[str]) -> Runnable:
-    first = arguments[0] if arguments else ""
+    if not arguments:
+        raise InputError(f"no command given, expected one of {', '.join(COMMANDS)}; see imgcal --help")
+    first = arguments[0]
     if first == VERSION:
         print(f"imgcal {imgcal.__version__}")
         raise SystemExit(DONE)
     if first in COMMANDS:
         options = _objects_last(first, arguments[1:])
+        if {"-h", "--help"} & {*options}:
+            _join_help_lines()
         given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=options)
         _check_values(given, options)
         with end_at_once():  # imports take a while
@@ -151,20 +164,33 @@ def _arguments(name: str) -> Any:
         return getattr(import_module("imgcal.cli.arguments"), name.capitalize())
 
 
+def _join_help_lines() -> None:
+    """Give tyro the help of every option on one line: it would keep the line breaks of a docstring in the source."""
+    kinds = import_module("imgcal.cli.arguments")
+    for node in ast.parse(inspect.getsource(kinds)).body:
+        if not isinstance(node, ast.ClassDef):
+            continue
+        options = {option.name: option for option in fields(getattr(kinds, node.name))}
+        for entry, after in pairwise(node.body):
+            match entry, after:
+                case ast.AnnAssign(target=ast.Name(name)), ast.Expr(ast.Constant(str(words))):
+                    options[name].metadata = MappingProxyType({"help": " ".join(words.split())})
+
+
 def _summary(name: str) -> Any:
     """A command without options, and the first paragraph of its help."""
     words = (_arguments(name).__doc__ or "").partition("\n\n")[0]
     return make_dataclass(name.capitalize(), (), namespace={"__doc__": words})
 
 
-def _strip_boxes(box: str, first: str = "") -> str:
-    """Strip the box that tyro draws around a message."""
+def _strip_boxes(box: str, arguments: list[str]) -> str:
+    """Strip the box that tyro draws around a message about a command line."""
     rows = (line.strip("│╭╮╰╯─| ") for line in box.splitlines()[1:])
     text = " ".join(row for row in rows if row.strip("-+"))
     problem, _, hint = text.partition("For full helptext, ")
     problem = problem.partition("Argument helptext:")[0].replace("__tyro-dummy-inner__.", "")
     command = re.search(r"imgcal[a-z ]* --help", hint)
-    return f"{_shorten(problem.strip(), first)}; see {command[0] if command else 'imgcal --help'}"
+    return f"{_shorten(problem.strip(), arguments)}; see {command[0] if command else 'imgcal --help'}"
 
 
 def list_options(command: str) -> list[str]:
@@ -180,13 +206,14 @@ def list_options(command: str) -> list[str]:
     return names(_arguments(command))
 
 
-def _shorten(problem: str, command: str = "") -> str:
+def _shorten(problem: str, arguments: list[str]) -> str:
     """Describe the first problem of a command line in a few words."""
+    command = arguments[0]
     if unknown := re.search(r"Unrecognized options: (.*?)(?: Perhaps you meant:? (.*))?$", problem):
         words, near = unknown[1].split(", "), re.search(r"--[\w.-]+", unknown[2] or "")
         options = [word for word in words if word.startswith("-")]
         if not options:
-            return f"found {quote(' '.join(words))!r}, expected no more than was given before it"
+            return f"unexpected argument `{quote(' '.join(words))}`"
         option = options[0].split()[0]
         close = [near[0]] if near else difflib.get_close_matches(option.partition("=")[0], list_options(command), 1)
         return f"unknown option `{shorten(option)}`" + (f"; did you mean `{close[0]}`?" if close else "")
@@ -194,7 +221,20 @@ def _shorten(problem: str, command: str = "") -> str:
         entries = problem.partition(": ")[2].split("(required)")[:-1]
         parts = [entry.split() for entry in entries]
         named = [p[0] if p[0].startswith("--") else f"{p[0]} ({' '.join(p[1:])})" for p in parts if p]
+        needed = ONE_OF.get(command, ())
+        if needed and not set(needed) & {argument.partition("=")[0] for argument in arguments}:
+            named.append(" or ".join(needed))
         return f"missing {', '.join(named)}"
+    if choice := re.search(r"[Ii]nvalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*?),?\)", problem):
+        words = {word.strip("' ") for word in choice[3].split(",")} - {"None"}
+        known = sorted(words, key=lambda word: (word.isdigit() and int(word), word))
+        close = difflib.get_close_matches(choice[1], known, 1)
+        hint = f"; did you mean {close[0]}?" if close else ""
+        return f"{choice[2]}: found {shorten(choice[1])}, expected {_one_of(known)}{hint}"
+    if group := re.match(r"Expected one of \{(.*)\}", problem):
+        return f"expected {_one_of(group[1].split(', '))} after `imgcal {command}`"
+    if short := re.search(r"Missing value for argument '(\S+)'\. Expected (\d+) values", problem):
+        return f"{short[1]}: found too few values, expected {short[2]}"
     if count := re.search(
         r"Error parsing (\S+): .*input length (\d+) did not match expected argument count (\d+)", problem
     ):
@@ -206,7 +246,11 @@ def _shorten(problem: str, command: str = "") -> str:
         numbers = re.search(r"tuple\[((?:(?:float|int)(?:, )?)+)\]", problem)
         expected = f"{len(numbers[1].split(', '))} numbers" if numbers else "another value"
         return f"{union[1]}: found {shorten(union[2].replace(chr(39), '').replace(',', ''))}, expected {expected}"
-    return re.sub(r"\[/?[a-z ]+\]", "", problem)
+    return re.sub(r"\[/?[a-z ]+\]|^Error parsing \w+: ", "", problem)
+
+
+def _one_of(words: list[str]) -> str:
+    return f"{', '.join(words[:-1])} or {words[-1]}" if len(words) > 1 else words[0]
 
 
 def _verdict(error: BaseException, given: list[str]) -> tuple[int, str]:
@@ -228,7 +272,7 @@ def _verdict(error: BaseException, given: list[str]) -> tuple[int, str]:
     ours = [frame for frame in traceback.extract_tb(error.__traceback__) if "imgcal" in Path(frame.filename).parts]
     place = f" ({Path(ours[-1].filename).name}:{ours[-1].lineno})" if ours else ""
     what = quote(f"{type(error).__name__}: {error}")
-    return UNUSABLE, f"internal error{place}: {what}; this input found a fault of imgcal, {DEBUG} shows where"
+    return UNUSABLE, f"internal error{place}: {what}; this is a fault of imgcal; {DEBUG} shows where"
 
 
 def run() -> None:

@@ -18,7 +18,7 @@ import imgcal
 from imgcal.errors import RefusedError
 from imgcal.estimation import Gauge
 from imgcal.io import RigCovariance
-from imgcal.messages import list_names
+from imgcal.messages import list_names, plural
 from imgcal.pipeline import (
     DOUBTFUL,
     Calibration,
@@ -73,7 +73,7 @@ class Findings:
         """What is printed."""
         lines = [self.motion.sentence] if self.motion.sentence and not self.from_scratch else []
         if self.knowledge.sentences:
-            lines.append("not known: " + " ".join(self.knowledge.sentences))
+            lines.append(" ".join(self.knowledge.sentences))
         if self.untimed:
             which = "all cameras" if len(self.untimed) == len(self.knowledge.camera_names) else list_names(self.untimed)
             lines.append(
@@ -124,8 +124,8 @@ def doubtful_cameras(calibration: Calibration) -> list[str]:
     doubtful = np.flatnonzero(unexplained > DOUBTFUL * np.maximum(kept + unexplained, 1))
     stopped = [str(camera) for camera in calibration.doubtful]
     return [f"{late}; these took no part" for late in calibration.late] or stopped + [
-        f"camera {calibration.rig.camera_names[c]}: {unexplained[c]} blobs may be fiducials and are not where these "
-        f"should be, {kept[c]} are"
+        f"camera {calibration.rig.camera_names[c]}: {unexplained[c]} blobs may be fiducials but are not where "
+        f"fiducials should be; {kept[c]} are"
         for c in doubtful
     ]
 
@@ -305,16 +305,16 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
         print("note: the network's guess was no better than the factory calibration: not used", file=sys.stderr)
     print("; ".join(filter(None, (predicted_line(result["predicted_error"]), result["scale"]["note"]))))
     print(
-        f"identity {result['identity']}, {result['snapshots_used']} snapshots used, "
+        f"identity {result['identity']}, {plural(result['snapshots_used'], 'snapshot')} used, "
         f"{result['snapshots_rejected']} rejected"
     )
     if result["lights"]:
         lights = result["lights"]
         shares = [camera["found"] for camera in lights["held_out"].values()]
+        share = f"{100 * min(shares):.0f} to {100 * max(shares):.0f} %"
         print(
-            f"{lights['markers']} markers used; in held-out snapshots, each camera sees {100 * min(shares):.0f} to "
-            f"{100 * max(shares):.0f} % of the markers that the other cameras find in its view, without matches by "
-            "chance"
+            f"{plural(lights['markers'], 'marker')} used; in held-out snapshots, each camera sees {share} of the "
+            "markers that the other cameras find in its view, without matches by chance"
         )
         if lights["note"]:
             print(f"note: {lights['note']}", file=sys.stderr)
@@ -345,7 +345,7 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
     print(f"rig     {out / 'rig.yaml'}")
     several = [entry for entry in result["object"] if "name" in entry]
     for entry in several:
-        print(f"object  {entry['name']} seen in {entry['snapshots_used']} snapshots")
+        print(f"object  {entry['name']} seen in {plural(entry['snapshots_used'], 'snapshot')}")
     if result["object"] and not several:
         print(f"object  {out / 'object.csv'}")
     if result["board_bend"]:

@@ -13,6 +13,7 @@ from imgcal.cli import arguments
 from imgcal.cli.common import check_folder, open_rig, progress, read_detections
 from imgcal.errors import InputError
 from imgcal.io import load_object, open_input, publishing, write_image
+from imgcal.messages import plural
 from imgcal.synthesis import GREY_LEVELS, ImageOptions, render_views
 
 
@@ -43,6 +44,6 @@ class Render(arguments.Render):
                     write_image(out / camera / f"{name}.png", image)
         refused = len(labelled.snapshots) - len(labelled.used)
         print(
-            f"{len(labelled.used)} snapshots written to {self.out}, {refused} left out (identity refused)",
+            f"{plural(len(labelled.used), 'snapshot')} written to {self.out}, {refused} left out (identity refused)",
             file=sys.stderr,
         )

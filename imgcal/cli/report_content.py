@@ -124,18 +124,21 @@ def _about_object(calibration: Calibration) -> str:
     """Name the fiducials that are not in their places, and those that were not found."""
     words = []
     if calibration.from_scratch:
-        words.append("There was no factory calibration: what is called so is a first rig made from the same data.")
+        words.append(
+            "There was no factory calibration: what this page calls the factory calibration is a first rig made from "
+            "the same data."
+        )
     if calibration.displaced:
         parts = [f"fiducial {d.fiducial} is {d.distance:.3g} ± {d.sigma:.1g} mm off" for d in calibration.displaced]
         words.append(
-            f"The object is not quite what its file says: {', '.join(parts)}. It was estimated with the rig; "
+            f"The object differs from its file: {', '.join(parts)}. It was estimated with the rig; "
             "object.csv beside this page holds it."
         )
     if calibration.lost:
         which = ", ".join(map(str, calibration.lost))
         words.append(
-            f"Fiducial {which} was hardly found where the others were: missing, hidden, or not where the object file "
-            "has it."
+            f"Fiducial {which} was rarely found where the others were: missing, hidden, or not where the object file "
+            "puts it."
         )
     return " ".join(words)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from imgcal.cli import arguments
 from imgcal.errors import InputError
 from imgcal.io import open_capture, save_cameras, save_rig
-from imgcal.messages import list_names
+from imgcal.messages import list_names, plural
 from imgcal.synthesis import arrange_rig
 from imgcal.types import ConvexVolume
 
@@ -38,7 +38,7 @@ def _look_at(given: arguments.LookAt) -> None:
         name=given.out.stem,
     )
     save_rig(rig, given.out)
-    print(f"{rig.num_cameras} cameras written to {given.out}", file=sys.stderr)
+    print(f"{plural(rig.num_cameras, 'camera')} written to {given.out}", file=sys.stderr)
 
 
 def _cameras(given: arguments.Cameras) -> None:
@@ -54,7 +54,7 @@ def _cameras(given: arguments.Cameras) -> None:
             f"{given.capture}: found no readable frame of {list_names(without)}, expected some of each camera"
         )
     save_cameras({name: sizes[name] for name in capture.camera_names}, given.field_of_view_deg, given.out)
-    print(f"{len(sizes)} cameras written to {given.out}", file=sys.stderr)
+    print(f"{plural(len(sizes), 'camera')} written to {given.out}", file=sys.stderr)
 
 
 def check_new_file(path: Path) -> None:

@@ -1,16 +1,20 @@
-"""`imgcal score`: how well a rig explains observations, as JSON."""
+"""`imgcal score`: how well a rig explains observations, as a table or JSON."""
 
 from __future__ import annotations
 
 import json
 import sys
 from functools import partial
+from typing import Any
 
 import torch
+from rich.console import Console
+from rich.table import Table
 
 from imgcal.cli import arguments
 from imgcal.cli.common import open_rig, progress, read_detections
 from imgcal.io import load_objects, open_input
+from imgcal.messages import plural
 from imgcal.pipeline import RigScore, rms_length, score, unit_doubt
 from imgcal.types import CameraRig
 
@@ -24,12 +28,39 @@ class Score(arguments.Score):
         source = open_input(self.input, rig, obj.rows, self.videos_differ)
         detections, _ = read_detections(source, self.snapshots, self.detection, board=obj.board)
         bar = partial(progress, label="scoring")
-        print(json.dumps(summary(score(detections, rig, obj, progress=bar), rig), indent=2))
+        found = summary(score(detections, rig, obj, progress=bar), rig)
+        if sys.stdout.isatty() and not self.json:
+            Console().print(table(found), *lines(found), sep="\n", markup=False, highlight=False)
+        else:
+            print(json.dumps(found, indent=2))
         if doubt := unit_doubt(rig, obj):
             print(f"note: {doubt}", file=sys.stderr)
 
 
-def summary(scored: RigScore, rig: CameraRig) -> dict[str, object]:
+def table(found: dict[str, Any]) -> Table:
+    """Show a summary, a row per camera and one for all."""
+    shown = Table("camera", title="Reprojection error (px)", title_justify="left")
+    for name in ("median", "RMS", "points", "outliers"):
+        shown.add_column(name, justify="right")
+    for name, row in [*found["per_camera"].items(), ("all", found)]:
+        shown.add_row(name, _pixels(row["median_px"]), _pixels(row["rms_px"]), str(row["points"]), str(row["outliers"]))
+    return shown
+
+
+def lines(found: dict[str, Any]) -> list[str]:
+    """Say what a table of cameras does not show."""
+    return [
+        f"95 % of the points are within {_pixels(found['p95_px'])} px; the RMS leaves outliers out, with them it is "
+        f"{_pixels(found['rms_px_with_outliers'])} px",
+        f"{plural(found['snapshots_used'], 'snapshot')} used, {found['snapshots_rejected']} rejected",
+    ]
+
+
+def _pixels(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
+
+
+def summary(scored: RigScore, rig: CameraRig) -> dict[str, Any]:
     """Summarize a score as plain values, robust figures first."""
     per_camera = {}
     for camera, name in enumerate(rig.camera_names):

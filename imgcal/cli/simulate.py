@@ -22,7 +22,7 @@ from imgcal.io import (
     write_frame,
     write_text,
 )
-from imgcal.messages import shorten
+from imgcal.messages import plural, shorten
 from imgcal.synthesis import (
     DIFFICULTIES,
     Drift,
@@ -81,7 +81,8 @@ class Simulate(arguments.Simulate):
         with publishing(self.out, WRITTEN, mark="frames") as out:
             self._write(truth, rig, obj, generator, out)
             _write_object(obj, out if are_known else out / "truth")
-        print(f"{self.snapshots} snapshots of {rig.num_cameras} cameras written to {self.out}", file=sys.stderr)
+        what = f"{plural(self.snapshots, 'snapshot')} of {plural(rig.num_cameras, 'camera')}"
+        print(f"{what} written to {self.out}", file=sys.stderr)
 
     def _write(
         self, truth: Truth, rig: CameraRig, obj: CalibrationObject, generator: torch.Generator, out: Path

@@ -12,6 +12,7 @@ from types import FrameType
 from imgcal.cli import arguments
 from imgcal.cli.common import check_folder
 from imgcal.errors import InputError
+from imgcal.messages import plural
 
 PATIENCE = 2.0  # s, between two signals that are not one and the same
 
@@ -49,7 +50,7 @@ class Train(arguments.Train):
                 f"interrupted and saved at step {run.step}; to go on, repeat the command with --resume"
             )
         if run.accelerator.is_main_process:
-            print(f"{run.step} steps, {run.seconds:.0f} s: {self.out / RESULT}", file=sys.stderr)
+            print(f"{plural(run.step, 'step')}, {run.seconds:.0f} s: {self.out / RESULT}", file=sys.stderr)
 
 
 @contextmanager

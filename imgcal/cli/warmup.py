@@ -7,6 +7,7 @@ import time
 
 from imgcal.cli import arguments
 from imgcal.cli.compiling import announce_compilation
+from imgcal.messages import plural
 from imgcal.online import warm_up
 from renderers.compiling import cache_folder
 
@@ -19,6 +20,6 @@ class Warmup(arguments.Warmup):
         started = time.perf_counter()
         with announce_compilation("compiling, which takes a while") as compiled:
             warm_up(self.all_lenses)
-        what = f"{len(compiled)} functions compiled" if compiled else "all was compiled already"
+        what = f"{plural(len(compiled), 'function')} compiled" if compiled else "all was compiled already"
         where = cache_folder() or "where Python keeps the compiled files of imgcal"
         print(f"{what} in {time.perf_counter() - started:.1f} s, kept in {where}", file=sys.stderr)

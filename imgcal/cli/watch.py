@@ -24,7 +24,7 @@ from imgcal.cli.watch_display import Display
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice, missing
 from imgcal.io import Fiducials, holding, load_objects, open_input
-from imgcal.messages import shorten
+from imgcal.messages import plural, shorten
 from imgcal.online import Event, RigKeeper
 from imgcal.pipeline import DETECTORS, DetectorName, LearnedMeasurer, choose_proposer
 from imgcal.types import CalibrationObject, CameraRig, Detections, object_difference, rig_difference
@@ -154,12 +154,12 @@ class Watch(arguments.Watch):
             stopped = stack.enter_context(_stopping())
             stack.enter_context(display.show_tally(loop.tally))
             if restored or anew:
-                how = "started again from what was known" if restored else "begun anew with the factory calibration"
+                how = "resumed from the saved state" if restored else "started anew from the factory calibration"
                 loop.publish_event(Event(time.time(), 0, "restart", message=how))
             loop.run(intake, stopped, display.draw)
         tally = loop.tally
         said = display.result(self.out / CURRENT)
-        if lost := [f"{output.name}: {output.lost:,} poses" for output in poses if output.lost]:
+        if lost := [f"{output.name}: {plural(output.lost, 'pose')}" for output in poses if output.lost]:
             said = f"{said} | not written: {'; '.join(lost)}"
         if learning is not None:
             said = f"{said} | {learning.summary}"
@@ -172,7 +172,7 @@ class Watch(arguments.Watch):
             raise InputError(f"watch: {said}")
         before = intake.known_before + (source.known_before() if isinstance(source, Folder) else 0)
         if tally.snapshots == 0 and before:
-            read = f"all {before:,} snapshots of {self.input} had been read before"
+            read = f"all {plural(before, 'snapshot')} of {self.input} had been read before"
             said = f"{read}; --fresh starts from the factory rig | {said}"
         elif tally.latest is None or tally.learnt == 0:
             raise RefusedError(_nothing(tally, intake))
@@ -316,7 +316,7 @@ def _object_difference(obj: CalibrationObject, known: CalibrationObject) -> str 
 def _nothing(tally: Tally, intake: SourceReader) -> str:
     """Say why nothing was learnt."""
     if tally.latest is not None:
-        return f"watch: no snapshot taught anything: {tally.latest.refused}"
+        return f"watch: nothing could be learned from any snapshot: {tally.latest.refused}"
     if intake.reasons:
         return f"watch: no snapshot came: {intake.reasons[-1]}"
     return "watch: no snapshot came"

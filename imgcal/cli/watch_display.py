@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from imgcal.messages import list_names, one_line
+from imgcal.messages import list_names, one_line, plural
 from imgcal.online import Event
 from imgcal.watch import EVENTS, Hook, SourceReader, Tally
 
@@ -76,13 +76,13 @@ class Display:
         parts = [self._waiting() if state is None else state.sentence]
         if state is not None and state.refused is not None:
             parts.append("not learning now")
-        parts.append(f"{tally.snapshots:,} snapshots, {self._rate:.3g}/s")
+        parts.append(f"{plural(tally.snapshots, 'snapshot')}, {self._rate:.3g}/s")
         return " | ".join([*parts, *self._counts(), *self._clocks(), *self._trembling(), *self._unsynchronized()])
 
     def result(self, rig: Path) -> str:
         """Say in one line what came of it, and what did not: `rig` is the file."""
         tally, reasons = self._tally, self._intake.reasons
-        said = f"{tally.snapshots:,} snapshots, {sum(tally.events.values()):,} events: {rig}"
+        said = f"{plural(tally.snapshots, 'snapshot')}, {plural(sum(tally.events.values()), 'event')}: {rig}"
         latest = [f"latest unreadable input: {reasons[-1]}"] if reasons else []
         return " | ".join([said, *self._counts(), *latest])
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.geometry import pose_rank
+from imgcal.messages import plural
 
 LEAST_BREADTH = 0.05
 """Breadth of the visible part, relative to the whole object's: below, a rotation about a line is undetermined."""
@@ -23,7 +24,7 @@ class UndeterminedPosesError(RefusedError):
 
     def __init__(self, rows: Sequence[int], reason: str = ON_A_LINE) -> None:
         """Keep the indices of the snapshots among those of the fit."""
-        super().__init__(f"estimation: in {len(rows)} snapshots {reason}")
+        super().__init__(f"estimation: in {plural(len(rows), 'snapshot')} {reason}")
         self.rows = tuple(rows)
 
 
@@ -46,7 +47,7 @@ def require_poses(seen: NDArray[np.bool_], points: Tensor, part_of: NDArray[np.i
         least = None if part_of is not None else _least_fiducials(pose_rank(points))
         if least is None:
             raise UndeterminedPosesError(rows)
-        raise UndeterminedPosesError(rows, TOO_FEW.format("1 fiducial" if least == 1 else f"{least} fiducials"))
+        raise UndeterminedPosesError(rows, TOO_FEW.format(plural(least, "fiducial")))
 
 
 def _least_fiducials(rank: int) -> int | None:

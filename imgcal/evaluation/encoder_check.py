@@ -18,6 +18,7 @@ from imgcal.errors import InputError
 from imgcal.evaluation.methods import network_method
 from imgcal.evaluation.metrics import reprojection_error
 from imgcal.evaluation.protocol import Conditions, Sample, draw
+from imgcal.messages import plural
 from imgcal.networks import Network
 
 LEAST_RISE = 3.0
@@ -71,7 +72,7 @@ def check_encoder(network: Network, conditions: Conditions, count: int = 64, see
         True
     """
     if count < 2:
-        raise InputError(f"encoder check: found {count} rigs, expected two or more")
+        raise InputError(f"encoder check: found {plural(count, 'rig')}, expected two or more")
     encoder = network.encoder
     if encoder is None:
         return None

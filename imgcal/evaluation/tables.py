@@ -19,6 +19,7 @@ from imgcal.evaluation.protocol import REFERENCE, Conditions, Evaluation, Row, S
 from imgcal.evaluation.sweeps import AXES, Sweep
 from imgcal.evaluation.timing import Latency
 from imgcal.io import write_text
+from imgcal.messages import plural
 from imgcal.synthesis import RelativeDrift
 
 FORMAT = "imgcal-evaluation/1"
@@ -215,7 +216,7 @@ def describe(evaluation: Evaluation) -> str:
         wrong += "; images: " + ", ".join(f"{name} {value:g}" for name, value in images.items())
     return (
         f"Rig {known.rig.name}, object {known.obj.name}, phi {phi} deg, {drift}; {wrong or 'exact points'}; "
-        f"{protocol.count} rigs a trial, {protocol.trials} trials, seed {protocol.seed}."
+        f"{protocol.count} rigs a trial, {plural(protocol.trials, 'trial')}, seed {protocol.seed}."
     )
 
 

@@ -8,7 +8,9 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import signal
 import socket
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -94,8 +96,11 @@ class Engine:
             if self.address is None:
                 os.environ.setdefault("RAY_worker_niceness", "0")  # as nice as who calls, not 15 more
                 where = {"address": "local", "num_cpus": self.cores, "include_dashboard": False}
+            handler = signal.getsignal(signal.SIGTERM)
             try:
                 ray.init(**where, log_to_driver=False, logging_level=logging.ERROR)
+                if handler is not None and threading.current_thread() is threading.main_thread():
+                    signal.signal(signal.SIGTERM, handler)  # instead of Ray's, which prints a stack and aborts
             except Exception as error:
                 if self.address is None:
                     raise InputError(f"Ray cannot be started on this machine: {short_reason(error)}") from error

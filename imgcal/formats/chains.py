@@ -62,5 +62,5 @@ def follow_links(root: str, cameras: Sequence[str], links: Sequence[Link]) -> di
                 waiting.append(destination)
     lost = [camera for camera in cameras if camera not in poses]
     if lost:
-        raise FormatError(f"{name_cameras(lost)}: no pose relative to {root}, so that there is no rig")
+        raise FormatError(f"{name_cameras(lost)}: no pose relative to {root}, and without one there is no rig")
     return {camera: poses[camera] for camera in cameras}

@@ -83,7 +83,7 @@ def _read(source: Source) -> ForeignRig:
     rigs_path, images_path = source.find_file("rigs.bin"), source.find_file("images.bin")
     rigs = _rigs(_Reader(rigs_path)) if rigs_path else []
     if images_path is None and not any(len(rig.sensors) > 1 for rig in rigs):
-        raise FormatError("intrinsics alone: expected images.bin or rigs.bin beside cameras.bin")
+        raise FormatError("found only intrinsics, expected images.bin or rigs.bin beside cameras.bin")
     return rig_from_model(FORMAT.name, cameras, _images(_Reader(images_path)) if images_path else [], rigs, source.rig)
 
 
@@ -93,7 +93,7 @@ def _cameras(reader: _Reader) -> list[ColmapCamera]:
         camera, model, width, height = reader.read("IiQQ")
         if not 0 <= model < len(MODELS):
             raise FormatError(
-                f"{reader.name}: camera {camera}: found the model number {model}, which is none of COLMAP's"
+                f"{reader.name}: camera {camera}: found the model number {model}, expected one of COLMAP's"
             )
         name = MODELS[model]
         at = reader.at()

@@ -132,7 +132,7 @@ def rig_from_model(
         FormatError: neither is there, or the cameras were not fixed to each other.
     """
     known = {camera.id: camera for camera in cameras}
-    notes = ["COLMAP's pixels begin half a pixel earlier: cx and cy are 0.5 less here"]
+    notes = ["COLMAP's pixels begin half a pixel earlier: cx and cy are smaller by 0.5 here"]
     together = [rig for rig in rigs if len(rig.sensors) > 1]
     if together:
         chosen = together[chosen_rig(_rig_names(together, images), wanted)]
@@ -228,8 +228,8 @@ def _convert_images(
         frames[frame][camera] = image
     if len(folders) == 1 and len({image.camera for image in images}) == 1 and len(images) > 2:
         notes.append(
-            f"found no rigs.txt, and {len(images)} images with one set of intrinsics: taken for as many cameras of one "
-            "moment; if it is one camera that moved, there is no rig"
+            f"found no rigs.txt, and {len(images)} images with one set of intrinsics: treated as that many cameras at "
+            "one moment, which is wrong if one camera moved"
         )
     first = max(frames.values(), key=len)
     frame = next(key for key, value in frames.items() if value is first)
@@ -265,8 +265,9 @@ def _check_steady(frames: dict[str, dict[str, ColmapImage]], first: dict[str, Co
             moved = float(np.linalg.norm(now[1] - then[1]))
             if turned > ROTATION_STEADY or moved > PLACE_STEADY * size:
                 raise FormatError(
-                    f"found no rigs.txt, and camera {camera} stands otherwise to {root} in {frame!r}: the cameras are "
-                    "not fixed to each other, or the model was made without a rig (see COLMAP's rig_configurator)"
+                    f"found no rigs.txt, and camera {camera} has another pose relative to {root} in {frame!r}: the "
+                    "cameras are not fixed to each other, or the model was made without a rig (see COLMAP's "
+                    "rig_configurator)"
                 )
 
 

@@ -44,7 +44,7 @@ def _read(source: Source) -> ForeignRig:
     rigs_path, images_path = source.find_file("rigs.txt"), source.find_file("images.txt")
     rigs = [_rig(row, line, rigs_path) for line, row in _rows(rigs_path)] if rigs_path else []
     if images_path is None and not any(len(rig.sensors) > 1 for rig in rigs):
-        raise FormatError("intrinsics alone: expected images.txt or rigs.txt beside cameras.txt")
+        raise FormatError("found only intrinsics, expected images.txt or rigs.txt beside cameras.txt")
     return rig_from_model(FORMAT.name, cameras, list(_images(images_path)) if images_path else [], rigs, source.rig)
 
 
@@ -208,7 +208,7 @@ def _read_config(source: Source) -> ForeignRig:
                 Place(path, (*keys, "cam_from_rig_translation"), places.translation),
             ]
         cameras.append(row.camera(name, pose, *others))
-    notes = ["COLMAP's pixels begin half a pixel earlier: cx and cy are 0.5 less here"]
+    notes = ["COLMAP's pixels begin half a pixel earlier: cx and cy are smaller by 0.5 here"]
     if without:
         notes.append(f"{', '.join(without)}: left out, without a pose in the rig")
     if len(cameras) < 2:

@@ -18,7 +18,7 @@ from imgcal.formats.limits import LIMIT
 from imgcal.formats.values import name_cameras
 from imgcal.geometry import LENS_MODELS, RigidTransform, lens_label, lens_width
 from imgcal.io import RigCovariance
-from imgcal.messages import shorten
+from imgcal.messages import plural, shorten
 from imgcal.types import CameraRig, check_rig
 
 BROWN, RATIONAL, FISHEYE = "brown_conrady", "rational", "equidistant"
@@ -78,14 +78,14 @@ def in_millimetres(
     """
     if distance is not None:
         if unit is not None:
-            raise InputError("--distance: found --unit, too; expected one of them")
+            raise InputError("found both --distance and --unit, expected one of them")
         return rig.scale(_factor(rig, distance), "mm")
     stated = unit if unit is not None else rig.unit
     if stated is None and len(rig.cameras) > 1:
         raise InputError(
-            f"{where}: the file does not state its unit of length: give it with --unit mm, cm, m, inch, or the length "
-            "of one unit (--unit 417.2mm), or give a known distance of two cameras (--distance NAME NAME MM), to "
-            'imgcal convert; in Python load_rig(..., unit="mm")'
+            f"{where}: the file does not state its unit of length: give imgcal convert --unit mm, cm, m, inch, or the "
+            "length of one unit (--unit 417.2mm), or the distance between two cameras (--distance NAME NAME MM); in "
+            'Python load_rig(..., unit="mm")'
         )
     return rig.scale(millimetres(stated or "mm"), "mm")
 
@@ -101,7 +101,7 @@ def _factor(rig: ForeignRig, distance: tuple[str, str, float]) -> float:
         )
     apart = float(np.linalg.norm(by_name[names[0]].centre - by_name[names[1]].centre))
     if apart < 1e-12:
-        raise InputError(f"--distance: {names[0]} and {names[1]} stand at the same place in the file")
+        raise InputError(f"--distance: {names[0]} and {names[1]} are at the same place in the file")
     return length / apart
 
 
@@ -132,9 +132,8 @@ def fill_image_sizes(rig: ForeignRig, where: str, sizes: Mapping[str, tuple[int,
         cameras.append(replace(camera, image_size=camera.image_size or given))
     if missing:
         raise InputError(
-            f"{where}: {name_cameras(missing)}: the size of the images is not said in the file: state it with "
-            "--image-size "
-            f"1280x720 for all, or --image-size {missing[0]}=1280x720, to imgcal convert; in Python load_rig(..., "
+            f"{where}: {name_cameras(missing)}: the file does not state the size of the images: give imgcal convert "
+            f"--image-size 1280x720 for all cameras, or --image-size {missing[0]}=1280x720; in Python load_rig(..., "
             "image_size=(1280, 720))"
         )
     return replace(rig, cameras=tuple(cameras))
@@ -151,10 +150,8 @@ def fit_to_target(rig: ForeignRig, holds: Holds, title: str, limit: float = LIMI
         assert camera.image_size is not None
         fit = fit_lens(camera.lens, camera.image_size, holds)
         if not fit.worst <= limit:
-            off = f"by {fit.worst:.3g} px" if np.isfinite(fit.worst) else "by any amount in a part of the image"
             raise RefusedError(
-                f"camera {camera.name}: {title} cannot say its lens ({describe_lens(camera.lens)}): the nearest that "
-                f"it can is off {off}, more than the limit of {limit:g} px",
+                lens_refusal(camera, fit, title, "the nearest lens", limit),
                 command="--fit-limit allows more",
                 python="`fit_limit` allows more",
             )
@@ -167,8 +164,8 @@ def lens_refusal(camera: ForeignCamera, fit: Fit, title: str, nearest: str, limi
     """Explain that no lens of the target comes near enough; `nearest` names the one that comes nearest."""
     off = f"by {fit.worst:.3g} px" if np.isfinite(fit.worst) else "by any amount in a part of the image"
     return (
-        f"camera {camera.name}: {title} cannot say its lens ({describe_lens(camera.lens)}): {nearest} is off {off}, "
-        f"more than the limit of {limit:g} px"
+        f"camera {camera.name}: {title} cannot express its lens ({describe_lens(camera.lens)}): {nearest} is "
+        f"off {off}, more than the limit of {limit:g} px"
     )
 
 
@@ -184,7 +181,7 @@ def describe_lens(lens: Lens) -> str:
     """Describe a lens in a few words."""
     kinds = {"opencv": "OpenCV", "fisheye": "fisheye, equidistant", "to_ideal": "image to ideal"}
     skew = ", skewed" if lens.skew else ""
-    return f"{kinds[lens.model]}, {lens.length} coefficient{'s' if lens.length != 1 else ''}{skew}"
+    return f"{kinds[lens.model]}, {plural(lens.length, 'coefficient')}{skew}"
 
 
 def to_camera_rig(rig: ForeignRig, name: str) -> CameraRig:

@@ -43,9 +43,9 @@ def _read(source: Source) -> ForeignRig:
     values = merge_storages(source)
     inside, outside = _find_names(values, "K_"), [n for n in _find_names(values, "Rot_", "R_") if f"T_{n}" in values]
     if not outside:
-        raise FormatError("intri.yml alone: give extri.yml, too, or the folder of both")
+        raise FormatError("found only intri.yml: give extri.yml as well, or the folder of both")
     if not inside:
-        raise FormatError("extri.yml alone: give intri.yml, too, or the folder of both")
+        raise FormatError("found only extri.yml: give intri.yml as well, or the folder of both")
     names = values.get("names")
     listed = [text(name, "names") for name in names] if isinstance(names, list) else []
     order = sorted(set(inside) & set(outside), key=lambda name: listed.index(name) if name in listed else len(listed))

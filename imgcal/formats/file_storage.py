@@ -55,7 +55,7 @@ def is_matrix(value: Any) -> bool:
 def matrix(value: Any, what: str) -> Array:
     """Read a matrix: (rows, cols) with the channels in the columns; an n-dimensional one in its own shape."""
     if not is_matrix(value):
-        raise FormatError(f"{what}: found something else than a matrix of OpenCV's FileStorage")
+        raise FormatError(f"{what}: expected a matrix of OpenCV's FileStorage")
     data = np.array(numbers(value["data"], what))
     sizes = value["sizes"] if "sizes" in value else [value["rows"], value["cols"]]
     shape = [int(size) for size in numbers(sizes, what)]

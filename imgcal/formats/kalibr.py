@@ -43,13 +43,13 @@ def _read(source: Source) -> ForeignRig:
     values = source.merge()
     twice = next((key for key in values if CAMERA.fullmatch(key) and len(_files_with_key(source, key)) > 1), None)
     if twice is not None:
-        raise FormatError(f"{twice} stands in {list_names(_files_with_key(source, twice))}: give one of these files")
+        raise FormatError(f"{twice} is in {list_names(_files_with_key(source, twice))}: give one of these files")
     entries = {key: mapping(values[key], key) for key in values if CAMERA.fullmatch(key)}
     names = sorted(entries, key=lambda name: int(name[3:]))
     lenses = {name: _lens(name, entries[name]) for name in names}
     links = _links(values, entries, names)
     root = names[0]
-    notes = ["T_cn_cnm1 takes points from the camera before to this one; metres, as Kalibr's targets are"]
+    notes = ["T_cn_cnm1 maps points from the previous camera to this one; in metres, like Kalibr's targets"]
     direct = [link for link in links if "imu" not in (link.destination, link.source)]
     try:
         poses = follow_links(root, names, direct)
@@ -115,7 +115,8 @@ def _lens(name: str, entry: dict[str, Any]) -> Lens:
     kind = text(entry.get("distortion_model", "none"), f"{name}: distortion_model").lower()
     if model in NO_LENS:
         raise FormatError(
-            f"{name}: {NO_LENS[model]}, which no other tool here can say; calibrate with pinhole-radtan or pinhole-equi"
+            f"{name}: {NO_LENS[model]}, which no other format here can express; calibrate with pinhole-radtan or "
+            "pinhole-equi"
         )
     if model == "fov" or kind == "fov":
         raise FormatError(f"{name}: the FOV distortion is not supported; calibrate with radtan or equidistant")
@@ -183,5 +184,6 @@ def _write(rig: ForeignRig) -> Files:
 
 
 FORMAT = Format(
-    "kalibr", TITLE, _recognizes, _read, _write, Holds((4,), fisheye=True), states_unit=True, from_first=True
-)
+    "kalibr", TITLE, _recognizes, _read, _write, Holds((4,), fisheye=True), states_unit=True, from_first=True,
+    stem="camchain",
+)  # fmt: skip

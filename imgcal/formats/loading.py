@@ -54,7 +54,7 @@ def load_rig(
     if not stated and not (path.exists() and is_foreign(path)):
         return io.read_rig(path)
     if path.exists() and not is_foreign(path):
-        raise InputError(f"{path}: a rig file of our own says its unit, image sizes and format itself")
+        raise InputError(f"{path}: an imgcal rig file states its own unit, image sizes and format: leave these out")
     return _convert_lenses(in_millimetres(read_foreign_rig(path, format), str(path), unit), path, image_size, fit_limit)
 
 

@@ -45,7 +45,7 @@ def _read(source: Source) -> ForeignRig:
     notes = [
         "metres, y up",
         "UNCONFIRMED: Motive does not document the direction of its distortion; read as OpenCV's. If the corners of "
-        "images disagree by tens of pixels, it is the other one: the poses hold, the distortion does not",
+        "images disagree by tens of pixels, it is the opposite: the poses are right, the distortion is not",
         "whether pixel centres lie at 0 or 0.5 is not documented: up to half a pixel is open",
     ]
     if lost:

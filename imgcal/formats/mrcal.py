@@ -29,9 +29,9 @@ from imgcal.formats.values import (
 TITLE = "mrcal cameramodel"
 COUNTS = {"PINHOLE": 0, "NONE": 0, "OPENCV4": 4, "OPENCV5": 5, "OPENCV8": 8, "OPENCV12": 12}
 REASONS = {
-    "SPLINED": "a splined lens, which no other tool can say",
-    "CAHVOR": "a CAHVOR lens, which no other format here can say",
-    "STEREOGRAPHIC": "a stereographic projection, not a lens that others can say",
+    "SPLINED": "a splined lens, which no other format here can express",
+    "CAHVOR": "a CAHVOR lens, which no other format here can express",
+    "STEREOGRAPHIC": "a stereographic projection, which no other format here can express",
     "LONLAT": "a panorama (longitude, latitude), not a lens", "LATLON": "a panorama (latitude, longitude), not a lens",
 }  # fmt: skip
 
@@ -46,9 +46,9 @@ def _read(source: Source) -> ForeignRig:
     cameras = [_camera(document.path, values) for document, values in source.mappings if _is_model(values)]
     notes = []
     if len(cameras) > 1 and not any(camera.translation.any() for camera in cameras):
-        raise FormatError("all cameras stand at the origin of their reference: extrinsics were never calibrated")
+        raise FormatError("all cameras are at the origin of their reference: extrinsics were never calibrated")
     if len(cameras) == 1:
-        notes.append("one camera; the others of its set are files of their own: give all, or their folder")
+        notes.append("this is one camera; the others are in files of their own: give all, or their folder")
     return ForeignRig(FORMAT.name, tuple(cameras), None, "mrcal's reference frame", tuple(notes))
 
 

@@ -49,7 +49,7 @@ def _read(source: Source) -> ForeignRig:
     document, values = found_values
     cameras = mapping(values["cameras"], "cameras")
     if not isinstance(values.get("camera_poses"), dict):
-        raise FormatError("intrinsics alone (no camera_poses): give calibration.json, which has both")
+        raise FormatError("found only intrinsics (no camera_poses): give calibration.json, which has both")
     poses, links, masters = values["camera_poses"], [], []
     for key, value in poses.items():
         entry = mapping(value, key)

@@ -45,9 +45,13 @@ def _read(source: Source) -> ForeignRig:
     matrices, distortions = [keys[key] for key in matrix_keys], [keys[key] for key in distortion_keys]
     turn, shift = _first(keys, ROTATION), _first(keys, TRANSLATION)
     if len(matrices) < 2:
-        raise FormatError("extrinsics alone (R, T): give the file with M1, D1, M2, D2, too, or the folder of both")
+        raise FormatError(
+            "found only extrinsics (R, T): give the file with M1, D1, M2, D2 as well, or the folder of both"
+        )
     if turn is None or shift is None:
-        raise FormatError("intrinsics alone (no R, T): give the file with the extrinsics, too, or the folder of both")
+        raise FormatError(
+            "found only intrinsics (no R, T): give the file with the extrinsics as well, or the folder of both"
+        )
     size = image_size(_first(keys, SIZE), "image size")
     if size is None and "imagewidth" in keys and "imageheight" in keys:
         size = image_size([keys["imagewidth"], keys["imageheight"]], "image size")
@@ -60,12 +64,12 @@ def _read(source: Source) -> ForeignRig:
         ks = coefficients(d, f"distortion {side + 1}", counts=(4,) if fisheye else (0, 4, 5, 8, 12, 14))
         lenses.append(Lens(focal, centre, ks, "fisheye" if fisheye else "opencv", skew))
     if len(distortions) != 2:
-        notes.append("no distortion in the file: taken as none")
+        notes.append("no distortion in the file: assumed to be zero")
     elif not fisheye and all(len(lens.coefficients) == 4 for lens in lenses):
         notes.append("4 coefficients are read as k1 k2 p1 p2; those of cv2.fisheye look alike: compare with an image")
     turned, translation = rotation(turn, "R"), array(shift, (3,), "T")
     if translation[0] > 0:
-        notes.append("T[0] > 0: camera 2 stands to the left of camera 1; taken as it is")
+        notes.append("T[0] > 0: camera 2 is to the left of camera 1; used as it is")
     poses = ((np.eye(3), np.zeros(3)), (turned, translation))
     written = {_plain(key): key for key in reversed(list(merge_storages(source)))}
 

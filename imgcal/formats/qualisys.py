@@ -57,8 +57,8 @@ def _read(source: Source) -> ForeignRig:
         notes.append(f"{name_cameras(lost)}: left out, not active or not calibrated")
     if turned:
         notes.append(
-            f"{name_cameras(turned)}: mounted turned (viewrotation): the numbers are those of the sensor's own image, "
-            "before a video is turned upright"
+            f"{name_cameras(turned)}: mounted rotated (viewrotation): the numbers refer to the sensor's own image, "
+            "before a video is rotated upright"
         )
     return ForeignRig(FORMAT.name, tuple(cameras), "mm", "QTM's world (z up)", tuple(notes))
 

@@ -30,6 +30,7 @@ from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
 from imgcal.formats.format import Files, Format
 from imgcal.formats.source import Source
 from imgcal.io import is_file_name
+from imgcal.messages import with_article
 from imgcal.types import limits
 
 FORMATS = (  # asked in this order: who knows a file by more comes before who knows it by less
@@ -146,7 +147,7 @@ def _check_requested(source: Source, one: Format) -> Format:
             return one
     except FormatError as error:
         raise InputError(f"{source.where}: {error}") from error
-    raise InputError(f"{source.where}: this is no {one.title}: {_other(source) or _instead(source)}")
+    raise InputError(f"{source.where}: this is not {with_article(one.title)}: {_other(source) or _instead(source)}")
 
 
 def _other(source: Source) -> str:
@@ -155,7 +156,7 @@ def _other(source: Source) -> str:
         found = recognize_format(source)
     except InputError:
         return ""
-    return f"it is a {found.title} ({found.name})"
+    return f"it is {with_article(found.title)} ({found.name})"
 
 
 def is_foreign(path: Path) -> bool:
@@ -174,12 +175,13 @@ def _instead(source: Source) -> str:
     values = merge_storages(source)
     if is_matrix(values.get("camera_matrix")) or is_matrix(values.get("cameraMatrix")) or is_matrix(values.get("K")):
         return (
-            "this is an OpenCV calibration of one camera: extrinsics in it are those of its boards; a rig needs where "
-            "its cameras stand to each other"
+            "this is an OpenCV calibration of one camera: its extrinsics are those of the boards, and a rig needs the "
+            "poses of its cameras"
         )
     if {"R", "T"} <= values.keys() and is_matrix(values["R"]):
         return (
-            "this is an OpenCV file of extrinsics alone: give the file with M1, D1, M2, D2, too, or the folder of both"
+            "this is an OpenCV file with only extrinsics: give the file with M1, D1, M2, D2 as well, or the folder of "
+            "both"
         )
     if isinstance(values.get("frames"), list) and ("transform_matrix" in str(values["frames"][:1])):
         return "this is a transforms.json of nerfstudio: convert its COLMAP model instead"
@@ -200,7 +202,7 @@ def _read(source: Source, one: Format) -> ForeignRig:
     try:
         rig = one.read(source)
     except FormatError as error:
-        raise InputError(f"{source.where}: this is a {one.title}: {error}") from error
+        raise InputError(f"{source.where}: this is {with_article(one.title)}: {error}") from error
     if len(rig.cameras) > limits.MOST_CAMERAS:
         raise InputError(f"{source.where}: found {len(rig.cameras)} cameras, expected at most {limits.MOST_CAMERAS}")
     return _make_names_sound(replace(rig, format=one.name))

@@ -72,8 +72,8 @@ def _read(source: Source) -> ForeignRig:
     infos = _infos(source)
     if len(infos) > 2:
         first, second = (info.path.name for info in infos[:2])
-        raise FormatError(f"{len(infos)} files: ROS says in them where two cameras are, no more; the poses of more are "
-                          f"in /tf and in no file: give the two of a pair (imgcal convert {first} {second} --out "
+        raise FormatError(f"{len(infos)} files: ROS camera_info files hold the poses of two cameras at most, and those "
+                          f"of more are only in /tf: give the two of a pair (imgcal convert {first} {second} --out "
                           "rig.yaml), or the folder to imgcal calibrate --cameras, which finds the poses")  # fmt: skip
     if len(infos) == 1:
         return _single(infos[0])
@@ -81,15 +81,15 @@ def _read(source: Source) -> ForeignRig:
     left, right = infos
     if not right.shift.any():
         raise FormatError(
-            "two files without Tx in P: these are two single cameras, and where they are to each other is not said: "
+            "two files without Tx in P: these are single cameras without a pose relative to each other; "
             "imgcal calibrate --cameras FOLDER finds the poses"
         )
     notes = ["a stereo pair: X_right = R_r^T (R_l X_left + (Tx / fx', 0, 0)), metres; the rig's frame is the left "
              "camera's, unrectified"]  # fmt: skip
     if left.shift.any():
-        notes.append("both files have Tx or Ty in P: their difference counts")
+        notes.append("both files have Tx or Ty in P: their difference is used")
     if right.shift[0] > left.shift[0]:
-        notes.append("Tx > 0: the cameras are called the other way round than they stand; taken as it is")
+        notes.append("Tx > 0: left and right seem to be swapped; used as it is")
     turned = nearest_rotation(right.rectified.T @ left.rectified, "R of the pair")
     translation = right.rectified.T @ (right.shift - left.shift)
     cameras = (
@@ -197,7 +197,7 @@ def _rectification(right: ForeignCamera, left_name: str) -> tuple[Array, Array, 
     x = -x if turned_round else x
     if abs(x[0]) < 0.5:
         raise FormatError(
-            f"camera {right.name} stands above, below, before or behind camera {left_name}, expected a stereo pair, "
+            f"camera {right.name} is above, below, before or behind camera {left_name}, expected a stereo pair, "
             "side by side: choose another with --cameras"
         )
     ahead = np.array([0.0, 0.0, 1.0]) + right.rotation.T @ np.array([0.0, 0.0, 1.0])

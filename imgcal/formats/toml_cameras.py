@@ -69,7 +69,7 @@ def find_tables(source: Source) -> Tables | None:
             metadata = values.get("metadata")
             found.append((document.path.name, Tables(cameras, metadata if isinstance(metadata, dict) else {})))
     if len(found) > 1:
-        raise FormatError(f"{list_names(name for name, _ in found)} have cameras in TOML each: give one of these files")
+        raise FormatError(f"{list_names(name for name, _ in found)}: each has cameras; give one of these files")
     return found[0][1] if found else None
 
 
@@ -118,11 +118,11 @@ def read_cameras(tables: Mapping[str, Table], notes: list[str]) -> tuple[Foreign
     if without_lens:
         notes.append(f"{name_cameras(without_lens)}: left out, intrinsics are not calibrated")
     if without_pose:
-        notes.append(f"{name_cameras(without_pose)}: left out, where they stand is not calibrated")
+        notes.append(f"{name_cameras(without_pose)}: left out, poses are not calibrated")
     if not cameras:
         raise FormatError(
-            f"no camera has both intrinsics and a pose: {'; '.join(notes[own:])}; imgcal calibrate --cameras finds out "
-            "where they stand"
+            f"no camera has both intrinsics and a pose: {'; '.join(notes[own:])}; imgcal calibrate --cameras finds "
+            "the poses"
         )
     if len(at_origin) > 1:
         raise FormatError(
@@ -283,7 +283,7 @@ def _read_freemocap(source: Source) -> ForeignRig:
         notes.append("the world is the board that lay on the ground")
     frame = "the board on the ground" if plane else "the file's world (near the first camera, or the board)"
     if any(camera.lens.length == 5 for camera in cameras):
-        notes.append("FreeMoCap itself drops k3 when it reads this file; here it counts")
+        notes.append("FreeMoCap itself drops k3 when it reads this file; imgcal uses it")
     return ForeignRig(FREEMOCAP.name, cameras, "mm", frame, tuple(notes))
 
 
@@ -306,7 +306,7 @@ def _read_caliscope(source: Source) -> ForeignRig:
     notes = ["metres"]
     cameras = read_cameras(tables, notes)
     if kept := [name for name in ignored if name in [camera.name for camera in cameras]]:
-        notes.append(f"{name_cameras(kept)}: marked `ignore` in the file; used all the same, with the pose it has")
+        notes.append(f"{name_cameras(kept)}: marked `ignore` in the file, but used, with its pose")
     return ForeignRig(CALISCOPE.name, cameras, "m", "the file's world (as set in caliscope)", tuple(notes))
 
 
@@ -329,8 +329,8 @@ def _caliscope_tables(source: Source) -> dict[str, Table]:
             turned.append(name)
     if turned:
         raise FormatError(
-            f"{name_cameras(turned)}: rotation_count is not 0: the images were turned before they were used, and the "
-            "file does not say what K then refers to; turn the videos, and calibrate again"
+            f"{name_cameras(turned)}: rotation_count is not 0: the images were rotated before use, and the file does "
+            "not state which orientation K refers to; rotate the videos and calibrate again"
         )
     return found
 

@@ -53,13 +53,13 @@ def _read(source: Source) -> ForeignRig:
         raise FormatError("no camera has a KeyFrame with a pose: it was never calibrated")
     notes = [
         "millimetres; which axis is up is not in the file",
-        "distortion: from the image to the ideal, in pixels (VICON_RADIAL2, else VICON_RADIAL); others get it by a fit",
-        "pixel centres are taken to lie at whole numbers: not documented, but best by a real calibration",
+        "distortion: from the image to the ideal, in pixels (VICON_RADIAL2 or VICON_RADIAL); other formats get a fit",
+        "pixel centres are assumed at whole numbers: not documented, but a real calibration fits best so",
     ]
     if lost:
         notes.append(f"{name_cameras(lost)}: left out, without a KeyFrame")
     if several:
-        notes.append(f"{name_cameras(several)}: moves (several KeyFrames); the first is taken")
+        notes.append(f"{name_cameras(several)}: moves (several KeyFrames); the first is used")
     return ForeignRig(FORMAT.name, tuple(cameras), "mm", "Vicon's world", tuple(notes))
 
 

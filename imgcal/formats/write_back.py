@@ -19,6 +19,7 @@ from imgcal.formats.registry import find_format, is_foreign, read_back, read_for
 from imgcal.formats.source import SUFFIXES, Source
 from imgcal.formats.values import name_cameras
 from imgcal.io import read_bytes
+from imgcal.messages import with_article
 
 DIGITS = (0, 9, 12, 17)  # tried in this order: those of the file first
 ROUNDING = 1e-3  # px that the digits of a file may cost: a hundredth of how well markers are measured
@@ -74,7 +75,7 @@ def write_into(
     try:
         return _written(rig, old, original, now, unit, limit, original_rig)
     except FormatError as error:
-        raise InputError(f"{where}: this is a {title}: {error}") from error
+        raise InputError(f"{where}: this is {with_article(title)}: {error}") from error
 
 
 def _written(
@@ -90,12 +91,12 @@ def _written(
     absent = [camera for camera in rig.names if camera not in old.names]
     if absent:
         raise InputError(
-            f"{where}: {name_cameras(absent)} not in it, which has {name_cameras(old.names)}: choose with "
+            f"{where}: found {name_cameras(old.names)}, expected also {name_cameras(absent)} of the rig: choose with "
             "--cameras, or rename"
         )
     if unit is None and old.unit is None and len(old.cameras) > 1:
         raise InputError(
-            f"{where}: its unit of length is not said in the file: state it with --out-unit mm, cm, m, inch"
+            f"{where}: the file does not state its unit of length: give it with --out-unit mm, cm, m, inch"
         )
     length = millimetres(unit or old.unit or "mm", "--out-unit")
     found = {camera.name: camera for camera in rig.scale(1.0 / length, unit or old.unit or "mm").cameras}
@@ -122,14 +123,16 @@ def _written(
         files, stamps = _patch(contents, changes, digits, now)
         back = read_back(files, old.format, original_rig)
         if back.names != old.names:
-            raise FormatError("what was written is read back with other cameras")
+            raise FormatError("the new file, read back, has other cameras")
         reread, points = worst_difference(sized, _fill_sizes(back, rig))
         if reread <= ROUNDING:
             break
     else:
-        raise FormatError(f"what was written is read back {reread:.3g} px off: nothing is written")
+        raise FormatError(f"the new file, read back, is {reread:.3g} px off: nothing is written")
     if digits:
-        notes.append(f"numbers have at least {digits} digits: those of the file would cost more than {ROUNDING:g} px")
+        notes.append(
+            f"numbers have at least {digits} digits: as many as in the file would cost more than {ROUNDING:g} px"
+        )
     notes += stamps
     kept = tuple(camera.name for camera in old.cameras if camera.name not in fits)
     inexact = [fit for fit in fits.values() if not fit.exact]
@@ -252,7 +255,7 @@ def _patch(
                 if replaced:
                     notes.append(f"{path.name}: {', '.join(replaced)} set to {now:%Y-%m-%d %H:%M:%S}")
                 if left:
-                    notes.append(f"{path.name}: {', '.join(left)} left as it is: a time in no known form")
+                    notes.append(f"{path.name}: {', '.join(left)} unchanged: a time of unknown form")
         files[path.name] = made
     return files, notes
 

@@ -73,7 +73,7 @@ def convert_rig(
     target = find_format(to)
     if target.write is None:
         able = ", ".join(one.name for one in FORMATS if one.write is not None)
-        raise InputError(f"--to {to}: {target.title} is only read, expected one of imgcal, {able}")
+        raise InputError(f"--to {to}: {target.title} can only be read, expected one of imgcal, {able}")
     least, most = target.cameras
     if not least <= len(rig.cameras) <= most:
         count = f"{least}" if least == most else f"{least} to {most}"
@@ -98,7 +98,7 @@ def convert_rig(
     if sorted(back.names) == sorted(rig.names):  # files of a folder come in the order of their names
         back = select_cameras(back, tuple(rig.names))
     else:
-        notes.append(f"cameras are called otherwise there, in this order: {', '.join(back.names[:8])}")
+        notes.append(f"the cameras have other names in the files, in this order: {', '.join(back.names[:8])}")
     return _compare(rig, held, back, files, notes)
 
 

@@ -26,7 +26,7 @@ from imgcal.messages import list_names
 from imgcal.types import CameraRig, Detections
 
 FORMAT = "imgcal-capture/1"
-DIFFER = "--videos-differ (in Python videos_differ=True) takes them by number all the same"
+DIFFER = "--videos-differ (in Python videos_differ=True) matches them by number anyway"
 
 
 class _Settings(StrictModel):

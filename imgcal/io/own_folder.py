@@ -66,9 +66,7 @@ def _lock(folder: Path) -> Iterator[None]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             if error.errno in TAKEN:
-                raise InputError(
-                    f"{folder}: found another imgcal at work there, expected a folder of its own for each"
-                ) from error
+                raise InputError(f"{folder}: another imgcal is using this folder: choose another one") from error
         yield
     finally:
         os.close(descriptor)

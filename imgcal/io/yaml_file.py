@@ -36,7 +36,7 @@ DECIMAL = re.compile(r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))([eE][-+]?[0
 MERGE = object()  # stands for the key `<<`
 Mark = Any  # of PyYAML: where in the text
 INSTEAD = {
-    ("imgcal-rig/1", "imgcal-cameras/1"): ": these cameras have no places yet; imgcal calibrate finds them where the "
+    ("imgcal-rig/1", "imgcal-cameras/1"): ": these cameras have no poses yet; imgcal calibrate finds them if the "
     "file is given as --cameras instead of --rig (in Python: load_cameras, calibrate_from_scratch)",
 }
 """What to do with a file of another format (the second) than the one that was expected."""
@@ -118,9 +118,7 @@ class _Builder:
             self._add(value, event.start_mark)
         elif kind is yaml.AliasEvent:
             if event.anchor not in self.anchors:
-                _fail(
-                    f"found the alias *{event.anchor} of nothing, or of what it is itself a part of", event.start_mark
-                )
+                _fail(f"found the alias *{event.anchor} without an anchor, or inside its own anchor", event.start_mark)
             value, count = self.anchors[event.anchor]
             self._count(count, event.start_mark)
             self._add(value, event.start_mark)
@@ -134,7 +132,7 @@ class _Builder:
         _check_tag(event, self.mapping_tags if isinstance(value, dict) else LIST)
         self._check_not_a_key(event.start_mark)
         if len(self.open) == MOST_DEPTH:
-            _fail(f"found more than {MOST_DEPTH} levels, one within the other", event.start_mark)
+            _fail(f"found more than {MOST_DEPTH} nested levels", event.start_mark)
         self.open.append(_Open(value, event.anchor, self.count))
         self._count(1, event.start_mark)
 
@@ -171,7 +169,7 @@ class _Builder:
         if within.key is MERGE:
             sources = value if isinstance(value, list) else [value]
             if not all(isinstance(source, dict) for source in sources):
-                _fail("found a merge key `<<` of something else than mappings", mark)
+                _fail("found a merge key `<<` whose value is not a mapping", mark)
             within.merged = [*(within.merged or ()), *sources]
         else:
             within.value[within.key] = value
@@ -184,7 +182,7 @@ class _Builder:
     def _count(self, more: int, mark: Mark) -> None:
         self.count += more
         if self.count > MOST_VALUES:
-            _fail(f"found more than {MOST_VALUES:,} values, with what aliases and merge keys repeat", mark)
+            _fail(f"found more than {MOST_VALUES:,} values, counting what aliases and merge keys repeat", mark)
 
     def _scalar(self, event: Any) -> Any:
         text: str = event.value

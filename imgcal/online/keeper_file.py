@@ -88,7 +88,7 @@ def read_state(path: str | Path) -> tuple[dict[str, Any], StateReader]:
     if found != FORMAT and isinstance(found, str) and found.startswith(FORMAT[: FORMAT.index("/") + 1]):
         raise InputError(
             f"{path}: State files from {'earlier' if found < FORMAT else 'later'} versions cannot be resumed: found "
-            f'{shorten(found)}, expected {FORMAT}; the last rig stands in the file as "rig"'
+            f'{shorten(found)}, expected {FORMAT}; the file holds the last rig as "rig"'
         )
     if found != FORMAT:
         raise InputError(f'{path}: found format {shorten(repr(found))}, expected "{FORMAT}"')

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from imgcal.association import Lights, associate_lights, undistort
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
+from imgcal.messages import plural
 from imgcal.online.camera_visibility import well_inside
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.label_consistency import MOST_APART, Checked
@@ -65,7 +66,7 @@ def label_lights(memory: KeeperMemory, tracks: LightTracks, blobs: Detections) -
     if not len(found):
         tracks.mark_still(blobs.camera, blobs.uv, np.zeros(len(blobs), dtype=bool), time)
         some = len(np.unique(blobs.camera[rows]))
-        seen = "no moving blob is seen" if not some else f"{some} cameras see moving blobs"
+        seen = f"moving blobs are seen by {plural(some, 'camera')}" if some else "no moving blob is seen"
         raise RefusedError(f"identity: found no light on which three cameras agree: {seen}")
     numbers = tracks.number_lights(found.point, time)
     scene = _Scene(rig, blobs, found, rows)

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from imgcal.messages import plural
 from imgcal.pipeline.calibration import Calibration
 
 FIELDS = 8
@@ -38,7 +39,8 @@ class Place:
         parts = [
             f"{value:+.0f} mm in {axis}" for axis, value in zip("xyz", self.offset, strict=True) if abs(value) >= 1
         ]
-        return f"{', '.join(parts) or 'where it was'} ({self.fields} new fields in {self.cameras} cameras)"
+        new = f"{plural(self.fields, 'new field')} in {plural(self.cameras, 'camera')}"
+        return f"{', '.join(parts) or 'where it was'} ({new})"
 
 
 @dataclass(frozen=True)
@@ -60,8 +62,8 @@ class Coverage:
             for name, cameras in self.undetermined.items():
                 by_cameras.setdefault(cameras, []).append(name)
             parts = [f"{', '.join(names)} in {_cameras(cameras, count)}" for cameras, names in by_cameras.items()]
-            stands = "what was assumed stands" if self.from_scratch else "the factory's values stand"
-            words.append(f"Not determined by these data, {stands}: {'; '.join(parts)}.")
+            kept = "assumed" if self.from_scratch else "factory"
+            words.append(f"Not determined by these data ({kept} values kept): {'; '.join(parts)}.")
         low, high = (round(100 * f(self.coverage)) for f in (min, max))
         if low < 100 * LITTLE:
             share = f"{low}" if low == high else f"{low} to {high}"

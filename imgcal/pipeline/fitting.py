@@ -151,8 +151,8 @@ def _fit_once(
     alike = labelled.identity == "ambiguous" and len(labelled.used) > 1
     if alike and obj.tolerance is not None and bool(obj.tolerance.any()):
         raise RefusedError(
-            "object: it can be turned into itself, and each snapshot may have the labels of another turn: where its "
-            "fiducials are within their tolerances cannot be estimated",
+            "object: it is symmetric, and snapshots may be labelled in different orientations: the places of its "
+            "fiducials within their tolerances cannot be estimated",
             python="give labels (Detections.fiducial), use an object without symmetry, or one without tolerances",
             command="give labels (a column `fiducial`), use an object without symmetry, or one without tolerances",
         )

@@ -28,7 +28,7 @@ from imgcal.association import (
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import K3, ColdStart, cold_start, ordinary_lens
-from imgcal.messages import list_names
+from imgcal.messages import list_names, plural
 from imgcal.pipeline.board_turns import require_one_turn
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.lights_from_scratch import calibrate_lights_from_scratch, place_by_stick
@@ -106,7 +106,7 @@ def calibrate_from_scratch(
         True
     """
     if distance is not None and obj.pose_rank > 3:
-        raise InputError("distance: found an object of known size, expected unknown markers, which know no scale")
+        raise InputError("distance: found an object of known size, which sets the scale; expected unknown markers")
     if obj.parts:
         obj.require_rigid("to calibrate without a factory calibration")
     started, cameras, options = time.perf_counter(), _set_prior(cameras), options.of_object(obj)
@@ -253,8 +253,9 @@ def _first_rig(labelled: Detections, cameras: CameraRig, obj: CalibrationObject)
     """Place the cameras by the labels."""
     if not (labelled.fiducial >= 0).any():
         raise RefusedError(
-            f"identity: in none of {len(labelled.snapshot_names)} snapshots can a single camera tell which blob is "
-            "which fiducial: show the whole object and few other bright things, and check the field of view"
+            f"identity: in no snapshot ({plural(len(labelled.snapshot_names), 'snapshot')} tried) can a single camera "
+            "tell which blob is which fiducial: show the whole object and few other bright things, and check the field "
+            "of view"
         )
     first = cold_start(to_observations(labelled, cameras, obj), cameras, obj)
     if first.spread > LARGEST_SPREAD:

@@ -85,7 +85,7 @@ class LearnedProposer:
         """
         near = self._around(snapshot) if snapshot.candidates else None
         if self.finder is None:
-            return near or Proposal.decline(snapshot, "found no pose to look around")
+            return near or Proposal.decline(snapshot, "found no pose to start from")
         finder = self.finder
         if near is not None and self._convinces(near, snapshot):
             return replace(near, otherwise=lambda: replace(finder.propose(snapshot), found_by=finder.name))
@@ -123,7 +123,7 @@ class LearnedProposer:
         view, looks = view.align(poses[:1]) if view.tiles.divided else (view, view.near(poses))
         if view.tiles.divided and not looks.count:
             return Proposal.decline(
-                snapshot, "too little of the object is to be seen to tell one step of its pattern from the next"
+                snapshot, "too little of the object is visible to tell one step of its pattern from the next"
             )
         fitted = view.fit(looks, view.observations(looks))
         for _ in range(LOOKS - 1):

@@ -21,6 +21,7 @@ from imgcal.association import Lights, PipelineOptions, associate_lights, backgr
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import cold_start_from_points, move_to_pair_frame, prior_of_pair
 from imgcal.geometry import RigidTransform
+from imgcal.messages import plural
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.fitting import fit_steady
 from imgcal.pipeline.lights import (
@@ -226,8 +227,8 @@ def _pair_observations(detections: Detections, cameras: CameraRig, markers: int)
     kept: NDArray[np.bool_] = seen.sum((1, 2)) >= 2
     if kept.sum() < LEAST_ALONE:
         raise RefusedError(
-            f"start without a factory calibration: found {int(kept.sum())} snapshots in which two cameras see "
-            f"{'one moving blob' if markers == 1 else f'{markers} moving blobs'} each, expected at least "
+            f"start without a factory calibration: found {plural(int(kept.sum()), 'snapshot')} in which two cameras "
+            f"see {'one moving blob' if markers == 1 else f'{markers} moving blobs'} each, expected at least "
             f"{LEAST_ALONE}: carry one {'light' if markers == 1 else 'stick'} alone through what the cameras see"
         )
     return Observations(*(torch.from_numpy(column[kept]) for column in (uv, sigma, seen)))

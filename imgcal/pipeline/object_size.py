@@ -107,8 +107,8 @@ def require_one_size(fit: Estimate, names: tuple[str, ...]) -> None:
         raise RefusedError(
             f"object: from snapshot {names[step.first]} on it is {100 * abs(step.change):.2g} +- "
             f"{100 * step.sigma:.1g} % {how} than before: another object, or other lenses",
-            python="calibrate the snapshots before and after by themselves",
-            command="calibrate the snapshots before and after by themselves",
+            python="calibrate the snapshots before and after separately",
+            command="calibrate the snapshots before and after separately",
         )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.association import Associations
+from imgcal.messages import plural
 from imgcal.types import Detections
 
 LEAST_BLOBS = 2
@@ -36,10 +37,13 @@ class Repeats:
         """Summary for people; empty if there are none."""
         parts = []
         if self.images:
-            whole = f", {len(self.snapshots)} whole snapshots among them" if self.snapshots else ""
-            parts.append(f"{self.images} images have exactly the blobs of an earlier image of their camera{whole}")
+            whole = f", {plural(len(self.snapshots), 'whole snapshot')} among them" if self.snapshots else ""
+            has = "has" if self.images == 1 else "have"
+            parts.append(
+                f"{plural(self.images, 'image')} {has} exactly the blobs of an earlier image of the same camera{whole}"
+            )
         if self.rows:
-            parts.append(f"{self.rows} blobs are listed twice")
+            parts.append(f"{plural(self.rows, 'blob')} {'is' if self.rows == 1 else 'are'} listed twice")
         return f"{' and '.join(parts)}: these copies are left out" if parts else ""
 
 

@@ -17,6 +17,7 @@ from imgcal.fleet import Dataset, KindOfRig, LearntPrior, standardized_offsets
 from imgcal.fleet import refusals as reasons_of
 from imgcal.io import write_text
 from imgcal.live_page import read_asset, render_page
+from imgcal.messages import plural
 from imgcal.report import svg
 from imgcal.report.svg import Axes
 from imgcal.types import PARAMETER_KINDS, RigPrior
@@ -79,8 +80,8 @@ def _sentence(table: Mapping[str, Sequence[Any]], taught: Sequence[Taught]) -> s
     total, ok = len(table["status"]), table["status"].count("ok")
     devices = sum(len(one.kind.devices) for one in taught)
     outliers = sum(len(one.learnt.outliers) for one in taught if one.learnt)
-    out = "no camera is" if not outliers else f"{outliers} camera{'s are' if outliers > 1 else ' is'}"
-    found = f"{ok} of {total} captures recalibrated, of {devices} devices"
+    out = "no camera is" if not outliers else f"{plural(outliers, 'camera')} {'is' if outliers == 1 else 'are'}"
+    found = f"{ok} of {total} captures recalibrated, of {plural(devices, 'device')}"
     return f"{found}; {out} farther off than the fleet's drift explains."
 
 

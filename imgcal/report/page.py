@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from imgcal.io import write_text
 from imgcal.live_page import read_asset, render_page, to_json
+from imgcal.messages import plural
 from imgcal.pipeline import MOVED, UNDETERMINED
 from imgcal.report import accuracy, charts, overlay, scene, svg, tables
 from imgcal.report.content import ReportContent
@@ -110,7 +111,7 @@ def _coverage(content: ReportContent) -> dict[str, object]:
     counts = content.detections.count_by_camera(rows)
 
     def words(camera: int) -> str:
-        number = f"{svg.group_digits(int(counts[camera]))} blobs"
+        number = f"{svg.group_digits(int(counts[camera]))} blob{'' if counts[camera] == 1 else 's'}"
         if not labelled.any():  # what a reflection covers is unknown
             return f"{number}, none labelled"
         return f"{number}, {100 * charts.covered_share(content, camera):.0f} %"
@@ -197,7 +198,9 @@ def _subsampling(content: ReportContent) -> list[str]:
     total = 0 if content.object_points is None else len(content.object_points)
     known = sum(not s.reason for s in content.snapshots)
     if len(snapshots) and (len(snapshots) < known or len(fiducials) < total):
-        notes.append(f"The rig shows {len(snapshots)} snapshots and {len(fiducials)} of {total} fiducials in each.")
+        notes.append(
+            f"The rig shows {plural(len(snapshots), 'snapshot')} and {len(fiducials)} of {total} fiducials in each."
+        )
     d = content.detections
     if int(d.count_by_camera(d.snapshot == content.frame_snapshot).max()) > overlay.blobs_drawn(content):
         notes.append(f"The overlays show at most {overlay.blobs_drawn(content)} blobs of each camera.")

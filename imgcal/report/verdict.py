@@ -25,10 +25,10 @@ ABOUT_OBJECT = ("object:", "estimation: the object", "estimation: fiducial")
 IDENTITY = {
     "coded": "The fiducials came labelled with the input.",
     "unique": "Every fiducial was recognized, and only one labelling explains what the cameras saw.",
-    "by_prior": "The pose that was given decided between look-alike orientations of the object.",
+    "by_prior": "The given pose decided between look-alike orientations of the object.",
     "by_tracking": "The labels were carried from snapshot to snapshot; the motion excluded look-alike positions.",
     "ambiguous": (
-        "The object can be turned into itself, so its absolute orientation is not known. All cameras use the same "
+        "The object is symmetric, so its absolute orientation is unknown. All cameras use the same "
         "choice, so the rig is valid."
     ),
 }
@@ -63,7 +63,7 @@ def unexplained_sentences(content: ReportContent) -> list[tuple[str, str]]:
         for camera in np.flatnonzero(content.unexplained > DOUBTFUL * np.maximum(content.unexplained + used, 1)):
             name = content.cameras[camera]
             notes.append((
-                f"{name}: {content.unexplained[camera]} blobs may be fiducials and are not where these should be; "
+                f"{name}: {content.unexplained[camera]} blobs may be fiducials but are not where fiducials should be; "
                 f"{used[camera]} are.",
                 f"Look at the overlay of {name}: reflections where the object is hidden are harmless; a pattern beside "
                 "its place means that the camera has moved, or is late.",
@@ -171,7 +171,7 @@ def _reservations(content: ReportContent) -> list[tuple[str, str]]:
     blind = [name for name, n in zip(content.cameras, content.observations, strict=True) if n == 0]
     if blind:
         notes.append((
-            f"No usable observations in {_list_names(blind)}: not recalibrated, still at the factory's values.",
+            f"No usable observations in {_list_names(blind)}: not recalibrated, factory values kept.",
             f"Bring the object into the view of {_list_names(blind)} and check exposure and cabling.",
         ))  # fmt: skip
     few = [name for name, n in zip(content.cameras, content.observations, strict=True) if 0 < n < FEW_OBSERVATIONS]
@@ -269,8 +269,8 @@ def _helpful(content: ReportContent) -> list[str]:
     if content.reason.startswith(ABOUT_OBJECT):
         return [
             *steps,
-            "Check that the object file is that of the object in the images, and that it was one and the same object "
-            "all the time; measure it again.",
+            "Check that the object file is that of the object in the images, and that it was the same object "
+            "throughout; measure it again.",
         ]
     steps.append("Check that the factory file belongs to this rig and that no camera was exchanged.")
     steps.append("Capture more snapshots, the whole object in view of as many cameras as possible, in varied poses.")

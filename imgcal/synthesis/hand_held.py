@@ -22,6 +22,6 @@ class HandHeld(StrictRecord):
         800.0
     """
 
-    speed: Annotated[float, Field(gt=0, le=20_000)] = 500.0  #: mm/s, mean speed of the object
-    turning: Annotated[float, Field(gt=0, le=2000)] = 45.0  #: degrees/s, mean
-    rate: Annotated[float, Field(gt=0, le=10_000)] = 5.0  #: snapshots a second
+    speed: Annotated[float, Field(gt=0, le=20_000)] = 500.0  #: mm/s, mean speed of a hand-held object
+    turning: Annotated[float, Field(gt=0, le=2000)] = 45.0  #: degrees/s, mean turning speed of a hand-held object
+    rate: Annotated[float, Field(gt=0, le=10_000)] = 5.0  #: snapshots a second of a hand-held object

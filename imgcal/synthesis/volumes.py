@@ -184,7 +184,7 @@ def find_seen_volume(rig: CameraRig) -> ConvexVolume:
     seen = rig.to(torch.float64).project(places).visible.sum(0)
     most = int(seen.max())
     if most < 2:
-        raise InputError(f"rig {rig.name}: found no two cameras that see the same, expected the key `volume`, in mm")
+        raise InputError(f"rig {rig.name}: found no two cameras with a common view, expected the key `volume`, in mm")
     together = places[seen >= max(2, (most + 1) // 2)]
     low, high = torch.quantile(together, torch.tensor([OUTER, 1 - OUTER], dtype=torch.float64), dim=0).tolist()
     return ConvexVolume.box(tuple(low), tuple(high))

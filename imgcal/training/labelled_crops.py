@@ -21,6 +21,7 @@ from imgcal.errors import RefusedError
 from imgcal.estimation import estimate
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.matching import measure_markers
+from imgcal.messages import plural
 from imgcal.networks import Expectation, Tiles, cut_crops, cut_patches
 from imgcal.training.frame_dataset import FrameDataset, PatchDataset
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
@@ -300,8 +301,9 @@ def split(crops: Part, snapshots: int, cameras: int) -> tuple[Part, Part]:
         train = ~held_out
     if not bool(train.any() and held_out.any()):
         raise RefusedError(
-            f"harvest: found {int(train.sum())} training crops and {int(held_out.sum())} held-out crops in "
-            f"{snapshots} snapshots of {cameras} cameras, expected some of both: capture more snapshots"
+            f"harvest: found {plural(int(train.sum()), 'training crop')} and "
+            f"{plural(int(held_out.sum()), 'held-out crop')} in {plural(snapshots, 'snapshot')} of "
+            f"{plural(cameras, 'camera')}, expected some of both: capture more snapshots"
         )
     return crops.select(train), crops.select(held_out)
 

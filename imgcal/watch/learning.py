@@ -30,6 +30,7 @@ from imgcal.detection import DetectionOptions, Frame
 from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform
 from imgcal.matching import MatchedFilter
+from imgcal.messages import plural
 from imgcal.online import RigState
 from imgcal.pipeline import load_proposer
 from imgcal.types import CalibrationObject, CameraRig, Detections
@@ -184,7 +185,8 @@ class Learning:
     def summary(self) -> str:
         """What was learnt, in a few words."""
         why = "" if self.kept else " (none qualified, or the source ended before the learning process was ready)"
-        return f"learning: {self.kept} snapshots{why}, {self.trainings} trainings, {self.adopted} adopted"
+        trained = f"{plural(self.trainings, 'training')}, {self.adopted} adopted"
+        return f"learning: {plural(self.kept, 'snapshot')}{why}, {trained}"
 
     @property
     def process_id(self) -> int:

@@ -5,7 +5,6 @@ Run as `python -m scripts.results.live_picture`; takes a minute and needs Debian
 
 from __future__ import annotations
 
-import io
 import shutil
 import tempfile
 import threading
@@ -15,19 +14,16 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
-from PIL import Image
 
 import imgcal
 from imgcal.errors import InputError
-from imgcal.io import write_bytes
 from imgcal.live_page import Address, Demonstration
-from scripts.output import ROOT, command
+from scripts.output import ROOT, command, save_picture
 
 ARGUMENTS = [
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
-COLOURS = 128
 
 
 @dataclass(frozen=True)
@@ -75,11 +71,7 @@ def main() -> None:
         finally:
             ended.set()
             running.join()
-    packed = io.BytesIO()
-    Image.open(io.BytesIO(picture)).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(
-        packed, "png", optimize=True
-    )
-    write_bytes(options.out, packed.getvalue())
+    save_picture(picture, options.out)
 
 
 if __name__ == "__main__":

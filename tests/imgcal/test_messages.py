@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.messages import LONGEST, MOST_QUOTED, brief_repr, list_names, one_line, quote, shorten
+from imgcal.messages import LONGEST, MOST_QUOTED, brief_repr, list_names, one_line, plural, quote, shorten, with_article
 
 
 @pytest.mark.parametrize("length", [0, 1, 40, 41, 10_000])
@@ -27,6 +27,14 @@ def test_lists_say_how_many_they_leave_out() -> None:
     found = list_names(iter(names))
     assert found == "camera000, camera001, camera002, camera003, ... (300 in all)"
     assert len(list_names(["x" * 5000] * 5000)) < MOST_QUOTED + 50
+
+
+def test_one_of_a_kind_is_singular() -> None:
+    assert [plural(count, "event") for count in (0, 1, 2, 1200)] == ["0 events", "1 event", "2 events", "1,200 events"]
+
+
+def test_articles_fit_the_noun() -> None:
+    assert [with_article(noun) for noun in ("ROS file", "OpenCV pair")] == ["a ROS file", "an OpenCV pair"]
 
 
 def test_one_line_is_one_line_of_text() -> None:

@@ -38,8 +38,8 @@ def test_without_a_factory_calibration(wand_capture, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("more", "expected"),
     [
-        ([], "neither of --rig and --cameras"),
-        (["--rig", "T4", "--cameras", "cameras.yaml"], "both of --rig and --cameras"),
+        ([], "missing --rig (a factory calibration) or --cameras"),
+        (["--rig", "T4", "--cameras", "cameras.yaml"], "found both --rig and --cameras"),
         (["--cameras", "absent.yaml"], "absent.yaml"),
         (["--cameras", "cameras.yaml", "--first-guess", "points"], "--first-guess"),
         (["--cameras", "cameras.yaml", "--detector", "matched"], "--detector"),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from imgcal.cli import common as module
 from imgcal.cli.common import (
     check_folder,
     drop_cameras,
@@ -57,6 +58,14 @@ def test_blobs_are_found_in_the_frames_of_a_capture(workplace) -> None:
 def test_progress_yields_everything_whatever_shows_it(capsys) -> None:
     assert list(progress(iter("abc"), 3, "letters")) == ["a", "b", "c"]
     assert capsys.readouterr().err == ""  # no terminal
+
+
+def test_without_a_terminal_progress_is_a_line_a_minute(capsys, monkeypatch) -> None:
+    now = iter([30.0, 91.0, 92.0, 95.0])  # of each advance
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(now))
+    for _ in progress(range(4), 4, "letters"):
+        pass
+    assert capsys.readouterr().err == "letters: 2 of 4\n"
 
 
 def test_a_start_pose_is_a_rotation_vector_and_a_shift() -> None:

@@ -1,6 +1,10 @@
 """`imgcal compare --captures`: detectors on simulated captures."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -42,6 +46,22 @@ def test_captures_that_are_done_are_not_done_again(tmp_path, capsys, monkeypatch
     assert not (out / ".work").exists()
 
 
+def test_sigterm_beside_worker_processes_is_one_line():
+    pytest.importorskip("ray", reason="no ray (extra fleet)")
+    command = [sys.executable, "-m", "imgcal", "compare", "points-O10-cube8", "vit-O10-cube8", "--cores", "2"]
+    environment = os.environ | {"PYTHONPATH": str(Path.cwd())}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    assert process.stderr is not None
+    started = next(line for line in process.stderr if not line.startswith("imgcal: compiling"))
+    expected = "evaluating points-O10-cube8, vit-O10-cube8, "
+    assert started.startswith(expected) and started.endswith("on 3 trials of 20,000 random rigs (--trials, --count)\n")
+    process.send_signal(signal.SIGTERM)
+    printed, error = process.communicate(timeout=120)
+    said = [line for line in error.splitlines() if not line.startswith("imgcal: compiling")]
+    assert (process.returncode, printed) == (130, "")
+    assert said == ["imgcal: terminated"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -49,15 +69,18 @@ def test_captures_that_are_done_are_not_done_again(tmp_path, capsys, monkeypatch
         (["--captures", "-1"], "--captures: found -1, expected 1 to 100000"),
         (["--captures", "1", "--cores", "0"], "--cores: found 0"),
         (["--captures", "1", "--rig", "none.yaml"], "none.yaml"),
-        (["--captures", "1", "--kappa", "0.01"], "--kappa: found it with --captures, expected it where networks are"),
-        (["--captures", "1", "--sweep-count", "5"], "--sweep-count: found it with --captures"),
-        (["--captures", "1", "--trust", "a:B"], "--trust: found it with --captures"),
-        (["--captures", "1", "--baselines"], "--baselines: found it with --captures"),
+        (
+            ["--captures", "1", "--kappa", "0.01"],
+            "--kappa: cannot be used with --captures; it is for comparing networks",
+        ),
+        (["--captures", "1", "--sweep-count", "5"], "--sweep-count: cannot be used with --captures"),
+        (["--captures", "1", "--trust", "a:B"], "--trust: cannot be used with --captures"),
+        (["--captures", "1", "--baselines"], "--baselines: cannot be used with --captures"),
         (
             ["matched", "--difficulty", "clean"],
-            "--difficulty: found it without --captures, expected it where detectors",
+            "--difficulty: cannot be used without --captures; it is for comparing detectors",
         ),
-        (["matched", "--snapshots", "2"], "--snapshots: found it without --captures"),
+        (["matched", "--snapshots", "2"], "--snapshots: cannot be used without --captures"),
         (["matched"], "found classical, which is a detector, expected networks; detectors are compared on captured"),
     ],
 )

@@ -27,8 +27,26 @@ def test_a_kalibr_file_becomes_ours(camchain: Path, tmp_path: Path, capsys: pyte
     code, out, _ = run(capsys, camchain, "--out", tmp_path / "rig.yaml")
     assert code == 0
     assert "Kalibr camchain: 4 cameras; frame: camera cam0" in out
-    assert "(imgcal); re-read: worst difference" in out and "px on 588 points, lens models the same" in out
+    assert "(imgcal rig file); re-read: worst difference" in out and "px on 588 points, lens models the same" in out
     assert read_rig(tmp_path / "rig.yaml").camera_names == ("cam0", "cam1", "cam2", "cam3")
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "said"),
+    [
+        ("camchain.yaml", (), True),
+        ("my-kalibr.yaml", (), True),
+        ("rig.yaml", (), False),
+        ("camchain.yaml", ("--to", "imgcal"), False),
+    ],
+)
+def test_a_name_that_suggests_another_format_gets_a_note(
+    name: str, more: tuple[str, ...], said: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, _ = run(capsys, "T4", "--out", tmp_path / name, *more)
+    note = "note: --out ends in .yaml, so an imgcal rig file is written; --to kalibr writes a Kalibr camchain"
+    assert code == 0 and (note in out) == said and "(imgcal rig file)" in out
+    assert read_rig(tmp_path / name).num_cameras == 4
 
 
 def test_commands_take_it_as_a_rig(workplace: Workplace, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -74,7 +92,7 @@ def test_nothing_is_guessed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     [
         (["--out", "x.toml"], "--to: cannot tell the format from x.toml"),
         (["--out", "x.yaml", "--to", "calibr"], "found the format 'calibr'"),
-        (["--out", "x.yaml", "--to", "motive"], "is only read"),
+        (["--out", "x.yaml", "--to", "motive"], "can only be read"),
         (["--out", "x.yaml", "--unit", "m"], "in mm, expected neither"),
         (["--out", "x.yaml", "--image-size", "12"], "--image-size: found '12'"),
         (["--out", "x.yaml", "--image-size", "cam01=1x1"], "--image-size says 1x1"),

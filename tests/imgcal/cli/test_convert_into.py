@@ -48,7 +48,7 @@ def test_the_success_line(recalibrated: tuple[Path, Path], tmp_path: Path, capsy
         (["--into", "rig.yaml", "--out", "new.xml"], "expected"),
         (["--into", "missing.xcp", "--out", "new.xcp"], "missing.xcp: no such file"),
         (["--into", "original.qca.txt", "--to", "imgcal", "--out", "new.xcp"], "--to: found imgcal"),
-        (["--into", "original.qca.txt", "--to", "vicon", "--out", "new.xcp"], "this is no Vicon calibration"),
+        (["--into", "original.qca.txt", "--to", "vicon", "--out", "new.xcp"], "this is not a Vicon calibration"),
         (["--into", "original.qca.txt", "--fit-limit", "0", "--out", "new.xcp"], "--fit-limit"),
         (["--into", "original.qca.txt", "--out-unit", "parsec", "--out", "new.xcp"], "--out-unit: found 'parsec'"),
     ],

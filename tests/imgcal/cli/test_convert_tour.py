@@ -80,11 +80,11 @@ def test_real_files_are_verified_in_every_format_or_refused_for_a_true_reason(
         fits = {camera.name: fit_lens(camera.lens, camera.image_size or (0, 0), holds) for camera in some}
         code, said, wrong = run(capsys, *asked, *names)
         if code == 3:
-            (camera,) = re.findall(r"camera (\S+): .* cannot say its lens", wrong)
+            (camera,) = re.findall(r"camera (\S+): .* cannot express its lens", wrong)
             assert wrong.count("\n") == 1 and fits[camera].worst > LIMIT, (to, wrong)
             continue
         if code == 2:
-            assert re.fullmatch(r"imgcal: --to ros: camera \S+ stands above, below, .* --cameras\n", wrong), (to, wrong)
+            assert re.fullmatch(r"imgcal: --to ros: camera \S+ is above, below, .* --cameras\n", wrong), (to, wrong)
             assert abs(direction(*some)[0]) < 0.5 + 1e-9  # more than 60 degrees off the first one's x
             continue
         assert (code, wrong) == (0, ""), (to, wrong)

@@ -48,6 +48,21 @@ def test_every_option_has_a_sentence(command, capsys, monkeypatch):
         assert [" ".join(page) + " " + name for name, text in said.items() if not re.search("[a-z]", text)] == []
 
 
+def test_sentences_are_not_broken_where_the_source_is(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "1000")
+    assert main(["calibrate", "--help"]) == 0
+    (row,) = (line for line in capsys.readouterr().out.splitlines() if "without a factory calibration" in line)
+    assert "field of view (imgcal rig cameras writes one)" in row and "defines the rig's frame (default: None)" in row
+
+
+def test_examples_have_lines_of_their_own(capsys):
+    for command in COMMANDS:
+        main([command, "--help"])
+        rows = [line.strip() for line in capsys.readouterr().out.splitlines()]
+        first = {"rig": "See imgcal rig look-at", "warmup": "RUN imgcal warmup"}.get(command, f"imgcal {command} ")
+        assert any(row.startswith(first) for row in rows), command
+
+
 def test_a_missing_sentence_would_be_noticed():
     rows = ["of a group", "--level {None}|INT  (default: None)", "--long INT", "       (required)", "-x  of x (1)"]
     assert sentences("options", rows) == {"--level {None}|INT": "", "--long INT": "", "-x": "of x (1)"}

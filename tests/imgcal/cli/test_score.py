@@ -1,4 +1,6 @@
 import json
+import re
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +29,21 @@ def test_truth_scores_zero_and_factory_does_not(workplace, capsys):
     assert {camera: values["points"] for camera, values in perfect["per_camera"].items()} == {
         f"cam0{i}": 24 for i in (1, 2, 3, 4)
     }
+
+
+def test_a_terminal_shows_a_table(workplace, capsys, monkeypatch):
+    given = [str(workplace.capture / "truth" / "detections.csv"), "--rig", str(workplace.rig)]
+    given += ["--object", str(workplace.object)]
+    monkeypatch.setattr(type(sys.stdout), "isatty", lambda stream: True)
+    assert main(["score", *given, "--json"]) == 0
+    expected = json.loads(capsys.readouterr().out)
+    assert main(["score", *given]) == 0
+    said = capsys.readouterr().out
+    cells = [re.findall(r"[\w.]+", line) for line in said.splitlines()]
+    rows = {row[0]: row[1:] for row in cells if len(row) == 5 and re.match("cam0|all", row[0])}
+    assert list(rows) == ["cam01", "cam02", "cam03", "cam04", "all"]
+    assert rows["all"] == [f"{expected['median_px']:.3g}", f"{expected['rms_px']:.3g}", "96", str(expected["outliers"])]
+    assert rows["cam02"][2] == "24" and "3 snapshots used, 0 rejected" in said
 
 
 def test_a_rig_of_mixed_lenses_is_simulated_scored_and_calibrated(workplace, tmp_path, capsys):

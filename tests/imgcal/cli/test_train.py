@@ -118,7 +118,7 @@ def test_a_second_training_in_a_folder_is_refused_and_harms_nothing(experiment, 
     with holding(out):
         assert train(experiment, out, "--resume", "--set", "training.steps=40") == 2
     error = capsys.readouterr().err
-    assert f"{out}: found another imgcal at work there" in error and error.count("\n") == 1
+    assert f"{out}: another imgcal is using this folder" in error and error.count("\n") == 1
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
     assert train(experiment, out, "--resume", "--set", "training.steps=40") == 0
 

@@ -79,7 +79,7 @@ def test_a_table_of_blobs_is_watched_once(blobs, stream, tmp_path, capsys):
     assert watch(tmp_path / "blobs.csv.gz", out, "--rate", "60") == 0
     said = capsys.readouterr()
     read = f"all 60 snapshots of {tmp_path}/blobs.csv.gz had been read before; --fresh starts from the factory rig"
-    assert said.out.endswith(f"{read} | 0 snapshots, 1 events: {out}/rig.yaml\n")
+    assert said.out.endswith(f"{read} | 0 snapshots, 1 event: {out}/rig.yaml\n")
     assert not said.err and (out / "rig.yaml").read_bytes() == known
     assert watch(tmp_path / "blobs.csv.gz", out, "--rate", "60", "--fresh") == 0
 
@@ -134,7 +134,7 @@ def test_a_killed_process_goes_on_and_ctrl_c_ends_it_cleanly(blobs, tmp_path):
     assert process.returncode == 130
     (line,) = [text for text in complaint.splitlines() if "compiling" not in text]
     assert line.startswith("imgcal: interrupted after ") and line.endswith("the same command resumes from there")
-    assert [event["event"] for event in events(out)].count("restart") == 1 and "restart: started again" in said
+    assert [event["event"] for event in events(out)].count("restart") == 1 and "restart: resumed" in said
     assert read_rig(out / "rig.yaml").num_cameras == 4
 
 
@@ -257,7 +257,7 @@ def test_a_recording_is_gone_on_with_by_its_names_and_rate_and_another_one_is_no
     assert watch(tmp_path / "first.csv", out, "--rate", "60") == 2
     assert f"--rate: found 60, expected 30 as in {out}/state.json; --fresh" in capsys.readouterr().err
     assert watch(tmp_path / "first.csv", out) == 0
-    assert "2 snapshots, 1 events" in (said := capsys.readouterr().out) and "| 4 had been read before" in said
+    assert "2 snapshots, 1 event:" in (said := capsys.readouterr().out) and "| 4 had been read before" in said
     save_detections(blobs.of_snapshots(0, 6), tmp_path / "second.csv")
     assert watch(tmp_path / "second.csv", out) == 2
     assert "found a different recording that begins at 0 s, expected one after" in capsys.readouterr().err
@@ -352,8 +352,8 @@ def test_fresh_leaves_nothing_to_go_on_from_even_before_it_has_learnt(blobs, tmp
     assert not (out / "state.json").exists() and not (out / "rig.yaml").exists()
     (put_aside,) = set(out.glob("history/*/*.yaml")) - kept
     assert put_aside.read_bytes() == known
-    assert [event["message"] for event in events(out)] == ["begun anew with the factory calibration"]
-    assert "restart: begun anew with the factory calibration" in capsys.readouterr().out
+    assert [event["message"] for event in events(out)] == ["started anew from the factory calibration"]
+    assert "restart: started anew from the factory calibration" in capsys.readouterr().out
     assert watch(tmp_path / "blobs.csv", out) == 0
     assert "4 snapshots" in capsys.readouterr().out  # all of them, once more
 

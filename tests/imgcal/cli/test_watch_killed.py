@@ -148,7 +148,7 @@ def watch(watches, tmp_path):
 
 def events(out):
     told = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
-    return [event for event in told if "started again" not in event["message"]]
+    return [event for event in told if "resumed" not in event["message"]]
 
 
 def assert_same(out, whole, snapshots):

@@ -109,7 +109,7 @@ def test_networks_say_which_part_is_their_encoder(trained, known):
 
 
 def test_one_rig_cannot_be_shuffled(trained, known):
-    with pytest.raises(InputError, match="encoder check: found 1 rigs"):
+    with pytest.raises(InputError, match="encoder check: found 1 rig,"):
         check_encoder(Toy(trained.network, bypass=False), replace(known), count=1)
 
 

@@ -66,7 +66,7 @@ def test_written_and_read(tmp_path: Path, name: str) -> None:
 
 def test_cameras_with_other_names_are_numbered() -> None:
     made = convert_rig(rig_of(brown(), brown()), "caliscope", "x")
-    assert any("cameras are called otherwise there, in this order: 0, 1" in note for note in made.notes)
+    assert any("the cameras have other names in the files, in this order: 0, 1" in note for note in made.notes)
 
 
 def test_caliscope_reads_what_is_written(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ def test_rigs_and_images(tmp_path: Path) -> None:
     (folder / "rigs.bin").unlink()
     assert apart(rig, read_in_mm(folder, "m")) < 1e-8
     (folder / "images.bin").unlink()
-    with pytest.raises(InputError, match="intrinsics alone"):
+    with pytest.raises(InputError, match="found only intrinsics"):
         read_foreign_rig(folder)
 
 

@@ -64,7 +64,7 @@ def test_images_of_fixed_cameras_are_a_rig() -> None:
     assert (rig.names, rig.unit) == (["a", "b"], None)
     assert np.allclose(rig.cameras[1].translation, compose(b_from_a, first)[1])  # the world, at the first frame
     taken["b/1.png"] = pose()
-    with pytest.raises(FormatError, match="camera b stands otherwise to a in '1'"):
+    with pytest.raises(FormatError, match="camera b has another pose relative to a in '1'"):
         rig_from_model("colmap", CAMERAS, images(taken), [])
 
 

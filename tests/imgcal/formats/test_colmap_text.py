@@ -28,7 +28,7 @@ def test_a_rig_counts_before_images(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("files", "said"),
     [
-        ({"cameras__txt": CAMERAS}, "intrinsics alone"),
+        ({"cameras__txt": CAMERAS}, "found only intrinsics"),
         ({"cameras__txt": "1 PINHOLE 1280\n", "images__txt": IMAGES}, "line 1: found 3 values"),
         ({"cameras__txt": CAMERAS, "images__txt": "1 1 0 0\n"}, "images.txt: line 1: found 4"),
         ({"cameras__txt": CAMERAS, "rigs__txt": "1 2 CAMERA 1 CAMERA 2 1 1 0 0\n"}, "middle of a pose"),

@@ -43,9 +43,11 @@ def test_image_sizes_are_asked_for_by_name() -> None:
     unknown = type(rig)(
         "x", tuple(type(c)(c.name, c.lens, None, c.rotation, c.translation) for c in rig.cameras), "mm", "f"
     )
-    with pytest.raises(InputError, match=r"cameras side0, side1: the size of the images is not said.*side0=1280x720"):
+    with pytest.raises(
+        InputError, match=r"cameras side0, side1: the file does not state the size of the images.*side0=1280x720"
+    ):
         fill_image_sizes(unknown, "file", {})
-    with pytest.raises(InputError, match="camera side1: the size"):
+    with pytest.raises(InputError, match="camera side1: the file does not state the size"):
         fill_image_sizes(unknown, "file", {"side0": (640, 480)})
     found = fill_image_sizes(unknown, "file", {"": (1280, 960), "side1": (640, 480)})
     assert [camera.image_size for camera in found.cameras] == [(1280, 960), (640, 480)]
@@ -57,7 +59,7 @@ def test_image_sizes_are_asked_for_by_name() -> None:
 
 def test_a_lens_that_cannot_be_said_is_refused() -> None:
     rig = rig_of(brown(0.1, 0, 0, 0, 0, 0.3), brown())
-    with pytest.raises(RefusedError, match=r"camera side0: it cannot say its lens \(OpenCV, 6 coefficients\).* px"):
+    with pytest.raises(RefusedError, match=r"camera side0: it cannot express its lens \(OpenCV, 6 coefficients\).* px"):
         fit_to_target(rig, Holds((4,)), "it", 1e-3)
     held = fit_to_target(rig, Holds((4,)), "it", 10.0)
     assert 0 < held.worst < 10

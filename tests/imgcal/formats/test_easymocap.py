@@ -40,7 +40,7 @@ def test_what_is_in_both_files(tmp_path: Path, rot: bool) -> None:
 
 
 def test_one_of_two_files(tmp_path: Path) -> None:
-    for name, said in (("intri__yml", "intri.yml alone"), ("extri__yml", "extri.yml alone")):
+    for name, said in (("intri__yml", "found only intri.yml"), ("extri__yml", "found only extri.yml")):
         with pytest.raises(InputError, match=said):
             read_foreign_rig(put(tmp_path / name, **{name: files()[name]}))
     with pytest.raises(InputError, match="no camera is in both"):

@@ -96,11 +96,11 @@ def test_written_and_read(tmp_path: Path) -> None:
     assert np.shape(content["cam2"]["T_cn_cnm1"]) == (4, 4)
     assert "T_cn_cnm1" not in content["cam0"]
     assert apart(rig, read_in_mm(path)) < 1e-8
-    assert any("called otherwise" in note for note in made.notes)
+    assert any("have other names" in note for note in made.notes)
 
 
 def test_a_fifth_coefficient_is_fitted_or_refused() -> None:
     slight, strong = brown(-0.1, 0.02, 0, 0, 0.0002), brown(-0.3, 0.1, 0, 0, -0.05)
     assert 0 < convert_rig(rig_of(slight, brown()), "kalibr", "x").between_models < 0.05
-    with pytest.raises(RefusedError, match="Kalibr camchain cannot say its lens"):
+    with pytest.raises(RefusedError, match="Kalibr camchain cannot express its lens"):
         convert_rig(rig_of(strong, brown()), "kalibr", "x")

@@ -19,7 +19,7 @@ def test_ours_as_ever(tmp_path: Path, o10: CameraRig) -> None:
     assert torch.equal(load_rig(tmp_path / "rig.yaml").distortion, o10.distortion)
     with pytest.raises(InputError, match="O11: no such file, nor one of the shipped rigs"):
         load_rig("O11")
-    with pytest.raises(InputError, match="says its unit"):
+    with pytest.raises(InputError, match="states its own unit"):
         load_rig(tmp_path / "rig.yaml", unit="m")
     with pytest.raises(InputError, match="format"):
         load_rig(put(tmp_path, a__yaml="format: imgcal-rig/9\n") / "a.yaml")
@@ -70,7 +70,7 @@ def test_cameras_of_ros_are_files_of_one_camera_each(tmp_path: Path) -> None:
     for number in range(3):
         files = convert_rig(rig_of(brown(0.1 * number), names=(f"cam{number}",)), "ros", "x").files
         put_files(tmp_path / "ros", files)
-    with pytest.raises(InputError, match="3 files: ROS says in them where two cameras are"):
+    with pytest.raises(InputError, match="3 files: ROS camera_info files hold the poses of two cameras"):
         load_rig(tmp_path / "ros")
     cameras = load_cameras(tmp_path / "ros")
     assert cameras.camera_names == ("cam0", "cam1", "cam2")
@@ -98,7 +98,7 @@ def test_two_calibrations_in_one_folder_are_not_mixed(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=rf"calibration1.{name}, calibration2.{name}.*give one of these files"):
             load_rig(tmp_path / to)
         assert load_rig(tmp_path / to / f"calibration2.{name}").distortion[0, 0] == -0.2
-    with pytest.raises(InputError, match=r"this is no anipose calibration[.]toml: it is a Kalibr camchain"):
+    with pytest.raises(InputError, match=r"this is not an anipose calibration[.]toml: it is a Kalibr camchain"):
         load_rig(tmp_path / "kalibr" / "calibration1.yaml", format="anipose")
 
 

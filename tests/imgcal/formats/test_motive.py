@@ -43,5 +43,5 @@ def test_metres_y_up_and_what_is_not_documented(tmp_path: Path) -> None:
 def test_the_older_binary_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="binary"):
         read_foreign_rig(put(tmp_path, old__cal=bytes(range(256))) / "old.cal")
-    with pytest.raises(InputError, match=r"this is a OptiTrack Motive calibration .*: M1: no LensCenterX"):
+    with pytest.raises(InputError, match=r"this is an OptiTrack Motive calibration .*: M1: no LensCenterX"):
         read(tmp_path, camera("M1").replace("LensCenterX", "x"))

@@ -30,7 +30,7 @@ def test_a_key_that_misleads(tmp_path: Path) -> None:
 
 
 def test_what_is_no_rig_is_said(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"this is a multical calibration.json: intrinsics alone"):
+    with pytest.raises(InputError, match=r"this is a multical calibration.json: found only intrinsics"):
         read(tmp_path, {"a": LENS, "b": LENS}, None)
     with pytest.raises(InputError, match="found a_to_x"):
         read(tmp_path, {"a": LENS, "b": LENS}, {"a": ZERO, "a_to_x": POSE})

@@ -47,9 +47,9 @@ def test_two_files_are_one_calibration(tmp_path: Path) -> None:
         rig = read_foreign_rig(given)
         assert any("left of camera 1" in note for note in rig.notes)  # and it is not "corrected"
         assert np.allclose(rig.cameras[1].translation, -T[:, 0])
-    with pytest.raises(InputError, match="extrinsics alone"):
+    with pytest.raises(InputError, match="found only extrinsics"):
         read_foreign_rig(put(tmp_path / "a", x__yml=outside))
-    with pytest.raises(InputError, match="intrinsics alone"):
+    with pytest.raises(InputError, match="found only intrinsics"):
         read_foreign_rig(put(tmp_path / "b", x__yml=inside))
 
 

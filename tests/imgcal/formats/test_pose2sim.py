@@ -31,5 +31,5 @@ def test_written_and_read(tmp_path: Path) -> None:
     assert {len(tables[name]["distortions"]) for name in rig.names} == {4}
     assert abs(tables["a b"]["translation"][2]) < 1.0  # metres
     assert apart(rig, read_in_mm(path)) < 1e-8
-    with pytest.raises(RefusedError, match=r"Pose2Sim Calib.toml cannot say"):
+    with pytest.raises(RefusedError, match=r"Pose2Sim Calib.toml cannot express"):
         convert_rig(rig_of(brown(-0.3, 0.1, 0, 0, -0.05), brown()), "pose2sim", "x")

@@ -47,7 +47,7 @@ def test_the_sensor_s_numbers(tmp_path: Path) -> None:
     assert np.allclose(one.in_camera(ahead[None]), [[0, 0, 500.0]])
     assert one.in_camera((ahead + AXES[1])[None])[0, 1] < 0
     said = " ".join(rig.notes)
-    assert "camera 18: mounted turned" in said
+    assert "camera 18: mounted rotated" in said
     assert "camera 19: left out" in said
     assert "half a pixel" in said
 
@@ -60,7 +60,7 @@ def test_theia_s_variant_has_plain_pixels(tmp_path: Path) -> None:
 
 
 def test_it_is_only_read(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="Qualisys calibration is only read"):
+    with pytest.raises(InputError, match="Qualisys calibration can only be read"):
         convert_rig(rig_of(brown(), brown()), "qualisys", "x")
     with pytest.raises(InputError, match="this is a Qualisys calibration: 17: no focalLengthU"):
         read(tmp_path, camera().replace("focalLengthU", "x"))

@@ -95,7 +95,7 @@ def test_formats_by_name() -> None:
             "one camera",
         ),
         ({"a__json": '{"frames": [{"transform_matrix": []}]}'}, "nerfstudio"),
-        ({"a__yml": storage_text({"R": np.eye(3), "T": np.zeros((3, 1))})}, "extrinsics alone"),
+        ({"a__yml": storage_text({"R": np.eye(3), "T": np.zeros((3, 1))})}, "with only extrinsics"),
         ({"a__cal": b"\0" * 50}, "binary"),
     ],
 )

@@ -118,6 +118,6 @@ def test_cameras_one_behind_the_other_are_no_pair() -> None:
         second.name, second.lens, second.image_size, first.rotation, first.translation + np.array([0, 0, 500.0])
     )
     with pytest.raises(
-        InputError, match=r"--to ros: camera \S+ stands above, below, before or behind camera \S+, .*side by side"
+        InputError, match=r"--to ros: camera \S+ is above, below, before or behind camera \S+, .*side by side"
     ):
         convert_rig(type(rig)("test", (first, behind), "mm", "x"), "ros", "x")

@@ -19,7 +19,7 @@ def test_who_has_no_pose_is_named_and_left_out() -> None:
     assert [camera.name for camera in read_cameras(tables, notes)] == ["a"]
     assert notes == [
         "camera d: left out, intrinsics are not calibrated",
-        "cameras b, c, e: left out, where they stand is not calibrated",
+        "cameras b, c, e: left out, poses are not calibrated",
     ]
     with pytest.raises(FormatError, match="no camera has both"):
         read_cameras({"c": LENS}, [])

@@ -18,7 +18,7 @@ def test_only_one_works_in_a_folder_and_its_death_frees_it(tmp_path):
         [sys.executable, "-c", HOLD, str(tmp_path / "out")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as other:
         assert other.stdout.readline() == "held\n"
-        with pytest.raises(InputError, match="out: found another imgcal at work there"), holding(tmp_path / "out"):
+        with pytest.raises(InputError, match="out: another imgcal is using this folder"), holding(tmp_path / "out"):
             pass
         other.send_signal(signal.SIGKILL)
     with holding(tmp_path / "out") as folder:

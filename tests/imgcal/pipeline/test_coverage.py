@@ -64,7 +64,7 @@ def test_all_is_known_where_the_object_was_everywhere():
     known = Coverage(("a", "b"), (0.9, 0.8), {}, ())
     assert known.sentences == () and known.advice == ""
     some = replace(known, undetermined={"k2": ("a",), "k3": ("a", "b")})
-    assert some.sentences == ("Not determined by these data, the factory's values stand: k2 in a; k3 in all cameras.",)
+    assert some.sentences == ("Not determined by these data (factory values kept): k2 in a; k3 in all cameras.",)
 
 
 def test_a_lens_that_is_held_is_not_said_to_be_undetermined(narrow):

@@ -68,7 +68,7 @@ def test_no_motion_is_said(content: ReportContent) -> None:
 
 
 def test_ambiguous_identity_is_explained(content: ReportContent) -> None:
-    assert "absolute orientation is not known" in " ".join(judge(replace(content, identity="ambiguous")).found)
+    assert "absolute orientation is unknown" in " ".join(judge(replace(content, identity="ambiguous")).found)
 
 
 def test_refusal_says_why_and_what_helps(refused_content: ReportContent, empty_content: ReportContent) -> None:

@@ -119,7 +119,7 @@ def test_snapshots_that_are_held_out_have_no_neighbours_among_the_others(snapsho
 
 
 def test_a_single_camera_and_snapshot_cannot_be_split() -> None:
-    with pytest.raises(RefusedError, match="0 training crops and 1 held-out crops in 1 snapshots of 1 cameras"):
+    with pytest.raises(RefusedError, match="0 training crops and 1 held-out crop in 1 snapshot of 1 camera,"):
         split(made(1, 1), 1, 1)
 
 
