@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 
 TERMS = 5
 """Most lights in a row: one, and four that span space."""
-DISTANCE_SIGMA = 0.01
-"""mm, standard deviation of a known length: small beside the error of any light's position."""
+DISTANCE_SIGMA = 1e-5
+"""Standard deviation of a known length, relative to the object's size: small beside the error of any light's place."""
 LEAST_EXTENT = 1e-3
 """Least distance of a marker from the line or plane of others, relative to the object's size; nearer ones lie in it."""
 
@@ -31,8 +31,8 @@ class KnownDistances:
     """R rows for each of S snapshots; unused ones have only zeros."""
 
     column: NDArray[np.int64]  # (S, R, TERMS) lights
-    coefficient: Array  # (S, R, TERMS) of their positions
-    length: Array  # (S, R) mm of the sum; 0 = the sum vanishes
+    coefficient: Array  # (S, R, TERMS) 1/mm, of their positions
+    length: Array  # (S, R) of the sum, in standard deviations; 0 = the sum vanishes
     numbers: int = 0  # known by all rows together
 
     @classmethod
@@ -64,7 +64,9 @@ def known_distances(
         rows = list[tuple[NDArray[np.int64], Array, float]]()
         for first, points in parts:
             column = np.flatnonzero(there & (named >= first) & (named < first + len(points)))
-            rows += [(column[which], by, length) for which, by, length in shape_rows(points[named[column] - first])]
+            unit = DISTANCE_SIGMA * float(np.linalg.norm(np.ptp(points, axis=0)))
+            seen = points[named[column] - first]
+            rows += [(column[which], by / unit, length / unit) for which, by, length in shape_rows(seen)]
         every.append(rows)
     found = KnownDistances.none(len(number))
     most = max(map(len, every))

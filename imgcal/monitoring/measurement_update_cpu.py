@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from imgcal.estimation import linearize_lights, linearize_rig, select_blocks
 from imgcal.geometry import kernels
-from imgcal.monitoring.known_distances import DISTANCE_SIGMA
 from imgcal.monitoring.rig_arrays import RigArrays
 from imgcal.monitoring.rig_error_cpu import times_basis, write_basis, write_error
 from renderers.compiling import njit
@@ -286,20 +285,19 @@ def _add_distances_of(places, pose, gradient, distances, s):
                 total[i] += coefficient[term] * places[column[term], i]
         size = max(np.sqrt(total[0] ** 2 + total[1] ** 2 + total[2] ** 2), 1e-9)
         excess = 1 - length / size  # residual relative to the sum
-        weight = 1 / DISTANCE_SIGMA**2
-        cost += 0.5 * weight * (excess * size) ** 2
+        cost += 0.5 * (excess * size) ** 2
         for first in range(len(column)):
             m = column[first]
             by_m = coefficient[first] * _away(places[m])
             if by_m == 0.0:
                 continue
             for i in range(3):
-                gradient[3 * m + i] += weight * by_m * excess * total[i]
+                gradient[3 * m + i] += by_m * excess * total[i]
             for second in range(len(column)):
                 n = column[second]
                 if n > m:
                     continue
-                by = weight * by_m * coefficient[second] * _away(places[n])
+                by = by_m * coefficient[second] * _away(places[n])
                 for i in range(3):
                     for j in range(3):
                         if length > 0:
