@@ -290,7 +290,7 @@ class Options:
     fresh: bool = False  #: calibrate again instead of using the cached calibration
     lights: bool = False  #: follow the markers as unknown lights
     stick: tuple[int, ...] = ()  #: markers of the wand whose distances are known; the others are lights
-    out: Path | None = None  #: default: docs/benchmarks/real_stream.json, real_stream_lights.json or real_stream_stick_....json
+    out: Path | None = None  #: default: docs/benchmarks/real_stream.json, ..._lights.json or ..._stick_0_1_2.json
 
 
 def main() -> None:

@@ -1,6 +1,7 @@
 """A running rig that sees sticks or several objects: their distances give it its size."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -42,14 +43,17 @@ def size(rig: CameraRig) -> float:
 
 def joined(parts: list[Detections]) -> Detections:
     """Blobs of several objects as one snapshot, without labels."""
-    columns = {
-        name: np.concatenate([getattr(part, name) for part in parts])
+    uv, sigma, camera, snapshot, radius, flags = (
+        np.concatenate([getattr(part, name) for part in parts])
         for name in ("uv", "sigma", "camera", "snapshot", "radius", "flags")
-    }
-    return replace(parts[0], **columns, fiducial=np.full(len(columns["camera"]), -1))
+    )
+    labels = np.full(len(uv), -1)
+    return Detections(uv, sigma, camera, snapshot, labels, radius, flags, parts[0].camera_names, ("now",))
 
 
-def watched(objects: list[CalibrationObject], given: CalibrationObject, count: int, path=None) -> imgcal.RigState:
+def watched(
+    objects: list[CalibrationObject], given: CalibrationObject, count: int, path: Path | None = None
+) -> imgcal.RigState:
     """Follow objects with a rig that is believed too large; a path: save and restore halfway."""
     rig = imgcal.load_rig("room10").to(torch.float64)
     worlds = [SimulatedRig(rig, obj, LOW, HIGH, seed=seed) for seed, obj in enumerate(objects)]
@@ -70,7 +74,7 @@ def watched(objects: list[CalibrationObject], given: CalibrationObject, count: i
 
 
 @pytest.mark.parametrize("name", OBJECTS)
-def test_known_distances_give_the_size_of_a_running_rig(name: str, tmp_path) -> None:
+def test_known_distances_give_the_size_of_a_running_rig(name: str, tmp_path: Path) -> None:
     objects = OBJECTS[name]
     state = watched(objects, CalibrationObject.of_several(objects), 120)
     before = resized(imgcal.load_rig("room10").to(torch.float64), 1.0)

@@ -22,8 +22,8 @@ def derivative(points: np.ndarray) -> np.ndarray:
         assert np.linalg.norm(total) == pytest.approx(length, abs=1e-9)
         full = np.zeros((3, len(points), 3))
         full[:, which] = np.eye(3)[:, None] * by[:, None]
-        full = full.reshape(3, -1)
-        rows.append(total[None] / length @ full if length else full)
+        by_step = full.reshape(3, -1)
+        rows.append(total[None] / length @ by_step if length else by_step)
     return np.concatenate(rows)
 
 
