@@ -57,7 +57,7 @@ class CalibrationObject:
     modes: Tensor | None = None  # (K, N, 3) mm: deformations with standard normal coefficients; None = rigid
     labels: tuple[int, ...] = ()  # of the fiducials in tables; empty = their row numbers
     unknown_markers: bool = False  # any blob may be a separate marker: see `unknown`
-    parts: tuple[CalibrationObject, ...] = ()  # several objects in one capture, see `of_several`; empty = one object
+    parts: tuple[CalibrationObject, ...] = ()  # several objects, see `of_several` and `as_unknown`; empty = one object
     origin: Tensor | None = None  # (3,) mm in the frame of the object's file: the origin of `points`; None = the same
 
     def __repr__(self) -> str:
