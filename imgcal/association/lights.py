@@ -289,10 +289,15 @@ def background_rows(detections: Detections) -> NDArray[np.bool_]:
         moments = len(np.unique(snapshot))
         if moments < LEAST_MOMENTS:
             continue
+        least = SHARE_OF_MOMENTS * moments
+        # A circle lies in four cells at most; in none of most images do so many blobs share one.
+        cell = np.floor(uv / (2.001 * STILL)) @ (1.0, 2.0**24)
+        if np.unique(cell, return_counts=True)[1].max() < least / 4:
+            continue
         near = cKDTree(uv).query_ball_point(uv, STILL, return_length=True)
-        for k in np.flatnonzero(near >= SHARE_OF_MOMENTS * moments):  # few: markers move
+        for k in np.flatnonzero(near >= least):  # few: markers move
             there = np.square(uv - uv[k]).sum(1) <= STILL**2
-            marked[rows[k]] = len(np.unique(snapshot[there])) >= SHARE_OF_MOMENTS * moments
+            marked[rows[k]] = len(np.unique(snapshot[there])) >= least
     return marked
 
 
@@ -325,18 +330,17 @@ def predicted_misses(
     there = (points - one.positions[0]) @ one.cam_from_rig.rotation[0].mT
     xy = (there[:, :2] / there[:, 2:]).numpy()
     sigma = error[camera] * np.sqrt(1 + _uncertainty(lights, rig, camera))
-    counts = np.zeros((1 + len(SHIFTS), 2))
-    for k, (du, dv) in enumerate(((0.0, 0.0), *SHIFTS)):
-        shifted = xy + np.array([du, dv]) / focal
-        for row in np.flatnonzero(inside):
-            own = slice(blobs.start[lights.moment[row], camera], blobs.start[lights.moment[row], camera + 1])
-            away = np.linalg.norm(blobs.xy[own] - shifted[row], axis=1) * focal / sigma[row]
-            least = away.min(initial=np.inf)
-            counts[k] += least < near, near <= least < far
+    shifted = xy[:, None] + np.array([(0.0, 0.0), *SHIFTS]) / focal  # (R, 1 + shifts, 2)
+    least = np.full((1 + len(SHIFTS), len(xy)), np.inf)  # standard deviations to the nearest blob
+    for row in np.flatnonzero(inside):
+        own = slice(blobs.start[lights.moment[row], camera], blobs.start[lights.moment[row], camera + 1])
+        away = np.hypot(*(blobs.xy[own][:, None] - shifted[row]).transpose(2, 0, 1)) * focal / sigma[row]
+        least[:, row] = away.min(axis=0, initial=np.inf)
     total = int(inside.sum())
     if total == 0:
         return 0, 0.0, 0.0
-    share = counts / total
+    least = least[:, inside]
+    share = np.stack(((least < near).mean(1), ((near <= least) & (least < far)).mean(1)), 1)
     chance = share[1:].mean(0)
     found = (share[0, 0] - chance[0]) / max(1 - chance[0], 1e-9)
     # A near miss counts only if no blob is in place.

@@ -117,7 +117,7 @@ class Watch(arguments.Watch):
             stack.enter_context(keeper)
             stack.enter_context(intake).wait_until_open()  # before anything is written
             if len(given.points) > 1 and obj is not given:
-                note = f"note: markers of {given.name} are followed one by one: their distances are not used"
+                note = f"note: markers of {given.name} are followed one by one; where their distances fit, they count"
                 print(note, file=sys.stderr)
             poses = [
                 stack.enter_context(Poses(name, _pose_sink(name, rig, obj)))
@@ -306,6 +306,10 @@ def _rig_difference(rig: CameraRig, known: CameraRig) -> str | None:
 def _object_difference(obj: CalibrationObject, known: CalibrationObject) -> str | None:
     """Say in what an object differs from the one that was begun with: also in its tolerances."""
     difference = object_difference(obj, known)
+    if difference is None and len(obj.parts) != len(known.parts):
+        return f"{len(known.parts)} objects, not {len(obj.parts)}"
+    for part, other in zip(obj.parts, known.parts, strict=difference is None):
+        difference = difference or _object_difference(part, other)
     if difference is None and (
         obj.scale_tolerance != known.scale_tolerance or not torch.allclose(obj.granted, known.granted.to(obj.granted))
     ):

@@ -122,10 +122,13 @@ def cholesky_solve(lower, right):
 @njit(fastmath=FAST)
 def subtract_gram(matrix, tall):
     """Subtract tall.T @ tall from the lower triangle; the number of rows must be divisible by three (6, 15, 18)."""
-    # Three rows at once: the matrix is read and written a third as often.
+    # Three rows at once: the matrix is read and written a third as often. Cameras that see nothing, and rotations of a
+    # single light, have only zeros.
     for r in range(0, tall.shape[0], 3):
         for i in range(tall.shape[1]):
             first, second, third = tall[r, i], tall[r + 1, i], tall[r + 2, i]
+            if first == 0 and second == 0 and third == 0:
+                continue
             for j in range(i + 1):
                 matrix[i, j] -= first * tall[r, j] + second * tall[r + 1, j] + third * tall[r + 2, j]
 

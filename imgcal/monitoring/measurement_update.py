@@ -5,6 +5,7 @@ eliminated from each snapshot. Snapshots that are absorbed together are lineariz
 does so with its first ones.
 
 Each light has its own position in each snapshot, which is eliminated; a light seen by one camera adds no information.
+Known distances between lights (a stick, several objects) are rows of the same equations: see `known_distances.py`.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions, levenberg_marquardt_cpu
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring import measurement_update_cpu
+from imgcal.monitoring.known_distances import KnownDistances, known_distances
 from imgcal.monitoring.measurement_update_cpu import DAMPED, MOST_DAMPING, SLACK, STALLED, WHY_NOT
 from imgcal.monitoring.rig_arrays import RigArrays
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
@@ -64,11 +67,13 @@ def absorb(
     if shown is not None:
         centre, rotation = centre.reshape(len(seen), -1, 3), rotation[: len(seen)]
         shared = (*(None if part is None else part[: seen.shape[2]] for part in shared[:2]), shared[2])
+    distances = KnownDistances.none(len(seen)) if shown is None else shown.distances(constants.parts)
     shaken = np.empty((0, 0)) if shake is None else np.ascontiguousarray(shake.double().numpy())
     loss = (levenberg_marquardt_cpu.LOSS_CODES[options.loss], float(options.threshold))
     found = measurement_update_cpu.absorb(
         shared,
         (uv, (1 / sigma).astype(np.float64, copy=False), shaken),
+        distances.arrays,
         (belief.arrays, unit.numpy(), belief.object_offset.numpy(), constants.own_std, belief.information.numpy()),
         (rotation, centre),
         (*loss, options.max_iterations, options.tolerance, SLACK, DAMPED, STALLED, MOST_DAMPING),
@@ -100,7 +105,7 @@ def absorb(
         translation = found.centre - found.rotation @ constants.centroid
         poses = RigidTransform(torch.from_numpy(found.rotation), torch.from_numpy(translation))
     else:
-        freedom = 3 * int(seen.any(1).sum())
+        freedom = 3 * int(seen.any(1).sum()) - distances.numbers
         poses = shown.places(given, torch.from_numpy(found.centre))
         residual = shown.of_all(residual, given.translation.shape[1])
     dof = 2 * int(np.count_nonzero(seen)) - freedom
@@ -139,6 +144,10 @@ class _Shown:
 
     number: Tensor  # (S, M) number of the light in each column
     used: Tensor  # (S, M) bool: the column is not empty
+
+    def distances(self, parts: Sequence[tuple[int, NDArray[np.float64]]]) -> KnownDistances:
+        """Known distances between them, from the first number and the markers of each known object."""
+        return known_distances(parts, self.number.numpy(), self.used.numpy())
 
     def places(self, given: RigidTransform, centre: Tensor) -> RigidTransform:
         """Replace the given positions (S, N) by estimated positions (S, M, 3)."""

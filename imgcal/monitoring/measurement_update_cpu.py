@@ -5,7 +5,8 @@ the object, D = K C + M; S snapshots, each linearized as a rig of its own (`line
 states and equations have two rows: the best so far, and the trial.
 
 A snapshot's pose has P numbers: six for an object. N lights have 3 N, a position each and no rotation
-(`light_linearization_cpu.linearize_lights`); their centres are (S, N, 3).
+(`light_linearization_cpu.linearize_lights`); their centres are (S, N, 3). Known distances between lights
+(`known_distances.py`) couple their positions.
 """
 
 # Compiled functions take their types from their arguments.
@@ -72,6 +73,7 @@ class Minimum:
 def absorb(
     shared: tuple[Any, ...],
     seen: tuple[Array, Array, Array],
+    distances: tuple[NDArray[np.int64], Array, Array],
     known: tuple[RigArrays, Array, Array, Array, Array],
     poses: tuple[Array, Array],
     options: tuple[int, float, int, float, float, float, float, float],
@@ -83,6 +85,7 @@ def absorb(
         shared: what `linearization_cpu` needs for all rigs alike: points, squared radii, and so on.
         seen: pixels (S, C, 2, N), square roots of their weights (S, C, N), and how much cameras shake (S, C): see
             `linearization_cpu.linearize_rig`.
+        distances: see `KnownDistances.arrays`; without rows for an object.
         known: the rig, units (C, K) of its errors, offset (M,) of the object and its prior standard deviation (M,), and
             the information (D, D) about both.
         poses: first guess, rotation (S, 3, 3) and centre (S, 3), or (S, N, 3) for lights.
@@ -107,7 +110,7 @@ def absorb(
     factor, gathered = np.empty((wide, wide)), np.empty((wide, wide))
     brought = (np.empty((count, freedom)), np.empty((count, wide)), np.empty((2, wide)))
     best, status, cost = _absorb(
-        shared, seen, rig.parts, (unit, own, own_std, information), rigs, states, blocks,
+        shared, (*seen, distances), rig.parts, (unit, own, own_std, information), rigs, states, blocks,
         (factor, gathered), brought, options,
     )  # fmt: skip
     last = 1 - best  # where the last step started
@@ -212,7 +215,7 @@ def _factorize(matrix, damping, factor):
 @njit(cache=True, fastmath=kernels.FAST)
 def _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, b, loss, threshold):
     """Linearize all snapshots at row b, write the distance from the known values, and return the cost."""
-    uv, root_weight, shake = seen
+    uv, root_weight, shake, distances = seen
     unit, own0, own_std, prior = known
     rotation, position, focal, principal, distortion = rigs
     offset, turned, centre, own = states
@@ -228,6 +231,7 @@ def _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, b,
         )  # fmt: skip
         state = (offset, turned[b, s : s + 1], centre[b, s : s + 1], own[b])
         cost += _linearize(given, state, state[2], select_blocks(row, s), loss, threshold, shake[s : s + 1])
+        cost += _add_distances(state[2], select_blocks(row, s), distances, s)
         for i in range(len(own0)):
             cost -= 0.5 * own[b, i] ** 2
     write_error(rotation[b], position[b], focal[b], principal[b], distortion[b], known_rig, unit, distance[b])
@@ -256,6 +260,57 @@ def _linearize(given, state, centre, blocks, loss, threshold, shake):
         lights, centre[0], (camera, coupling[0], pose[0], camera_gradient, pose_gradient[0], residual[0]),
         loss, threshold, shake.ravel(),
     )  # fmt: skip
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _add_distances(centre, blocks, distances, s):
+    """Add the known distances between the lights (1, N, 3) of snapshot s to its equations; return their cost."""
+    if centre.ndim == 2:
+        return 0.0
+    return _add_distances_of(centre[0], blocks[2][0], blocks[5][0], distances, s)
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _add_distances_of(places, pose, gradient, distances, s):
+    """Add them to the information (3 N, 3 N) of the positions (N, 3) and to its gradient (3 N,)."""
+    if places.ndim != 2:
+        return 0.0
+    columns, coefficients, lengths = distances
+    total, cost = np.empty(3), 0.0
+    for row in range(lengths.shape[1]):
+        column, coefficient, length = columns[s, row], coefficients[s, row], lengths[s, row]
+        total[:] = 0.0
+        for term in range(len(column)):
+            for i in range(3):
+                total[i] += coefficient[term] * places[column[term], i]
+        size = max(np.sqrt(total[0] ** 2 + total[1] ** 2 + total[2] ** 2), 1e-9)
+        excess = 1 - length / size  # residual relative to the sum
+        cost += 0.5 * (excess * size) ** 2
+        for first in range(len(column)):
+            m = column[first]
+            by_m = coefficient[first] * _away(places[m])
+            if by_m == 0.0:
+                continue
+            for i in range(3):
+                gradient[3 * m + i] += by_m * excess * total[i]
+            for second in range(len(column)):
+                n = column[second]
+                if n > m:
+                    continue
+                by = by_m * coefficient[second] * _away(places[n])
+                for i in range(3):
+                    for j in range(3):
+                        if length > 0:
+                            pose[3 * m + i, 3 * n + j] += by * total[i] * total[j] / (size * size)
+                        elif i == j:
+                            pose[3 * m + i, 3 * n + j] += by
+    return cost
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _away(place):
+    """Unit of a step of a light's position (3,), see `light_linearization_cpu`."""
+    return max(1.0, np.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2))
 
 
 @njit(cache=True, fastmath=kernels.FAST)

@@ -52,6 +52,8 @@ def belief_from_posterior(posterior: RigPosterior, obj: CalibrationObject) -> Ri
         obj: the object that is seen from now on.
     """
     own = posterior.object_offset
+    if obj.unknown_markers:
+        return _about_cameras(posterior, obj)
     if len(own):
         tolerance, scale = posterior.tolerance, posterior.scale_tolerance
         seen = replace(obj, points=posterior.points, tolerance=tolerance, scale_tolerance=scale)

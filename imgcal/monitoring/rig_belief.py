@@ -37,6 +37,7 @@ class ObjectArrays:
     centroid: NDArray[np.float64]  # (3,) mm
     own_std: NDArray[np.float64]  # (M,) prior standard deviation of the object's offset
     pose_rank: int  # degrees of freedom of a pose that the object determines
+    parts: tuple[tuple[int, NDArray[np.float64]], ...]  # known objects among lights: first number, markers (n, 3) mm
 
     @classmethod
     def of(cls, obj: CalibrationObject, rig: CameraRig) -> ObjectArrays:
@@ -46,7 +47,8 @@ class ObjectArrays:
         squared = None if obj.radius is None else obj.radius.double().square()
         none = obj.points.new_zeros(0)
         problem = Problem(none, none, obj.points - centroid, centroid, squared, rig, none)
-        return cls(levenberg_marquardt_cpu.shared_arrays(problem), centroid.numpy(), own_std.numpy(), obj.pose_rank)
+        shared = levenberg_marquardt_cpu.shared_arrays(problem)
+        return cls(shared, centroid.numpy(), own_std.numpy(), obj.pose_rank, obj.known_parts)
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ class RigKeeper:
         Args:
             rig: the factory calibration, without batch axes.
             obj: the calibration object. The markers of a stick, or of several objects, are followed one by one, as
-                unknown markers are: their distances are not used.
+                unknown markers are; where they are recognized, their distances are used, and give the scale.
             options: how certain labels must be, and how to minimize.
             detection: how blobs are found.
             detector: how fiducials are found in frames, as for `calibrate`.
@@ -294,7 +294,8 @@ class RigKeeper:
         health = camera_health(memory)
         sentence = describe_health(health, memory.monitor.filter.count)
         if memory.lights is not None and memory.monitor.filter.count:
-            sentence += f"; the scale is known to +- {100 * memory.belief.scale_std():.2g} % (lights cannot improve it)"
+            sentence += f"; the scale is known to +- {100 * memory.belief.scale_std():.2g} %"
+            sentence += "" if memory.obj.parts else " (lights cannot improve it)"
         lights = None if labelled is None else labelled.checked.lights
         return replace(state, cameras=health, events=tuple(events), sentence=sentence, lights=lights)
 

@@ -105,7 +105,7 @@ class KeeperMemory:
             relearning=Relearning(rig.camera_names), drift_watch=DriftWatch(rig.camera_names),
             doubts=ObjectChecks(obj.num_fiducials), search=Search(rig.num_cameras),
             looks=np.zeros(rig.num_cameras, dtype=np.int64), before=monitor.filter.belief,
-            lights=LightTracks.of(obj.num_fiducials, rig.num_cameras) if obj.unknown_markers else None,
+            lights=LightTracks.of(obj.each[-1].num_fiducials, rig.num_cameras) if obj.unknown_markers else None,
         )  # fmt: skip
         if calibration is not None:
             memory.looks[:], memory.learnt = LEAST_LOOKS, calibration.time

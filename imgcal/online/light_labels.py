@@ -19,8 +19,9 @@ from imgcal.messages import plural
 from imgcal.online.camera_visibility import well_inside
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.label_consistency import MOST_APART, Checked
-from imgcal.online.light_points import FoundLights
+from imgcal.online.light_points import FoundLights, distance_errors
 from imgcal.online.light_tracks import LightTracks
+from imgcal.online.shape_labels import LightDistances, find_shapes
 from imgcal.types import CameraRig, Detections
 
 Array = NDArray[np.float64]
@@ -43,7 +44,7 @@ LEAST_FITTING = 0.5
 
 
 def label_lights(memory: KeeperMemory, tracks: LightTracks, blobs: Detections) -> tuple[Checked, frozenset[int]]:
-    """Label the blobs of a snapshot with the numbers of their lights.
+    """Label the blobs of a snapshot with the numbers of their lights; markers of known objects have their own.
 
     Args:
         memory: what is known about the rig.
@@ -68,9 +69,12 @@ def label_lights(memory: KeeperMemory, tracks: LightTracks, blobs: Detections) -
         some = len(np.unique(blobs.camera[rows]))
         seen = f"moving blobs are seen by {plural(some, 'camera')}" if some else "no moving blob is seen"
         raise RefusedError(f"identity: found no light on which three cameras agree: {seen}")
+    earlier = tracks.place.copy()
     numbers = tracks.number_lights(found.point, time)
     scene = _Scene(rig, blobs, found, rows)
     lights = FoundLights(blobs, scene.label.copy(), found.point)  # also those that are more than a rig learns from
+    if memory.obj.known_parts:
+        numbers = _number_shapes(memory, lights, numbers, np.where(np.isfinite(tracks.velocity), earlier, np.nan))
     tracks.mark_still(blobs.camera, blobs.uv, scene.label >= 0, time)
     usual, sought = scene.usual_shift(), scene.misfits()
     lost, off = np.zeros((2, rig.num_cameras), dtype=bool)
@@ -100,6 +104,25 @@ def label_lights(memory: KeeperMemory, tracks: LightTracks, blobs: Detections) -
     pose = RigidTransform(torch.eye(3, dtype=torch.float64).expand(1, len(place), 3, 3), torch.from_numpy(place)[None])
     labelled = replace(blobs, fiducial=named)
     return Checked(labelled, labelled, pose, off, usual, int((named >= 0).sum()), lights), astray
+
+
+def _number_shapes(
+    memory: KeeperMemory, lights: FoundLights, tracked: NDArray[np.int64], earlier: Array
+) -> NDArray[np.int64]:
+    """Number the lights (L,) that are markers of known objects; others go behind these.
+
+    Args:
+        memory: what is known about the rig.
+        lights: of the snapshot.
+        tracked: (L,) their numbers from snapshot to snapshot; -1 = none.
+        earlier: (N, 3) mm, where each number was in the previous snapshot; nan = nowhere.
+    """
+    parts = memory.obj.known_parts
+    error = distance_errors(memory.belief, lights, memory.noise.additive)
+    before = np.where((tracked >= 0)[:, None], earlier[tracked], np.nan)
+    found = find_shapes(parts, LightDistances(lights.point, before, error))
+    count = sum(len(points) for _, points in parts)
+    return np.where(found >= 0, found, np.where(tracked >= 0, tracked + count, -1))
 
 
 class _Scene:

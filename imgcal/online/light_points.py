@@ -84,15 +84,8 @@ def light_points(
         pull = torch.einsum("mri,m,mr->mi", by_point, weight, uv - image)
         step = torch.linalg.pinv(information) @ point.new_zeros(count, 3).index_add_(0, light, pull)[..., None]
         point = point + step[..., 0]
-    by_point, by_error = _jacobians(belief, point, camera, light)
-    factor, failed = torch.linalg.cholesky_ex(_information(by_point, weight, light, count))
-    known = (seen.sum(0) >= 2) & (failed == 0).numpy() & factor.isfinite().all(-1).all(-1).numpy()
-    known &= point.isfinite().all(-1).numpy()
-    usable = torch.from_numpy(known)[:, None, None]
-    covariance = torch.cholesky_inverse(torch.where(usable, factor, torch.eye(3, dtype=torch.float64)))
-    coupling = torch.zeros(count, *belief.unit.shape, 3, dtype=torch.float64)
-    coupling.index_put_((light, camera), torch.einsum("mri,m,mrk->mki", by_point, weight, by_error), accumulate=True)
-    follows = torch.einsum("lij,lckj->lick", covariance, coupling).flatten(2)  # (L, 3, C K)
+    known, covariance, follows = _errors(belief, point, weight, (camera, light))
+    known &= (seen.sum(0) >= 2) & point.isfinite().all(-1).numpy()
     common = common_motion(belief, RigidTransform.identity(dtype=torch.float64), trusted)
     across = (follows + common[3:] - cross_matrix(point) @ common[:3]).flatten(0, 1)
     across = torch.cat((across, across.new_zeros(len(across), len(belief.factor) - across.shape[1])), 1)
@@ -100,6 +93,54 @@ def light_points(
     variance_of_point = covariance.diagonal(dim1=-2, dim2=-1).sum(-1) + half.square().sum(0).view(count, 3).sum(-1)
     error = variance_of_point.clamp_min(0).sqrt()
     return LightPoints(point.numpy()[known], error.numpy()[known], seen[:, known])
+
+
+def distance_errors(belief: RigBelief, found: FoundLights, noise: Array) -> Array:
+    """Standard deviations (L, L) mm of the distances between the lights of a snapshot, as the rig is known.
+
+    Args:
+        belief: about the rig.
+        found: which blobs show which light.
+        noise: (C,) px of noise beyond the blobs' own sigmas.
+    """
+    rows = np.flatnonzero(found.light >= 0)
+    camera, light = (torch.from_numpy(part[rows]).long() for part in (found.blobs.camera, found.light))
+    variance = np.square(found.blobs.sigma[rows]) + np.square(noise)[found.blobs.camera[rows]]
+    point = torch.from_numpy(found.point).double()
+    known, covariance, follows = _errors(belief, point, torch.from_numpy(1 / variance).double(), (camera, light))
+    padded = torch.nn.functional.pad(follows.flatten(0, 1), (0, len(belief.factor) - follows.shape[-1]))
+    half = torch.linalg.solve_triangular(belief.factor, padded.mT, upper=False).mT.unflatten(0, (-1, 3))  # (L, 3, D)
+    along = torch.nn.functional.normalize(point[:, None] - point, dim=-1)
+    by_rig = torch.einsum("ijk,ikd->ijd", along, half) - torch.einsum("ijk,jkd->ijd", along, half)
+    own = torch.einsum("ijk,ikl,ijl->ij", along, covariance, along)
+    error = (by_rig.square().sum(-1) + own + own.mT).clamp_min(0).sqrt().numpy()
+    return np.where(known[:, None] & known, error, np.nan)
+
+
+def _errors(
+    belief: RigBelief, point: Tensor, weight: Tensor, where: tuple[Tensor, Tensor]
+) -> tuple[NDArray[np.bool_], Tensor, Tensor]:
+    """Errors of triangulated positions (L, 3).
+
+    Args:
+        belief: about the rig.
+        point: (L, 3) mm.
+        weight: (M,) of the blobs.
+        where: camera and light of each blob, (M,) each.
+
+    Returns:
+        Which positions are determined; their covariance (L, 3, 3) for a perfect rig; and their motion by each error of
+        the rig (L, 3, C K).
+    """
+    (camera, light), count = where, len(point)
+    by_point, by_error = _jacobians(belief, point, camera, light)
+    factor, failed = torch.linalg.cholesky_ex(_information(by_point, weight, light, count))
+    known = (failed == 0).numpy() & factor.isfinite().all(-1).all(-1).numpy()
+    usable = torch.from_numpy(known)[:, None, None]
+    covariance = torch.cholesky_inverse(torch.where(usable, factor, torch.eye(3, dtype=torch.float64)))
+    coupling = torch.zeros(count, *belief.unit.shape, 3, dtype=torch.float64)
+    coupling.index_put_((light, camera), torch.einsum("mri,m,mrk->mki", by_point, weight, by_error), accumulate=True)
+    return known, covariance, torch.einsum("lij,lckj->lick", covariance, coupling).flatten(2)
 
 
 def _jacobians(belief: RigBelief, point: Tensor, camera: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:

@@ -99,7 +99,8 @@ class RigState:
         """Size of the rig relative to the factory's, and its standard deviation.
 
         Unknown lights do not determine it. It changes with what they show about the cameras, as far as an earlier
-        calibration left a correlation between both.
+        calibration left a correlation between both. Sticks and several objects do; lengths in their files count as
+        exact.
         """
         now, before = (rig.positions - rig.positions.mean(0) for rig in (self.rig, self.factory))
         return float((now.norm() / before.norm()) - 1), self.belief.scale_std()

@@ -42,6 +42,7 @@ def _check_object(obj: CalibrationObject) -> None:
     for name in ("radius", "tolerance"):
         value = getattr(obj, name)
         _require(value is None or tuple(value.shape) == (obj.num_fiducials,), f"{name} of other fiducials")
+    _require(sum(part.num_fiducials for part in obj.each) == obj.num_fiducials, "parts of another object")
     check_object(obj)
 
 

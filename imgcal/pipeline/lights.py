@@ -186,10 +186,9 @@ def rows_of_lights(lights: Lights, detections: Detections) -> Associations:
     names = tuple(detections.snapshot_names[moment] for moment in moments[order])
     labels = np.zeros(len(marker), dtype=np.int64)
     blobs = replace(blobs, snapshot=number[marker], fiducial=labels, snapshot_names=names)
+    found = _rows_of_found(lights, detections.snapshot_names)
     snapshots = tuple(
-        _row_of_light(lights, k, detections.snapshot_names)
-        if k < len(lights)
-        else SnapshotIdentity(name, "refused", NO_MARKER, 0, None, moment=moment)
+        found[k] if k < len(lights) else SnapshotIdentity(name, "refused", NO_MARKER, 0, None, moment=moment)
         for name, k, moment in zip(names, order.tolist(), moments[order].tolist(), strict=True)
     )
     return Associations(blobs, snapshots)
@@ -223,18 +222,21 @@ def add_lights(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -
     own = free[lights.row[light, camera]]
     row[own], fiducial[own] = number[len(moments) + light], obj.num_fiducials - 1
     snapshots = [*labelled.snapshots]
-    snapshots += [_row_of_light(lights, k, blobs.snapshot_names, part) for k in range(len(lights))]
+    snapshots += _rows_of_found(lights, blobs.snapshot_names, part)
     names = tuple(snapshots[at].name for at in order)
     table = replace(blobs, snapshot=row, fiducial=fiducial, snapshot_names=names)
     return Associations(table, tuple(snapshots[at] for at in order))
 
 
-def _row_of_light(lights: Lights, number: int, names: Sequence[str], part: int = 0) -> SnapshotIdentity:
-    """What is known of a marker at its moment."""
-    moment, point = int(lights.moment[number]), torch.from_numpy(lights.point[number]).double()
-    place = RigidTransform(torch.eye(3, dtype=torch.float64), point)
-    reason = f"{lights.cameras[number]} cameras agree"
-    return SnapshotIdentity(names[moment], "unique", reason, 1, place, moment=moment, part=part)
+def _rows_of_found(lights: Lights, names: Sequence[str], part: int = 0) -> list[SnapshotIdentity]:
+    """What is known of each marker at its moment."""
+    eye, points = torch.eye(3, dtype=torch.float64), torch.from_numpy(lights.point).double()
+    return [
+        SnapshotIdentity(
+            names[moment], "unique", f"{cameras} cameras agree", 1, RigidTransform(eye, point), moment=moment, part=part
+        )
+        for moment, cameras, point in zip(lights.moment.tolist(), lights.cameras.tolist(), points, strict=True)
+    ]
 
 
 def even_error(rig: CameraRig, pixels: float = FINEST) -> NDArray[np.float64]:

@@ -57,7 +57,7 @@ class CalibrationObject:
     modes: Tensor | None = None  # (K, N, 3) mm: deformations with standard normal coefficients; None = rigid
     labels: tuple[int, ...] = ()  # of the fiducials in tables; empty = their row numbers
     unknown_markers: bool = False  # any blob may be a separate marker: see `unknown`
-    parts: tuple[CalibrationObject, ...] = ()  # several objects in one capture, see `of_several`; empty = one object
+    parts: tuple[CalibrationObject, ...] = ()  # several objects, see `of_several` and `as_unknown`; empty = one object
     origin: Tensor | None = None  # (3,) mm in the frame of the object's file: the origin of `points`; None = the same
 
     def __repr__(self) -> str:
@@ -123,20 +123,28 @@ class CalibrationObject:
         """Replace an object by unknown markers, as a running rig does unless it is a single rigid body.
 
         Returns:
-            Up to `MOST_LIGHTS` markers at once, with the object's radius if all fiducials have the same. A single rigid
-            body is returned unchanged.
+            Up to `MOST_LIGHTS` markers at once, or as many as the objects have, with the object's radius if all
+            fiducials have the same. The fiducials of sticks and of several objects come first: their `parts` say
+            how far apart they are. A single rigid body is returned unchanged.
 
         Examples:
             >>> stick = torch.tensor([[0.0, 0.0, 0.0], [500.0, 0.0, 0.0]])
-            >>> CalibrationObject(stick, torch.ones(2, 3), name="stick").as_unknown()
-            CalibrationObject('stick': unknown markers)
+            >>> watched = CalibrationObject(stick, torch.ones(2, 3), name="stick").as_unknown()
+            >>> watched, watched.num_fiducials, [part.num_fiducials for part in watched.parts]
+            (CalibrationObject('stick': unknown markers), 18, [2, 16])
         """
         if len(self.points) > 1 and (self.unknown_markers or (not self.parts and self.pose_rank == 6)):
             return self
-        lights = CalibrationObject.unknown(self.name, MOST_LIGHTS)
-        if self.radius is None or bool((self.radius != self.radius[0]).any()):
+        known = [part for part in self.each if part.pose_rank > 3]
+        count = sum(part.num_fiducials for part in known)
+        lights = CalibrationObject.unknown(self.name, max(MOST_LIGHTS, count))
+        if self.radius is not None and bool((self.radius == self.radius[0]).all()):
+            lights = replace(lights, radius=self.radius[:1].double().expand(len(lights.points)).clone())
+        if not known:
             return lights
-        return replace(lights, radius=self.radius[:1].double().expand(len(lights.points)).clone())
+        found = CalibrationObject.unknown(self.name, count + len(lights.points))
+        radius = None if lights.radius is None else lights.radius[:1].expand(len(found.points)).clone()
+        return replace(found, radius=radius, parts=(*known, lights))
 
     @classmethod
     def of_several(cls, objects: Sequence[CalibrationObject]) -> CalibrationObject:
@@ -213,6 +221,15 @@ class CalibrationObject:
         return np.repeat(np.arange(len(self.each)), [len(part.points) for part in self.each])
 
     @property
+    def known_parts(self) -> tuple[tuple[int, NDArray[np.float64]], ...]:
+        """Known objects among unknown markers: the number of the first fiducial of each, and its points (n, 3) mm."""
+        if not self.unknown_markers or not self.parts:
+            return ()
+        points = [part.points.double().numpy() for part in self.parts[:-1]]
+        first = np.cumsum([0, *map(len, points)]).tolist()
+        return tuple(zip(first, points, strict=False))
+
+    @property
     def has_lights(self) -> bool:
         """Tell whether the last of several objects stands for unknown markers."""
         return bool(self.parts) and self.parts[-1].unknown_markers
@@ -281,6 +298,8 @@ class CalibrationObject:
 
         For several objects, the largest.
         """
+        if self.unknown_markers:
+            return 3
         return max(part.pose_rank for part in self.parts) if self.parts else pose_rank(self.points)
 
     @cached_property

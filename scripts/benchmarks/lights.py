@@ -1,10 +1,10 @@
 """Markers without labels: how many captures are calibrated, refused and wrong, and how good the rigs are.
 
-Run as `python -m scripts.benchmarks.lights campaign|accuracy|stream`; each writes its part of
+Run as `python -m scripts.benchmarks.lights campaign|accuracy|bound|stream`; each writes its part of
 docs/benchmarks/lights.json and resumes where it was stopped (out/work/lights.jsonl). Rig room10; errors of the factory
 values: half a degree, 2 mm, 1 % and 5 px times the drift; blobs with a noise of 0.1 px, a quarter of them hidden, three
 false ones in each image, no labels. `accuracy` compares with an estimate that is given all labels and reaches the
-Cramér-Rao bound, and times 2,000 lights. `stream` needs IMGCAL_CAPTURES.
+Cramér-Rao bound, and times 2,000 lights. `bound` says what errors that bound allows. `stream` needs IMGCAL_CAPTURES.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from torch import Tensor
 
 import imgcal
 from imgcal import CalibrationObject, CameraRig, Detections, Observations, RefusedError, RigPrior, estimate
-from imgcal.estimation import relative_covariance, relative_difference
+from imgcal.estimation import camera_covariance, relative_covariance, relative_difference
 from imgcal.geometry import RigidTransform
 from imgcal.messages import list_names
 from imgcal.synthesis import PhysicalDrift, simulate_volume
@@ -40,6 +40,8 @@ MOMENTS = {5: 60, 15: 40, 40: 24, 100: 12}
 WRONG_MM, WRONG_TIMES = 2.0, 5.0
 """A rig is wrong if its median error exceeds this, and this multiple of its stated error."""
 POINTS = 300
+DRAWN = 40
+"""Rigs drawn from the bound for each capture."""
 STICKS = {"stick of two": (-250.0, 250.0), "stick of three": (-250.0, -80.0, 250.0)}
 """mm, positions of the markers along the stick."""
 TARGETS = {"1 marker": (450, 2000), "40 markers": (50,), "stick of two": (150,), "stick of three": (150,)}
@@ -63,7 +65,9 @@ class Scene:
     obj: CalibrationObject = LIGHTS  # the target as it is given to imgcal
 
 
-def simulate(markers: int, moments: int, drift: float, seed: int, stick: Sequence[float] = ()) -> Scene:
+def simulate(
+    markers: int, moments: int, drift: float, seed: int, stick: Sequence[float] = (), hidden: float = HIDDEN
+) -> Scene:
     """Simulate a capture of a body in a room; one marker is a light that is carried around.
 
     Args:
@@ -72,6 +76,7 @@ def simulate(markers: int, moments: int, drift: float, seed: int, stick: Sequenc
         drift: of the factory values.
         seed: of all random values.
         stick: mm, known positions of markers on a line, which replaces the body.
+        hidden: share of the blobs that cameras miss.
     """
     generator, random = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
     physical = PhysicalDrift(0.5 * drift, 2.0 * drift, 0.01 * drift, 5.0 * drift, 0.005 * drift)
@@ -86,7 +91,7 @@ def simulate(markers: int, moments: int, drift: float, seed: int, stick: Sequenc
     obj = CalibrationObject(body, torch.ones(len(body), 3).double(), name="stick")
     truth = simulate_volume(rig, obj, moments, generator, None)
     assert truth.visible is not None
-    seen = truth.visible.numpy() & (random.random(truth.visible.shape) > HIDDEN)
+    seen = truth.visible.numpy() & (random.random(truth.visible.shape) > hidden)
     snapshot, camera, fiducial = np.nonzero(seen)
     exact = truth.uv.numpy()[seen]
     false = FALSE * moments * rig.num_cameras
@@ -241,6 +246,42 @@ def run(case: dict[str, Any]) -> dict[str, Any]:
     return case | examine(simulate(markers, case["moments"], case["drift"], case["seed"], stick))
 
 
+def bound(seeds: int) -> Iterable[dict[str, Any]]:
+    """Yield, for each target, the errors of rigs drawn from the Cramér-Rao bound, with labels given.
+
+    The bound is the covariance of the estimate that is given all labels. The first rows hide a quarter of the blobs, as
+    everywhere else; the others hide none.
+    """
+    for hidden in (HIDDEN, 0.0):
+        for target, counts in TARGETS.items():
+            stick = STICKS.get(target, ())
+            markers = len(stick) or int(target.split()[0])
+            for moments in counts:
+                rows = [_bound_of(simulate(markers, moments, 1.0, 100 + k, stick, hidden), k) for k in range(seeds)]
+                drawn = np.concatenate([errors for errors, _, _ in rows])
+                row = {
+                    "target": f"{target} x {moments}",
+                    "hidden": hidden,
+                    "median_mm": float(np.median(drawn)),
+                    "middle_90_percent_mm": np.quantile(drawn, (0.05, 0.95)).tolist(),
+                    "told_mm": [told for _, told, _ in rows],
+                    "told_nees": [nees for _, _, nees in rows],
+                }
+                print(row, flush=True)
+                yield row
+
+
+def _bound_of(scene: Scene, seed: int) -> tuple[NDArray[np.float64], float, float]:
+    """Errors (mm) of rigs drawn from the bound around the true rig; error and normalized error of the estimate."""
+    told = with_labels(scene)
+    values, vectors = torch.linalg.eigh(camera_covariance(told, curved=False))
+    half = vectors * values.clamp_min(0).sqrt()
+    noise = torch.randn(DRAWN, len(half), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    steps = (noise @ half.mT).unflatten(1, (scene.rig.num_cameras, -1))
+    errors = np.array([triangulation_error(scene.rig.retract(step), scene) for step in steps])
+    return errors, triangulation_error(told.rig, scene), normalized_error(told, scene.rig)
+
+
 def stream() -> dict[str, Any]:
     """Calibrate from the first half of the recorded wand without labels; score on the second with the whole wand."""
     reference, given = calibrated(), recording()
@@ -318,7 +359,7 @@ def rms(values: Sequence[float]) -> float:
 class Options:
     """Count captures of unknown markers that are calibrated, refused and wrong."""
 
-    part: tyro.conf.Positional[Literal["campaign", "accuracy", "stream"]]
+    part: tyro.conf.Positional[Literal["campaign", "accuracy", "bound", "stream"]]
     seeds: int = SEEDS  #: captures per kind
 
 
@@ -329,6 +370,9 @@ def main() -> None:
     result = read_json(RESULT) if RESULT.is_file() else {}
     if options.part == "stream":
         write_json(RESULT, surroundings() | result | {"stream": stream()})
+        return
+    if options.part == "bound":
+        write_json(RESULT, surroundings() | result | {"bound": list(bound(options.seeds))})
         return
     make_folder(DONE.parent)
     done = [json.loads(line) for line in DONE.read_text().splitlines()] if DONE.is_file() else []

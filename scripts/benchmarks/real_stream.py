@@ -5,7 +5,8 @@ from it and follows frames 2400-4799. Nothing moved in this recording, so every 
 false. A rotation can only be detected while the camera sees the wand, so delays count only that time. Finished runs of
 the same code are not repeated (`out/work/real_stream`). The result is written after each case.
 
-With `--lights`, the wand is unknown: its markers are separate lights at unknown positions.
+With `--lights`, the wand is unknown: its markers are separate lights at unknown positions. With `--stick 0 1 2`, the
+distances of these markers are known, and the others are lights.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ import tyro
 
 import imgcal
 from imgcal.fleet import StoredResults, workers
+from imgcal.types import CalibrationObject
 from scripts.benchmarks import wand_recording
+from scripts.benchmarks.lights import part_of
 from scripts.benchmarks.wand_recording import FOLLOWED, RATE, SEEN, calibrated, recording, turned
 from scripts.output import ROOT, WORK, command, markdown, surroundings, write_json
 
@@ -46,9 +49,18 @@ WORST_FINAL, WORST_ON_THE_WAY = 1.0, 1.2
 """Targets: error of the final rig relative to the calibration, and of any rig on the way relative to the first."""
 
 
-def start(calibration: imgcal.Calibration, lights: bool = False) -> imgcal.RigKeeper:
-    """Start a keeper from a new calibration; `lights`: the markers that it will see are unknown."""
-    return imgcal.RigKeeper(calibration.rig, imgcal.CalibrationObject.unknown() if lights else calibration.obj)
+def start(calibration: imgcal.Calibration, lights: bool = False, stick: tuple[int, ...] = ()) -> imgcal.RigKeeper:
+    """Start a keeper from a new calibration.
+
+    Args:
+        calibration: its rig, and its object unless `lights`.
+        lights: the markers are unknown.
+        stick: those with known distances.
+    """
+    if not lights:
+        return imgcal.RigKeeper(calibration.rig, calibration.obj)
+    known = [part_of(calibration.object, stick)] if stick else []  # lengths in its file are up to 0.4 % off
+    return imgcal.RigKeeper(calibration.rig, CalibrationObject.of_several([*known, CalibrationObject.unknown()]))
 
 
 @dataclass(frozen=True)
@@ -59,11 +71,12 @@ class Case:
     camera: int | None = None  # rotated camera; None = untouched
     degrees: float = 0.0
     lights: bool = False  # the wand is unknown
+    stick: tuple[int, ...] = ()  # markers whose distances are known
 
     @property
     def key(self) -> str:
         """Identify the result of the run."""
-        seen = "lights, " if self.lights else ""
+        seen = f"lights{''.join(f' {marker}' for marker in self.stick)}, " if self.lights else ""
         return f"{seen}stride {self.stride}, camera {self.camera}, {self.degrees} degrees"
 
 
@@ -77,7 +90,7 @@ def untouched(case: Case) -> dict[str, Any]:
     given, known, stride = recording(), calibrated(), case.stride
     batch, batch_median = known.score(known.calibration.rig)
     events, scores, refused, began = [], [], Counter[str](), time.process_time()
-    with start(known.calibration, case.lights) as keeper:
+    with start(known.calibration, case.lights, case.stick) as keeper:
         for count, number in enumerate(FOLLOWED[::stride]):
             state = keeper.update(given.frame(number), time=number / RATE)
             events += [plain(event, number) for event in state.events]
@@ -115,7 +128,7 @@ def bumped(case: Case) -> dict[str, Any]:
     name, frames = given.factory.camera_names[case.camera], FOLLOWED[:: case.stride]
     seeing = [n for n in frames if n >= BUMPED and given.counts[n, case.camera] >= SEEN]
     last = seeing[: math.ceil(AFTER * RATE / case.stride)][-1]
-    events, saved = kept_until_bump(case.stride, case.lights)
+    events, saved = kept_until_bump(case.stride, case.lights, case.stick)
     with tempfile.TemporaryDirectory() as folder:
         (path := Path(folder) / "keeper.json").write_bytes(saved)
         keeper = imgcal.RigKeeper.restore(path)
@@ -132,10 +145,10 @@ def bumped(case: Case) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=1)
-def kept_until_bump(stride: int, lights: bool) -> tuple[list[dict[str, Any]], bytes]:
+def kept_until_bump(stride: int, lights: bool, stick: tuple[int, ...]) -> tuple[list[dict[str, Any]], bytes]:
     """Follow the stream until a camera is rotated; return all events, and the state of the keeper."""
     given, events = recording(), []
-    with start(calibrated().calibration, lights) as keeper, tempfile.TemporaryDirectory() as folder:
+    with start(calibrated().calibration, lights, stick) as keeper, tempfile.TemporaryDirectory() as folder:
         for number in (n for n in FOLLOWED[::stride] if n < BUMPED):
             events += [plain(e, number) for e in keeper.update(given.frame(number), time=number / RATE).events]
         keeper.save(path := Path(folder) / "keeper.json")
@@ -276,7 +289,8 @@ class Options:
     cores: int = 1  #: processes over the cases; the result is the same
     fresh: bool = False  #: calibrate again instead of using the cached calibration
     lights: bool = False  #: follow the markers as unknown lights
-    out: Path | None = None  #: default: docs/benchmarks/real_stream.json, or real_stream_lights.json
+    stick: tuple[int, ...] = ()  #: markers of the wand whose distances are known; the others are lights
+    out: Path | None = None  #: default: docs/benchmarks/real_stream.json, ..._lights.json or ..._stick_0_1_2.json
 
 
 def main() -> None:
@@ -285,13 +299,16 @@ def main() -> None:
     known = calibrated(options.fresh)
     texts = [Path(str(module)).read_text("utf-8") for module in (__file__, wand_recording.__file__)]
     rms = float(known.calibration.rms)
-    cases = [Case(stride, lights=options.lights) for stride in options.strides] + [
-        Case(stride, camera, degrees, options.lights)
+    lights = options.lights or bool(options.stick)
+    cases = [Case(stride, lights=lights, stick=options.stick) for stride in options.strides] + [
+        Case(stride, camera, degrees, lights, options.stick)
         for stride in options.bump_strides
         for degrees in options.bumps
         for camera in options.cameras
     ]
-    out = options.out or (LIGHTS_RESULT if options.lights else RESULT)
+    name = f"real_stream_stick_{'_'.join(map(str, options.stick))}.json"
+    usual = RESULT.with_name(name) if options.stick else LIGHTS_RESULT if lights else RESULT
+    out = options.out or usual
     with workers(None, options.cores, StoredResults(WORK / "real_stream", f"{rms!r}\n" + "\n".join(texts))) as mapped:
         found = []
         for case, row in zip(cases, mapped(run, cases), strict=True):

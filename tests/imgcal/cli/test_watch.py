@@ -13,13 +13,13 @@ import pytest
 import torch
 
 from imgcal.cli.main import main
-from imgcal.cli.watch import metrics_address
+from imgcal.cli.watch import _object_difference, metrics_address
 from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform
 from imgcal.io import load_object, read_rig, save_detections, save_object, save_rig, write_frame
 from imgcal.online import RigKeeper
 from imgcal.synthesis import Truth, simulate_volume, true_detections
-from imgcal.types import CameraRig, Detections, DriftRate, RigPrior
+from imgcal.types import CalibrationObject, CameraRig, Detections, DriftRate, RigPrior
 from imgcal.watch import Progress
 from tests.imgcal.streams import Stream
 from tests.imgcal.watch.test_marker_files import points_of
@@ -148,6 +148,19 @@ def test_a_missing_source_is_reported_before_any_note(tmp_path, monkeypatch, cap
     (tmp_path / "empty" / "frames" / "cam01").mkdir(parents=True)
     assert main([*arguments[:1], "empty", *arguments[2:], "--until-idle", "0.1"]) == 3
     assert "note: markers of stick are followed one by one" in capsys.readouterr().err
+
+
+def test_a_stick_of_another_length_does_not_go_on_with_what_is_known(tmp_path):
+    stick, longer, both = (
+        CalibrationObject.of_several([
+            CalibrationObject(torch.tensor([[0.0, 0, 0], [length, 0, 0]]).double(), torch.ones(2, 3).double())
+            for length in lengths
+        ]).as_unknown()
+        for lengths in ((100.0,), (101.0,), (100.0, 100.0))
+    )  # fmt: skip
+    assert _object_difference(stick, stick) is None
+    assert "fiducial 2" in str(_object_difference(longer, stick))
+    assert "found 20 fiducials, expected 18" in str(_object_difference(both, stick))
 
 
 @pytest.mark.parametrize(

@@ -99,3 +99,35 @@ def test_lights_that_no_two_cameras_see_are_refused() -> None:
     alone[:, 0] = seen.seen[:, 0]
     with pytest.raises(RefusedError, match="no light is seen by two cameras"):
         absorb(RigBelief.of_prior(factory, lights), replace(seen, seen=alone), at)
+
+
+@pytest.mark.parametrize("kept", [(0, 1), (0, 1, 2), (0, 1, 2, 3), tuple(range(8))], ids=len)
+def test_lights_with_known_distances_say_what_the_rigid_object_says(kept) -> None:
+    factory, obj, truth, observations = made_snapshots()
+    rows = list(kept)
+    rigid = replace(obj, points=obj.points[rows], colours=obj.colours[rows])
+    given, poses = part(observations, 0, 6), truth.rig_from_object[:6]
+    there = given.seen[:, :, rows] & (given.seen[:, :, rows].sum(1, keepdim=True) >= 2)
+    given = Observations(given.uv[:, :, rows], given.sigma[:, :, rows], there)
+    assert bool((there.any(1).sum(1) >= min(3, len(rows))).all())
+    lights, seen, at = lights_of(given, poses.apply(rigid.points) + torch.tensor((0.3, -0.2, 0.4)).double())
+    none = CalibrationObject.unknown(most=ROOM)
+    swapped = [*range(ROOM, ROOM + len(rows)), *range(ROOM)]  # known markers come first
+    seen = Observations(seen.uv[:, :, swapped], seen.sigma[:, :, swapped], seen.seen[:, :, swapped])
+    at = RigidTransform(at.rotation, at.translation[:, swapped])
+    known = absorb(RigBelief.of_prior(factory, replace(lights, parts=(rigid, none))), seen, at, SQUARED)
+    expected = absorb(RigBelief.of_prior(factory, rigid), given, poses, SQUARED) if len(rows) > 2 else None
+    apart = known.rig_from_object.translation[:, : len(rows)]
+    torch.testing.assert_close(
+        torch.cdist(apart, apart), torch.cdist(rigid.points, rigid.points).expand(6, -1, -1), rtol=0, atol=2e-2
+    )
+    free = 2 * int(given.seen.sum()) - 6 * rigid.pose_rank
+    assert known.dof == free
+    if expected is not None:
+        std = expected.belief.std()
+        torch.testing.assert_close(known.belief.std(), std, rtol=2e-2, atol=1e-9)
+        off = (known.belief.rig.positions - expected.belief.rig.positions) / std[:, 3:6]
+        assert float(off.abs().max()) < 0.1
+        assert known.evidence == pytest.approx(expected.evidence, abs=1.0)
+    alone = absorb(RigBelief.of_prior(factory, lights), seen, at)
+    assert known.belief.scale_std() < 0.5 * alone.belief.scale_std()

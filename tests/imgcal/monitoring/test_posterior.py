@@ -41,6 +41,16 @@ def test_of_another_object_it_says_what_it_knows_of_the_cameras(made) -> None:
     assert torch.allclose(belief.std(), known.std(), rtol=1e-6)
 
 
+def test_for_several_objects_it_says_what_it_knows_of_the_cameras(made) -> None:
+    _, obj, _, _ = made
+    loose = replace(obj, tolerance=torch.full((8,), 0.3, dtype=torch.float64))
+    posterior = make_posterior(batch(made, 6, loose), loose)
+    watched = imgcal.CalibrationObject.of_several([loose, imgcal.load_object("wand4")]).as_unknown()
+    belief = belief_from_posterior(posterior, watched)
+    torch.testing.assert_close(belief.std(), belief_from_posterior(posterior, loose).std())
+    assert belief.obj is watched and len(belief.object_offset) == 0
+
+
 def test_a_scattered_estimate_starts_a_wider_belief(made) -> None:
     _, obj, _, _ = made
     fit = batch(made, 6)

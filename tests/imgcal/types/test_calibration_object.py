@@ -138,12 +138,19 @@ def test_all_but_a_single_body_is_taken_for_unknown_markers():
     stick = CalibrationObject(points, torch.ones(2, 3).double(), radius=torch.full((2,), 7.0), name="it")
     light = CalibrationObject(points[:1], torch.ones(1, 3).double(), name="lamp")
     assert body.as_unknown() is body
-    for obj in (stick, light, lights, CalibrationObject.of_several([body, stick])):
+    both = CalibrationObject.of_several([body, stick])
+    for obj, known in ((stick, [2]), (light, []), (lights, []), (both, [4, 2])):
         found = obj.as_unknown()
         check_object(found)
-        assert found.unknown_markers and found.num_fiducials == MOST_LIGHTS and found.exact and found.pose_rank == 3
+        assert found.unknown_markers and found.exact and found.pose_rank == 3
+        assert found.num_fiducials == MOST_LIGHTS + sum(known)
         assert found.name == obj.name and found.as_unknown() is found
-    assert stick.as_unknown().radius.tolist() == [7.0] * MOST_LIGHTS
+        assert [first for first, _ in found.known_parts] == [0, 4][: len(known)]
+        for (_, points), part in zip(found.known_parts, obj.each, strict=False):
+            np.testing.assert_allclose(points, part.points.double().numpy())
+    assert stick.as_unknown().radius.tolist() == [7.0] * (MOST_LIGHTS + 2)
+    crowd = CalibrationObject.of_several([body] * 5).as_unknown()
+    assert crowd.parts[-1].num_fiducials == 20  # as many lights as the objects have markers
 
 
 def test_unknown_markers_come_last_among_several() -> None:
