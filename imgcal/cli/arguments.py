@@ -227,8 +227,8 @@ class Watch:
     rig: str  #: factory rig: a file, or the name of a shipped one
     object: tuple[str, ...]
     """object: a file, or the name of a shipped one; lights = any bright markers that move through the volume. The
-    markers of a stick, or of several objects, are followed one by one, like lights; then the rig should come from
-    imgcal calibrate, and it keeps its scale"""
+    markers of a stick, or of several objects, are followed one by one, like lights, and their known distances give the
+    scale; then the rig should come from imgcal calibrate"""
     out: Path  #: folder to write
     fresh: bool = False  #: ignore what an earlier run left in OUT and start from the factory rig
     tolerance: float = Timing.tolerance  #: s, largest difference of time stamps within a snapshot
