@@ -129,7 +129,8 @@ class PendingChange:
             The form of change to believe (None = any) and the kind to report (None = no single kind); None = cannot be
             decided yet.
         """
-        odds, likeliest = {None: test.odds({**self.others(camera), camera: None})}, dict[str | None, str | None]()
+        odds: dict[str | None, float] = {None: test.odds({**self.others(camera), camera: None})}
+        likeliest = dict[str | None, str | None]()
         for kind, forms in FORMS_OF.items():
             found = {form: test.odds({**self.others(camera), camera: form}) for form in forms}
             odds[kind] = mean_evidence(list(found.values()), len(found)) + LENS_LOG_PRIOR * (kind in LENS_KINDS)
