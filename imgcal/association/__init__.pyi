@@ -13,6 +13,7 @@ from .series import (
     associate,
     drop_snapshots,
     match_to_rig,
+    refuse_snapshots,
 )
 from .single_image_labels import is_small_planar, label_by_shape
 from .tracker import SnapshotIdentity, Tracker, to_observations
@@ -55,6 +56,7 @@ __all__ = [
     "pattern_prior",
     "predicted_misses",
     "proposal_rows",
+    "refuse_snapshots",
     "relocalize",
     "to_observations",
     "track",

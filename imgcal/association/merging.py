@@ -96,16 +96,18 @@ def merging_distance(labelled: Associations, rows: NDArray[np.int64]) -> NDArray
     detections = labelled.detections
     reach, camera = 2 * detections.radius[rows] + BLUR, detections.camera[rows]
     unknown = np.isnan(reach)
-    for one in np.unique(camera[unknown]):
-        own = np.flatnonzero((detections.camera == one) & (detections.fiducial >= 0))
-        reach[unknown & (camera == one)] = _closest(detections.uv[own], detections.snapshot[own])
+    if unknown.any():
+        reach[unknown] = _closest(detections.select(detections.fiducial >= 0), camera.max() + 1)[camera[unknown]]
     return reach
 
 
-def _closest(uv: NDArray[np.float64], snapshot: NDArray[np.int64]) -> float:
-    """Smallest distance (px) of two of some blobs (M, 2) in one snapshot (M,), at most `MOST_REACH`."""
-    if len(uv) < 2:
-        return MOST_REACH
-    apart = 2 * MOST_REACH * (snapshot - snapshot.min())  # snapshots side by side
-    distance, _ = cKDTree(np.column_stack((uv, apart))).query(np.column_stack((uv, apart)), k=2)
-    return min(float(distance[:, 1].min()), MOST_REACH)
+def _closest(blobs: Detections, cameras: int) -> NDArray[np.float64]:
+    """Smallest distance (px) of two blobs in one frame of each camera (C,), at most `MOST_REACH`."""
+    closest = np.full(cameras, MOST_REACH)
+    some = blobs.camera < cameras
+    uv, camera = blobs.uv[some], blobs.camera[some]
+    frame = blobs.snapshot[some] * cameras + camera
+    tree = cKDTree(np.column_stack((uv, 2 * MOST_REACH * frame)))  # frames side by side
+    first, second = tree.query_pairs(MOST_REACH, output_type="ndarray").T
+    np.minimum.at(closest, camera[first], np.linalg.norm(uv[first] - uv[second], axis=-1))
+    return closest

@@ -9,8 +9,7 @@ from math import perm
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import logsumexp
-from scipy.stats import chi2
+from scipy.special import gammaincinv, logsumexp
 
 from imgcal.association.hypotheses import Poses
 from imgcal.association.identity import Identity, IdentityOptions, Status
@@ -68,7 +67,7 @@ def compare_labellings(scene: Scene, options: IdentityOptions) -> Identity:
     rig, pose = rig_and_pose(scene, fits, best)
     labelled = int((labels[best] >= 0).sum())
     refusal = ""
-    if 2 * cost[best] > chi2.ppf(FITS, 2 * labelled - 6):
+    if 2 * cost[best] > 2 * gammaincinv(labelled - 3, FITS):
         refusal = f"no labelling of the {labelled} blobs fits: the best is {off[best]:.2g} px off"
     elif margin < min(LEAST_MARGIN, options.least_margin):
         refusal = (

@@ -294,15 +294,20 @@ def drop_snapshots(labelled: Associations, rows: Sequence[int]) -> Associations:
     Raises:
         RefusedError: no snapshot is left.
     """
-    numbers, snapshots = [labelled.used[row] for row in rows], list(labelled.snapshots)
-    for number in numbers:
-        snapshots[number] = replace(snapshots[number], status="refused", reason=ON_A_LINE, rig_from_object=None)
-    detections = labelled.detections
-    fiducial = np.where(np.isin(detections.snapshot, numbers), -1, detections.fiducial)
-    left = Associations(replace(detections, fiducial=fiducial), tuple(snapshots))
+    left = refuse_snapshots(labelled, rows, ON_A_LINE)
     if not left.used:
         raise RefusedError(f"estimation: in every snapshot: {ON_A_LINE}; capture more, with the whole object in view")
     return left
+
+
+def refuse_snapshots(labelled: Associations, rows: Sequence[int], reason: str) -> Associations:
+    """Remove the labels of snapshots (numbers among the used ones), and record the reason."""
+    numbers, snapshots = [labelled.used[row] for row in rows], list(labelled.snapshots)
+    for number in numbers:
+        snapshots[number] = replace(snapshots[number], status="refused", reason=reason, rig_from_object=None)
+    detections = labelled.detections
+    fiducial = np.where(np.isin(detections.snapshot, numbers), -1, detections.fiducial)
+    return Associations(replace(detections, fiducial=fiducial), tuple(snapshots))
 
 
 def _gap(snapshot: int, accepted: NDArray[np.int64]) -> int:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from imgcal.detection.centroids import Blobs
 from imgcal.detection.options import DetectionOptions
+from imgcal.medians import median
 from imgcal.types import UNUSABLE
 
 GAP = 3.0  # ratio of neighbouring contrasts between two populations
@@ -55,9 +56,9 @@ def usual_size(blobs: Blobs, limit: float) -> NDArray[np.bool_]:
         return small
     large = ~small & usable(blobs)
     if large.sum() >= LEAST_LARGE:
-        ratio = blobs.radius / np.median(blobs.radius[large])
+        ratio = blobs.radius / median(blobs.radius[large])
         alike = large & (ratio < ONE_SIZE) & (ratio > 1 / ONE_SIZE)
-        least = DIMMER * np.median(blobs.contrast[small]) if small.any() else 0.0
+        least = DIMMER * median(blobs.contrast[small]) if small.any() else 0.0
         if (alike & (blobs.contrast >= least)).sum() >= LEAST_LARGE:
             return small | alike
     return small
@@ -81,7 +82,7 @@ def drop_dim(shots: Sequence[Blobs], options: DetectionOptions) -> list[Blobs]:
     for own, some in zip(limits.T, shown.sum(0), strict=True):
         known = own[own > 0]
         if len(known) > OFTEN * some:
-            own[own == 0] = np.median(known)
+            own[own == 0] = median(known)
     kept = contrast >= limits.reshape(-1)[frame]
     return [
         shot if keep.all() else shot.select(keep)

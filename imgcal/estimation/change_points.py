@@ -24,6 +24,7 @@ from scipy.special import chdtrc, chdtri
 from imgcal.estimation.linearization import Problem, State
 from imgcal.estimation.map_estimate import equations_by_snapshot
 from imgcal.estimation.robust_losses import NamedLoss
+from imgcal.medians import median
 
 STEP = 8
 """Values of a camera that can step: rotation, position, focal lengths."""
@@ -217,7 +218,7 @@ def dispersion(blocks: Blocks, seen: NDArray[np.bool_]) -> float:
         if len(rows):
             few = rows[np.unique(np.linspace(0, len(rows) - 1, 16).astype(int))]
             found.append(blocks.statistics([camera], few))
-    return max(1.0, float(np.median(np.concatenate(found))) / float(chdtri(STEP, 0.5))) if found else 1.0
+    return max(1.0, median(np.concatenate(found)) / float(chdtri(STEP, 0.5))) if found else 1.0
 
 
 def least_significant(candidates: int, error: float) -> float:

@@ -14,6 +14,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from imgcal.medians import median_of_known
+
 LAG_THRESHOLD = 2.0
 """An autocorrelation is significant above `LAG_THRESHOLD` (log10 n / n)^1/2 for n pairs: three sigma of white noise."""
 QUIET = 5
@@ -47,16 +49,22 @@ def autocorrelation(series: NDArray[np.floating], lags: int) -> tuple[NDArray[np
     count, sources = series.shape[:2]
     x = _centre(np.asarray(series, dtype=np.float64).reshape(count, sources, -1))
     known = np.isfinite(x)
-    x = np.where(known, x, 0.0)
+    wide = x.shape[2]
+    samples, there = _rows(np.where(known, x, 0.0)), _rows(known.astype(np.float64))
     products, pairs = np.empty((lags + 1, sources)), np.empty((lags + 1, sources))
     for lag in range(lags + 1):
-        ahead, behind = slice(lag, count), slice(0, count - lag)
-        products[lag] = np.einsum("scd,scd->c", x[ahead], x[behind])
-        pairs[lag] = np.einsum("scd,scd->c", known[ahead], known[behind], dtype=np.float64)
+        ahead, behind = np.s_[:, lag * wide :], np.s_[:, : (count - lag) * wide]
+        products[lag] = np.einsum("cn,cn->c", samples[ahead], samples[behind])
+        pairs[lag] = (count - lag) * wide if known.all() else np.einsum("cn,cn->c", there[ahead], there[behind])
     mean = np.divide(products, pairs, out=np.full_like(products, np.nan), where=pairs > 0)
     variance = mean[0]
     rho = np.divide(mean, variance, out=np.full_like(mean, np.nan), where=variance > 0)
     return rho, pairs
+
+
+def _rows(series: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Arrange series (S, C, D) as one long row for each source, so that sums run along the memory: (C, S D)."""
+    return np.ascontiguousarray(series.swapaxes(0, 1)).reshape(series.shape[1], -1)
 
 
 def correlation_time(series: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -97,8 +105,8 @@ def _centre(x: NDArray[np.float64]) -> NDArray[np.float64]:
     filled = np.where(known, x, np.nan)
     empty = ~known.any(0)
     filled[:, empty] = 0.0
-    centre = np.nanmedian(filled, axis=0)
-    spread = 1.4826 * np.nanmedian(np.abs(filled - centre), axis=0)
+    centre = median_of_known(filled)
+    spread = 1.4826 * median_of_known(np.abs(filled - centre))
     limit = np.where(spread > 0, OUTLYING * spread, np.inf)
     clipped = np.clip(filled - centre, -limit, limit)
     clipped -= np.nanmean(clipped, axis=0)

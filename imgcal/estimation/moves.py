@@ -32,6 +32,7 @@ from imgcal.estimation.correlation import correlation_time
 from imgcal.estimation.linearization import Problem, State, points_at, pose_at, rig_at
 from imgcal.estimation.map_estimate import equations_at, minimize
 from imgcal.estimation.robust_losses import NamedLoss, huber
+from imgcal.medians import median
 from imgcal.types import PARAMETER_KINDS, Kind, MovedCamera
 
 # When a camera has moved.
@@ -133,7 +134,7 @@ class Places:
     def cost_per_label(self, place: int) -> float:
         """Median, over a place's snapshots, of the mean cost of a label; noise alone leaves one."""
         labels = (self.problem.root_weight[0][:, place] > 0).sum(-1).numpy()
-        return float(np.median((self.costs(place) / np.maximum(labels, 1))[labels > 0]))
+        return median((self.costs(place) / np.maximum(labels, 1))[labels > 0])
 
     def misfit(self, camera: int) -> float:
         """Chi-squared of a camera's labels, each clipped, in excess of the noise."""

@@ -34,7 +34,7 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation.levenberg_marquardt import Solution
-from imgcal.estimation.linearization import Problem, State
+from imgcal.estimation.linearization import NormalEquations, Problem, State
 from imgcal.estimation.map_estimate import equations_at
 from imgcal.estimation.robust_losses import NamedLoss
 
@@ -76,13 +76,14 @@ def block_scatter(problem: Problem, solution: Solution, loss: NamedLoss) -> Bloc
         size *= 2
     if snapshots // size < LEAST_BLOCKS:
         return BlockScatter()
-    information, pull = _evidence(problem, solution.state, size, loss)
+    parts = [linearize_blocks(problem, solution.state, size, loss)]
     if snapshots % size:
-        rest = _evidence(problem, solution.state, snapshots % size, loss, snapshots - snapshots % size)
-        information, pull = torch.cat((information, rest[0])), torch.cat((pull, rest[1]))
+        parts.append(linearize_blocks(problem, solution.state, snapshots % size, loss, snapshots - snapshots % size))
+    pull = torch.cat([part.pull for part in parts])
     cameras, lengths = problem.prior_std[0], _powers_of_two(snapshots // size // LEAST_BLOCKS)
-    if not _is_worth_measuring(information, pull, lengths, cameras.numel()):
+    if not _is_worth_measuring(torch.stack([part.total() for part in parts]).sum(0), pull, lengths, cameras.numel()):
         return BlockScatter()
+    information = torch.cat([part.information() for part in parts])
     largest, most, length, sure = torch.ones_like(cameras[:, 0]), 1.0, 0, False
     before: Scatter | None = None
     for joined in lengths:
@@ -104,10 +105,16 @@ def _powers_of_two(most: int) -> list[int]:
     return [2**power for power in range(most.bit_length())]
 
 
-def _is_worth_measuring(information: Tensor, pull: Tensor, lengths: list[int], cameras: int) -> bool:
-    """Test to first order whether blocks of any length scatter more than noise would; shapes as in `_scatter`."""
-    total = information.sum(0)
-    total.diagonal().add_(1)
+def _is_worth_measuring(total: Tensor, pull: Tensor, lengths: list[int], cameras: int) -> bool:
+    """Test to first order whether blocks of any length scatter more than noise would.
+
+    Args:
+        total: (D, D) information of all blocks, without the prior.
+        pull: (B, D) scores of the short blocks.
+        lengths: numbers of short blocks in a block.
+        cameras: number of the cameras' parameters, which come first.
+    """
+    total = total + torch.eye(len(total), dtype=total.dtype, device=total.device)
     covariance = torch.cholesky_inverse(torch.linalg.cholesky(total))
     noise = (covariance - covariance @ covariance)[:cameras, :cameras]  # due to noise; the rest is due to the prior
     known = noise.diagonal() > LEAST_SAID
@@ -167,8 +174,56 @@ def _scatter(information: Tensor, pull: Tensor, joined: int, shape: torch.Size) 
     return Scatter(average, deviation, OWN * own + (1 - OWN) * average)
 
 
-def _evidence(problem: Problem, state: State, size: int, loss: NamedLoss, first: int = 0) -> tuple[Tensor, Tensor]:
-    """Information of blocks of snapshots about the whitened parameters of cameras and object, D in all.
+@dataclass(frozen=True)
+class Evidence:
+    """Evidence of B blocks of snapshots about the whitened parameters of cameras and object, D in all.
+
+    Poses are marginalized, and the prior is left out.
+    """
+
+    equations: NormalEquations  # of B rigs, each with the prior
+    taken: Tensor  # (B, P, D) factor of the information that the poses take
+    pull: Tensor  # (B, D) score
+
+    def information(self) -> Tensor:
+        """Information of each block: (B, D, D)."""
+        own = self.equations.object
+        parts = None if own is None else (own.camera.flatten(1, 2), own.own)
+        return _without_prior_and_poses(self.equations.camera, parts, 1, self.taken)
+
+    def total(self) -> Tensor:
+        """Information of all blocks together, (D, D): faster than the sum of `information`."""
+        own, count = self.equations.object, len(self.pull)
+        parts = None if own is None else (own.camera.flatten(1, 2).sum(0, True), own.own.sum(0, True))
+        camera = self.equations.camera.sum(0, True)
+        return _without_prior_and_poses(camera, parts, count, self.taken.flatten(0, 1)[None])[0]
+
+
+def _without_prior_and_poses(camera: Tensor, own: tuple[Tensor, Tensor] | None, priors: int, taken: Tensor) -> Tensor:
+    """Join the parts of dense normal equations: (B, D, D).
+
+    Args:
+        camera: (B, C, K, K) blocks of the cameras.
+        own: (B, K C, M) coupling of the cameras with the object and (B, M, M) the object's block; None = exact object.
+        priors: how many times the parts contain the prior's unit information.
+        taken: (B, P, D) factor of the information that the poses take.
+    """
+    cameras, free = camera.shape[1:3]
+    wide = cameras * free
+    information = taken.mT @ taken.neg()
+    blocks = information[:, :wide, :wide].unflatten(1, (cameras, free)).unflatten(-1, (cameras, free))
+    blocks.diagonal(dim1=1, dim2=3).add_(camera.permute(0, 2, 3, 1))
+    if own is not None:
+        across, square = own
+        information[:, :wide, wide:] += across
+        information[:, wide:, :wide] += across.mT
+        information[:, wide:, wide:] += square
+    information.diagonal(dim1=1, dim2=2).sub_(priors)
+    return information
+
+
+def linearize_blocks(problem: Problem, state: State, size: int, loss: NamedLoss, first: int = 0) -> Evidence:
+    """Linearize blocks of snapshots.
 
     Args:
         problem: one rig.
@@ -177,8 +232,6 @@ def _evidence(problem: Problem, state: State, size: int, loss: NamedLoss, first:
         loss: of the fit.
         first: the first snapshot of the first block.
 
-    Returns:
-        (B, D, D) information and (B, D) score, poses marginalized, without the prior.
     """
     count = (problem.uv.shape[1] - first) // size
     rows = slice(first, first + count * size)
@@ -204,19 +257,11 @@ def _evidence(problem: Problem, state: State, size: int, loss: NamedLoss, first:
     )  # fmt: skip
     equations = equations_at(blocks, there, loss)
     own, coupling = equations.object, equations.coupling.permute(0, 1, 4, 2, 3).flatten(3)  # (B, S, 6, K C)
-    _, cameras, free, _ = equations.camera.shape
-    apart = coupling.new_zeros(count, cameras, free, cameras, free)
-    apart.diagonal(dim1=1, dim2=3).copy_(equations.camera.permute(0, 2, 3, 1))
-    information = apart.flatten(3).flatten(1, 2)
     pull = (there.offset - equations.camera_gradient).flatten(1)
     if own is not None and there.object_offset is not None:
-        across = own.camera.flatten(1, 2)
-        information = torch.cat((torch.cat((information, across), 2), torch.cat((across.mT, own.own), 2)), 1)
         pull = torch.cat((pull, there.object_offset - own.gradient), 1)
         coupling = torch.cat((coupling, own.pose), 3)
     factor = torch.linalg.cholesky(equations.pose)
     taken = torch.linalg.solve_triangular(factor, coupling, upper=False).flatten(1, 2)
     residue = torch.linalg.solve_triangular(factor, equations.pose_gradient[..., None], upper=False).flatten(1, 3)
-    information.diagonal(dim1=1, dim2=2).sub_(1)
-    information = torch.baddbmm(information, taken.mT, taken, alpha=-1)
-    return information, pull + (taken.mT @ residue[..., None])[..., 0]
+    return Evidence(equations, taken, pull + (taken.mT @ residue[..., None])[..., 0])

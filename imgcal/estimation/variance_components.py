@@ -319,9 +319,10 @@ def _fit(
 def _additive_noise(squared: NDArray[np.floating], variance: NDArray[np.floating], taken: float) -> float:
     """Standard deviation (px, each axis) of the residuals beyond the blobs' own sigma; 0 = insignificant.
 
-    The median of squared distances over two axes is 1.386 for unit noise, whatever a minority of outliers does. The
-    residuals are smaller than the noise by the degrees of freedom of the parameters: each counts as one observation
-    times the share of its information that comes from the data.
+    The median of squared distances over two axes is 1.386 for unit noise, whatever a minority of outliers does, so half
+    of the residuals must have `squared / 1.386 - variance` below the square of the result. The residuals are smaller
+    than the noise by the degrees of freedom of the parameters: each counts as one observation times the share of its
+    information that comes from the data.
 
     Args:
         squared: (M,) px^2, squared lengths of the residuals.
@@ -330,20 +331,12 @@ def _additive_noise(squared: NDArray[np.floating], variance: NDArray[np.floating
     """
     count = 2 * len(squared)
     free = max(count - taken, 1.0)
-    squared = squared * (count / free)
+    unit = squared * (count / free / 1.386)
     middle = (len(squared) - 1) // 2
-
-    def excess(error: float) -> float:
-        return float(np.partition(squared / (variance + error**2), middle)[middle]) / 1.386
-
     # Six standard deviations of a chi-squared mean: below, the residuals agree with the blobs' sigmas.
-    if excess(0.0) <= 1 + 6 * (2 / free) ** 0.5:
+    if np.partition(unit / variance, middle)[middle] <= 1 + 6 * (2 / free) ** 0.5:
         return 0.0
-    low, high = 0.0, float(np.sqrt(squared.max()))
-    for _ in range(30):
-        error = 0.5 * (low + high)
-        low, high = (error, high) if excess(error) > 1 else (low, error)
-    return high
+    return float(np.partition(unit - variance, middle)[middle]) ** 0.5
 
 
 def _too_narrow(offset: NDArray[np.floating], remaining: NDArray[np.float64]) -> dict[str, float]:

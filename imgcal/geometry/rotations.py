@@ -128,18 +128,14 @@ def _quaternion_from_rotation(rotation: Tensor) -> Tensor:
     zy, xz, yx = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
     xy, zx, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
     ww, xx, yy, zz = 1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22
-    candidates = torch.stack(
-        (
-            torch.stack((ww, zy, xz, yx), -1),
-            torch.stack((zy, xx, xy, zx), -1),
-            torch.stack((xz, xy, yy, yz), -1),
-            torch.stack((yx, zx, yz, zz), -1),
-        ),
-        -2,
-    )
-    best = torch.stack((ww, xx, yy, zz), -1).argmax(-1)
-    chosen = torch.take_along_dim(candidates, best[..., None, None], -2).squeeze(-2)
-    return torch.nn.functional.normalize(chosen, dim=-1)
+    # Compare the candidates component by component: each component is one long row.
+    largest = ww
+    chosen: tuple[Tensor, ...] = (ww, zy, xz, yx)
+    for square, candidate in ((xx, (zy, xx, xy, zx)), (yy, (xz, xy, yy, yz)), (zz, (yx, zx, yz, zz))):
+        larger = square > largest
+        largest = torch.where(larger, square, largest)
+        chosen = tuple(torch.where(larger, new, old) for new, old in zip(candidate, chosen, strict=True))
+    return torch.nn.functional.normalize(torch.stack(chosen, -1), dim=-1)
 
 
 def rotation_from_euler(angles: Tensor) -> Tensor:

@@ -26,8 +26,9 @@ REMAINING_CHI2 = 20.0
 """Minimum score without the episode that supports the change most; wrong labels or passing errors leave nothing."""
 
 # Numbers of snapshots.
-SLOW_TESTS = {16: 16, 64: 32}
-"""Numbers of snapshots to test without a suspicion, each with the interval between its tests: for young rigs."""
+SLOW_TESTS = {16: (16, 0), 64: (32, 8)}
+"""Numbers of snapshots to test without a suspicion, each with the interval between its tests and their offset, so that
+no snapshot waits for both: for young rigs."""
 NEARBY_SNAPSHOTS = 4
 """Half width, in snapshots, of the search for the first snapshot after a change."""
 
@@ -46,7 +47,7 @@ def find_alarm(
         episode: number of successive snapshots that a passing error may last, given the camera and the shift in pixels.
         least_shifts: smallest image shift, in pixels, that counts as a change; one for each camera.
     """
-    ages = {age for age, every in SLOW_TESTS.items() if age <= len(recent) and count % every == 0}
+    ages = {age for age, (every, at) in SLOW_TESTS.items() if age <= len(recent) and count % every == at}
     screened = recent.screen()
     if screened.max() >= SCREEN_CHI2:
         ages.add(int(SCREENED_AGES[int(screened.max(1).argmax())]))
@@ -120,7 +121,7 @@ def changed_cameras(
 
 def _largest_shift(test: ChangeTest, camera: int) -> float:
     """Largest image shift (px) by a change of a single kind, if no other camera changed."""
-    kinds = (test.jump(camera, kind)[0] / test.pixels[camera, part] for kind, part in CHANGES.items())
+    kinds = (test.jump(camera, part)[0] / test.pixels[camera, part] for part in CHANGES.values())
     return max(float(shift.norm()) for shift in kinds)
 
 

@@ -28,6 +28,14 @@ from imgcal.types import PARAMETER_KINDS, CameraRig
 
 CHANGES: Mapping[str, slice] = {kind: part for kind, part in PARAMETER_KINDS.items() if kind != "distortion"}
 """Kinds of change, and the camera parameters that each one covers."""
+_PARTS = {**CHANGES, "tilt": slice(0, 2)}
+FORMS: Mapping[str, tuple[slice, ...]] = {name: (part,) for name, part in _PARTS.items()} | {
+    f"{name} and lens": (part, PARAMETER_KINDS["distortion"]) for name, part in _PARTS.items()
+}
+"""Forms of these kinds, and their parameters. A tilt is a rotation about an axis in the image plane, as by a mount's
+joints. After a change, a camera may see the object where its distortion is not well known."""
+FORMS_OF = {kind: tuple(name for name in FORMS if kind in name or (kind == "rotation" and "tilt" in name))
+            for kind in CHANGES}  # fmt: skip
 JUMPS = (0.6, 6.0, 60.0, 600.0)
 """Pixels: prior standard deviations of a change, all equally probable. They are image shifts, whatever the kind of
 change, so that no kind is preferred."""
@@ -62,17 +70,17 @@ def pixel_changes(rig: CameraRig) -> Tensor:
 
 
 def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = LARGE) -> Tensor:
-    """Standard deviations (C, K) of changes, by camera and kind (None = all kinds); zero where nothing changes.
+    """Standard deviations (C, K) of changes, by camera and form (None = any); zero where nothing changes.
 
     Args:
-        changes: kind of change of each camera that changed.
+        changes: form of the change, one of `FORMS`, of each camera that changed.
         pixels: (C, K) see `pixel_changes`.
         jump: pixels.
     """
     std = torch.zeros_like(pixels)
     for camera, kind in changes.items():
-        part = slice(None) if kind is None else CHANGES[kind]
-        std[camera, part] = jump * pixels[camera, part]
+        for part in (slice(None),) if kind is None else FORMS[kind]:
+            std[camera, part] = jump * pixels[camera, part]
     std[:, 6:] *= min(1.0, LENS / jump)
     return std
 
@@ -174,10 +182,10 @@ class ChangeTest:
         taken = torch.linalg.solve_triangular(factor, scaled, upper=False)
         return ChangeTest(self.pull - taken.mT @ pull, self.learnt - taken.mT @ taken, self.pixels, self.lasting)
 
-    def jump(self, camera: int, kind: str) -> tuple[Tensor, Tensor]:
-        """Estimate a camera's change in a kind with K parameters, if no other changed: (K,) and covariance (K, K)."""
+    def jump(self, camera: int, own: slice) -> tuple[Tensor, Tensor]:
+        """Estimate a change of K parameters of a camera, if no other changed: (K,) and covariance (K, K)."""
         first = camera * self.pixels.shape[1]
-        part = slice(first + CHANGES[kind].start, first + CHANGES[kind].stop)
+        part = slice(first + own.start, first + own.stop)
         covariance = torch.linalg.pinv(self.learnt[part, part], hermitian=True)
         return covariance @ self.pull[part], covariance
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import torch
@@ -17,7 +17,7 @@ from torch import Tensor
 from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions
 from imgcal.geometry import RigidTransform
-from imgcal.monitoring.case import Case, ClockSlip, Explained, Explanation, Finding, Snapshot, Start, Variant
+from imgcal.monitoring.case import Case, ClockSlip, Explained, Explanation, Finding, Start, Variant
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.object_motion import ObjectMotion
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
@@ -92,7 +92,8 @@ def _slip(case: Case, start: Start, cameras: Sequence[int]) -> Variant:
             sigma[camera] = curvature**-0.5
             if not abs(late[camera]) < MOST_SLIP_SECONDS:
                 raise RefusedError(TOO_LONG)
-    corrected, log_prior = cases.correct(late)
+    blobs, log_prior = cases.correct(late)
+    corrected = [(blobs.of_snapshots([s]), there.rig_from_object[s : s + 1]) for s in range(count)]
     log_prior += sum(math.log(spread / SLIP_SECONDS) for spread in sigma.values())  # over all slips, not only the best
     spreads = {camera: math.hypot(sigma[camera], INEXACT * late[camera]) for camera in cameras}
     slips = tuple(ClockSlip(camera, 0, late[camera], spreads[camera], math.nan) for camera in cameras)
@@ -116,9 +117,23 @@ class _Late:
     seconds: Tensor  # (S,) exposure times of the other cameras
     options: EstimationOptions
 
+    images: dict[tuple[int, float], Tensor] = field(default_factory=dict)  # by camera and delay, see `image`
+
     def image(self, camera: int, late: float) -> Tensor:
         """Project the fiducials into a camera that exposes `late` seconds later: (S, N, 2) pixels."""
-        return project_fiducials(self.there.belief, self.motion.interpolate(self.seconds + late), camera)
+        key = camera, late
+        if key not in self.images:
+            self.images[key] = project_fiducials(
+                self.there.belief, self.motion.interpolate(self.seconds + late), camera
+            )
+        return self.images[key]
+
+    def project(self, camera: int, lates: Sequence[float]) -> None:
+        """Compute several images at once, which takes hardly longer than one."""
+        seconds = torch.cat([self.seconds + late for late in lates])
+        images = project_fiducials(self.there.belief, self.motion.interpolate(seconds), camera)
+        for late, image in zip(lates, images.split(len(self.seconds)), strict=True):
+            self.images[camera, late] = image
 
     def rough_slip(self, camera: int) -> float:
         """Estimate the delay (s) of a camera that has not moved."""
@@ -126,16 +141,17 @@ class _Late:
         seen = given.seen[:, camera]
         weight = torch.where(seen, given.sigma[:, camera].square().reciprocal(), 0.0)[..., None]
         for _ in range(SEARCH_ROUNDS):
-            velocity = (self.image(camera, late + VELOCITY_SECONDS) - self.image(camera, late - VELOCITY_SECONDS)) / (
-                2 * VELOCITY_SECONDS
-            )
-            rest = torch.where(seen[..., None], given.uv[:, camera] - self.image(camera, late), 0.0)
+            three = late - VELOCITY_SECONDS, late, late + VELOCITY_SECONDS
+            self.project(camera, three)
+            before, here, after = (self.image(camera, one) for one in three)
+            velocity = (after - before) / (2 * VELOCITY_SECONDS)
+            rest = torch.where(seen[..., None], given.uv[:, camera] - here, 0.0)
             power = float((weight * velocity.square()).sum()) + SLIP_SECONDS**-2
             late += (float((weight * velocity * rest).sum()) - late * SLIP_SECONDS**-2) / power
             late = min(max(late, -MOST_SLIP_SECONDS), MOST_SLIP_SECONDS)
         return late
 
-    def correct(self, late: Mapping[int, float]) -> tuple[list[Snapshot], float]:
+    def correct(self, late: Mapping[int, float]) -> tuple[Observations, float]:
         """Move blobs to where they belong without the delay, with more noise; also return the slips' log prior."""
         uv, sigma, seen = self.given.uv.clone(), self.given.sigma.clone(), self.given.seen
         for camera, seconds in late.items():
@@ -144,8 +160,7 @@ class _Late:
             sigma[:, camera] = torch.hypot(sigma[:, camera], INEXACT * behind.norm(dim=-1))
         log_prior = -2 * float((sigma / self.given.sigma).log()[seen].sum())
         log_prior -= sum(0.5 * (seconds / SLIP_SECONDS) ** 2 for seconds in late.values())
-        given, poses = Observations(uv, sigma, seen, self.given.shake), self.there.rig_from_object
-        return [(given.of_snapshots([s]), poses[s : s + 1]) for s in range(len(uv))], log_prior
+        return Observations(uv, sigma, seen, self.given.shake), log_prior
 
     def climb(self, late: dict[int, float], camera: int, step: float) -> list[float]:
         """Go on with the slip of one camera by steps (s) while that makes the snapshots more probable.
@@ -156,6 +171,7 @@ class _Late:
         Raises:
             RefusedError: the slip becomes too long, or see `absorb`.
         """
+        self.project(camera, [late[camera] + way for way in (-step, 0.0, step)])
         before, here, after = (self.evidence({**late, camera: late[camera] + way}) for way in (-step, 0.0, step))
         while max(before, after) > here:
             way = step if after > before else -step
@@ -172,5 +188,5 @@ class _Late:
         Raises:
             RefusedError: see `absorb`.
         """
-        corrected, log_prior = self.correct(late)
-        return absorb(self.before, *stack_snapshots(corrected), self.options).evidence + log_prior
+        blobs, log_prior = self.correct(late)
+        return absorb(self.before, blobs, self.there.rig_from_object, self.options).evidence + log_prior

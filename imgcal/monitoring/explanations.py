@@ -18,6 +18,7 @@ from imgcal.estimation import EstimationOptions
 from imgcal.monitoring.case import Case, Explained, Explanation, Finding, Snapshot, Start, Variant, mean_evidence
 from imgcal.monitoring.change_test import JUMPS
 from imgcal.monitoring.clock_slip import ClockSlipExplanation
+from imgcal.monitoring.lens_misfit import LensMisfit
 from imgcal.monitoring.lens_warming import Warmed
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.object_change import ObjectChanged
@@ -34,6 +35,9 @@ PATIENCE = 16
 """... the number of cases to wait for this, before the most probable one is believed anyway ..."""
 HARMLESS_PATIENCE = 4
 """... and the same if possibly nothing has happened: after a pause, the belief allows for small moves."""
+
+TOLERANCE = 0.01
+"""Accuracy of the evidence (log odds): far below `LEAD`. What contradicts a belief converges slowly."""
 
 
 class Steady(Explanation):
@@ -88,6 +92,8 @@ class PassingError(Explanation):
         return replace(shake_cameras(start, cameras, size), find=lambda _: Finding())
 
 
+HARMLESS = {Steady.name, PassingError.name, Warmed.name, LensMisfit.name}
+"""Explanations by which nothing needs a report."""
 EXPLANATIONS: tuple[Explanation, ...] = (
     Steady(),
     Moved(),
@@ -97,6 +103,7 @@ EXPLANATIONS: tuple[Explanation, ...] = (
     ObjectChanged(),
     PassingError(),
     Warmed(),
+    LensMisfit(),
 )
 """All explanations that are weighed. To add one: a subclass as above, in its own module if long, and a line here."""
 
@@ -123,7 +130,7 @@ class Verdict:
     def harmless(self) -> bool:
         """Tell whether possibly nothing has happened, and every rival is a consequence of that or passes."""
         near = {name for name, one in self.explained.items() if one.evidence > self.best.evidence - LEAD}
-        return Steady.name in near and near <= {Steady.name, Moved.name, Warmed.name, PassingError.name}
+        return Steady.name in near and near <= HARMLESS | {Moved.name}
 
     def evidence(self, *names: str) -> float:
         """Largest evidence among the named explanations; minus infinity if none could be weighed."""
@@ -137,6 +144,7 @@ def weigh(case: Case, explanations: Sequence[Explanation] = EXPLANATIONS) -> Ver
         RefusedError: none could be weighed.
     """
     found, reasons = list[Explained](), dict[str, str]()
+    case = replace(case, options=replace(case.options, tolerance=max(TOLERANCE, case.options.tolerance)))
     for explanation in explanations:
         try:
             found.append(_explain(case, explanation))
@@ -198,6 +206,13 @@ class Diagnosis:
             raise RefusedError(f"diagnosis: {best.name} is not certain yet: {why}")
         self.waited = 0
         return verdict
+
+    def skip(self) -> bool:
+        """Leave out a case in which little is new, unless the patience ends with it; return whether it is left out."""
+        if self.waited in (HARMLESS_PATIENCE, PATIENCE):
+            return False
+        self.waited += self.waited > 0
+        return True
 
 
 def doubtful_cameras(

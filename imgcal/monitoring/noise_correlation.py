@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.estimation import correlation_time
+from imgcal.medians import median_of_known, quantile_of_known
 from imgcal.monitoring.change_test import MODEL_ERROR
 from imgcal.monitoring.shaking import shared_shifts
 from imgcal.types import Observations
@@ -195,13 +196,9 @@ class NoiseCorrelation:
         self.time = torch.from_numpy(time)
         # A passing error is rare and large: the tail of the distribution shows it better than the variance.
         length = np.where(seen, np.linalg.norm(series, axis=-1), np.nan)
-        tail = np.array(
-            [np.nanquantile(column, TAIL) if some.any() else 0.0 for column, some in zip(length.T, seen.T, strict=True)]
-        )
+        tail = np.nan_to_num(quantile_of_known(length, TAIL))
         self.lasting = torch.from_numpy(np.where(time > 1, tail / TAIL_SIGMAS, 0.0))
-        usual = np.array(
-            [np.nanmedian(column) if some.any() else 0.0 for column, some in zip(length.T, seen.T, strict=True)]
-        )
+        usual = np.nan_to_num(median_of_known(length))
         self.scale = torch.from_numpy(np.maximum(usual / MEDIAN, LEAST_LASTING))
 
 

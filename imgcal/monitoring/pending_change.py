@@ -10,7 +10,17 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation import displace, error_between
-from imgcal.monitoring.change_test import CHANGES, LARGE, ChangeTest, camera_change_errors, change_std, pixel_changes
+from imgcal.monitoring.case import mean_evidence
+from imgcal.monitoring.change_test import (
+    CHANGES,
+    FORMS,
+    FORMS_OF,
+    LARGE,
+    ChangeTest,
+    camera_change_errors,
+    change_std,
+    pixel_changes,
+)
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belief, widen
 from imgcal.monitoring.rig_filter import YOUNG_SECONDS
 from imgcal.types import CameraRig
@@ -20,9 +30,12 @@ KIND_LEAD = 5.0
 """One kind against every other; ..."""
 SINGLE_KIND_LEAD, ALL_KINDS_LEAD = 3.0, 15.0
 """... against a change of all kinds together, and the latter against each kind: a wrong belief does no harm then."""
+MAIN_KIND_SHARE = 0.99
+"""A change of all kinds together is reported as its main kind if that one has this share of the log odds: the rest
+shifts the image by a tenth of it at most."""
 LENS_KINDS, LENS_LOG_PRIOR = ("focal_length", "principal_point"), -3.0
-"""Changes of the lens alone, and their prior log odds against a rotation or a shift if the snapshots cannot tell: bumps
-hit the camera, not the lens."""
+"""Changes of the lens alone, and their prior log odds against a rotation or a shift: bumps hit the camera, not the
+lens."""
 DECIDE_AFTER = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """Numbers of snapshots since a change at which its kind is decided if possible."""
 
@@ -50,7 +63,7 @@ class PendingChange:
     weighted: Tensor  # (D,) gradient at the origin
     count: int  # snapshots
     seconds: float
-    kinds: dict[int, str | None]  # by camera that changed; None = undecided
+    kinds: dict[int, str | None]  # form by camera that changed; None = undecided
     most: int = DECIDE_AFTER[-1]  # decide the kinds after so many snapshots
 
     @property
@@ -113,19 +126,22 @@ class PendingChange:
         """Decide how a camera has changed, now if it is the `last` chance.
 
         Returns:
-            The kind to believe (None = any) and the kind to report (None = no single kind); None = cannot be decided
-            yet.
+            The form of change to believe (None = any) and the kind to report (None = no single kind); None = cannot be
+            decided yet.
         """
-        odds = {kind: test.odds({**self.others(camera), camera: kind}) for kind in (*CHANGES, None)}
+        odds, likeliest = {None: test.odds({**self.others(camera), camera: None})}, dict[str | None, str | None]()
+        for kind, forms in FORMS_OF.items():
+            found = {form: test.odds({**self.others(camera), camera: form}) for form in forms}
+            odds[kind] = mean_evidence(list(found.values()), len(found)) + LENS_LOG_PRIOR * (kind in LENS_KINDS)
+            likeliest[kind] = max(found, key=lambda form: found[form])
         best, second = sorted(odds, key=lambda kind: -odds[kind])[:2]
         least = ALL_KINDS_LEAD if best is None else SINGLE_KIND_LEAD if second is None else KIND_LEAD
+        kind = max(CHANGES, key=lambda kind: odds[kind])
         if odds[best] - odds[second] >= least:
-            return best, best
-        if not last:
-            return None
+            main = kind if odds[kind] >= MAIN_KIND_SHARE * odds[None] else None
+            return likeliest.get(best), main if best is None else best
         # Report the most probable kind, but believe that any is possible.
-        likely = {kind: odds[kind] + LENS_LOG_PRIOR * (kind in LENS_KINDS) for kind in CHANGES}
-        return None, max(likely, key=lambda kind: likely[kind]) if self.overdue else None
+        return (None, kind if self.overdue else None) if last else None
 
     def decide_kinds(
         self, test: ChangeTest, changes: Mapping[int, Change], last: bool
@@ -133,7 +149,7 @@ class PendingChange:
         """Decide the kinds of pending changes, by camera, where possible or overdue.
 
         Returns:
-            The decided changes to report, and the kinds to believe for their cameras.
+            The decided changes to report, and the forms to believe for their cameras.
         """
         decided, kinds = [], dict[int, str | None]()
         for camera, change in changes.items():
@@ -149,7 +165,7 @@ class PendingChange:
 
     def size(self, test: ChangeTest, camera: int, kind: str) -> tuple[float, float]:
         """Size of a camera's change, assuming this kind alone, and its standard deviation."""
-        change, covariance = test.condition_on(self.others(camera)).jump(camera, kind)
+        change, covariance = test.condition_on(self.others(camera)).jump(camera, CHANGES[kind])
         size = float(change.norm())
         along = change / max(size, 1e-30)
         return size, float((along @ covariance @ along).clamp_min(0).sqrt())
@@ -165,7 +181,8 @@ class PendingChange:
         step = torch.zeros_like(self.before.unit)
         for camera, kind in self.kinds.items():
             if kind is not None:
-                step[camera, CHANGES[kind]] = test.condition_on(self.others(camera)).jump(camera, kind)[0]
+                (part, *_) = FORMS[kind]
+                step[camera, part] = test.condition_on(self.others(camera)).jump(camera, part)[0]
         first = free_cameras(replace(self.before, rig=self.before.rig.retract(step)), self.kinds)
         information = first.information + self.brought
         factor = torch.linalg.cholesky(information)
@@ -178,7 +195,7 @@ class PendingChange:
 
 
 def free_cameras(belief: RigBelief, changes: Mapping[int, str | None], jump: float = LARGE) -> RigBelief:
-    """Let cameras have changed in some way (None = any) by a jump in pixels."""
+    """Let cameras have changed in some form (None = any) by a jump in pixels."""
     return widen(belief, change_std(changes, pixel_changes(belief.rig), jump).square())
 
 

@@ -227,12 +227,12 @@ class RecentSnapshots:
             RefusedError: nothing is known about the rig.
         """
         number = self._next - age
-        information, at = self._known(number)
+        information, factor, at = self._known(number)
         brought, weighted = self._sums(number, self._next)
         pull = weighted - brought @ at
         variance = self.walk.square() * (self.seconds(age) / 3600)
         if aged and bool(variance.any()):
-            covariance = torch.cholesky_inverse(_cholesky(information))
+            covariance = torch.cholesky_inverse(factor)
             add_blocks(covariance, error_covariance(self._belief, variance))
             information = torch.cholesky_inverse(_cholesky(covariance))
         return ChangeTest.of(information, brought, pull, self._change, self._pixels, self.lasting)
@@ -252,7 +252,7 @@ class RecentSnapshots:
         number, part = self._next - age, CHANGES[kind]
         if age <= episode:
             return 0.0, 0.0
-        _, at = self._known(number)
+        *_, at = self._known(number)
         own, pull = [], []
         row = slice(camera * self._unit.shape[1], (camera + 1) * self._unit.shape[1])
         change = self._change[camera, :, part]
@@ -275,24 +275,24 @@ class RecentSnapshots:
         Raises:
             RefusedError: nothing was known about the rig.
         """
-        information, at = self._known(self._next - age)
+        _, factor, at = self._known(self._next - age)
         wide = self._unit.size
         error = (at - torch.from_numpy(self._at))[:wide].view(self._unit.shape)
         rig = displace(self._belief.rig, error * self._belief.unit)
-        return replace(self._belief, rig=rig, object_offset=at[wide:], factor=_cholesky(information))
+        return replace(self._belief, rig=rig, object_offset=at[wide:], factor=factor)
 
     def information(self, count: int) -> tuple[Tensor, Tensor]:
         """Information (D, D) of the latest snapshots, and their gradient (D,) at the current belief."""
         information, weighted = self._sums(self._next - count, self._next)
         return information, weighted - information @ torch.from_numpy(self._at)
 
-    def _known(self, number: int) -> tuple[Tensor, Tensor]:
-        """Information (D, D) before a snapshot, and the most probable error (D,)."""
+    def _known(self, number: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Information (D, D) before a snapshot, its Cholesky factor, and the most probable error (D,)."""
         base = next(base for base in reversed(self._bases) if base.number <= number)
         brought, weighted = self._sums(base.number, number)
         information, weighted = base.information + brought, base.weighted + weighted
         factor = _cholesky(information)
-        return information, torch.cholesky_solve(weighted[:, None], factor)[:, 0]
+        return information, factor, torch.cholesky_solve(weighted[:, None], factor)[:, 0]
 
     def _sums(self, first: int, last: int) -> tuple[Tensor, Tensor]:
         """Information (D, D) and weighted errors (D,) of a range of snapshots."""

@@ -26,6 +26,7 @@ from imgcal.monitoring.change_test import JUMPS, LARGE
 from imgcal.monitoring.clock_slip import project_fiducials
 from imgcal.monitoring.drift_pace import DriftLearning, DriftPaces
 from imgcal.monitoring.explanations import Diagnosis, Moved, Steady, Verdict, doubtful_cameras, weigh
+from imgcal.monitoring.lens_misfit import LensMisfit
 from imgcal.monitoring.lens_warming import Warmed
 from imgcal.monitoring.noise_correlation import NoiseCorrelation
 from imgcal.monitoring.object_change import MISFIT_LEAD, Misfit, ObjectChanged, has_never_fitted
@@ -45,6 +46,8 @@ OBJECT_SNAPSHOTS = 8
 """... and a change of the object is not considered before so many snapshots have been absorbed."""
 UNDECIDED_SNAPSHOTS = 16
 """Snapshots for which a camera stays in doubt that seemed to have moved without a decision."""
+NEW_SHARE = 0.25
+"""Share of the snapshots since a change that must be new before an undecided camera is weighed again."""
 SETTLED_SNAPSHOTS, LEAST_AGAIN = 16, 8
 """A second move of a camera within so many snapshots is doubted, and so many snapshots are needed to decide: a late
 camera seems to have moved in any two successive snapshots, but not in eight."""
@@ -256,6 +259,9 @@ class RigMonitor:
             decided = self._decide_kinds(last=True)
             anew = self._learn_moved(case, dict.fromkeys(case.cameras), JUMPS[-1], sum(case.pauses[-case.count :]))
             return replace(anew, changes=(*found.changes, *decided, *anew.changes))
+        if verdict.best.name == LensMisfit.name:
+            best = verdict.best
+            return MonitorUpdate(self._restart(best.before, best.snapshots, case.pauses[-case.count :]))
         if verdict.best.finding.slips and len(verdict.best.snapshots) > case.count:  # late from the beginning
             return replace(self._adopt(case, verdict), changes=found.changes)
         return replace(found, slips=self._clock_slips(verdict))
@@ -271,8 +277,11 @@ class RigMonitor:
             RefusedError: the case cannot be decided yet, or the snapshots cannot be learnt.
         """
         free: dict[int, str | None] = {}
-        pending, test = self._pending, self._recent.test(age)
-        age = likeliest_age(self._recent, likeliest_camera(test), age)
+        pending, camera = self._pending, likeliest_camera(self._recent.test(age))
+        new = UNDECIDED_SNAPSHOTS - self.undecided.get(camera, 0)  # snapshots since it was weighed
+        if new < NEW_SHARE * age and self._diagnosis.skip():
+            raise RefusedError("diagnosis: undecided, and little is new")
+        age = likeliest_age(self._recent, camera, age)
         if pending is not None and age >= pending.count - NEARBY_SNAPSHOTS:  # the pending changes happened then
             again = likeliest_camera(self._recent.test(age)) in pending.kinds
             # A second change: the first snapshots were taken from the old pose.

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import RefusedError
+from imgcal.medians import median_of_known
 from imgcal.monitoring.case import Case, Explained, Explanation, Finding, Start, Variant
 from imgcal.monitoring.measurement_update import stack_snapshots
 from imgcal.monitoring.rig_belief import MeasurementUpdate
@@ -143,9 +144,9 @@ class ShakeLevel:
         # The mean square of two coordinates has an exponential distribution. The object's pose absorbs a part of the
         # shifts. A constant shift is not shaking.
         free = max(1 - 1.5 / self.cameras, 0.25)
-        shifts = known[:, :2, often] - np.nanmedian(known[:, :2, often], axis=0)
-        found[often] = np.nanmedian(np.square(shifts).mean(1), axis=0) / (math.log(2) * free)
-        expected[often] = np.nanmedian(known[:, 2, often], axis=0)
+        shifts = known[:, :2, often] - median_of_known(known[:, :2, often])
+        found[often] = median_of_known(np.square(shifts).mean(1)) / (math.log(2) * free)
+        expected[often] = median_of_known(known[:, 2, often])
         before = self.shake.numpy()
         ratio = found / (expected + before**2)
         other = often & ((ratio > DIFFERENT_VARIANCE) | (ratio < 1 / DIFFERENT_VARIANCE))

@@ -81,8 +81,9 @@ def _evidence_of_own_poses(
 ) -> float:
     """The part of `unsynchronized_evidence` that the cameras add to the update by the others."""
     poses = result.rig_from_object
-    others = _pose_information(result.belief, drop_cameras(observations, cameras), poses)
-    every = _pose_information(result.belief, observations, poses)
+    _, jacobian = _jacobian(result.belief, poses)
+    others = _pose_information(jacobian, drop_cameras(observations, cameras))
+    every = _pose_information(jacobian, observations)
     evidence = 0.5 * float((torch.logdet(every) - torch.logdet(others)).sum())  # `absorb` leaves out shared terms
     for camera in cameras:
         rest = [other for other in range(observations.seen.shape[1]) if other != camera]
@@ -90,7 +91,7 @@ def _evidence_of_own_poses(
         rows = alone.seen[:, camera].any(-1).nonzero()[:, 0]
         if not len(rows):
             continue
-        sure = _are_determined(_pose_information(result.belief, alone.of_snapshots(rows), poses[rows]))
+        sure = _are_determined(_pose_information(jacobian, alone)[rows])
         for part, evidence_of in ((rows[sure], _evidence_of_sure_poses), (rows[~sure], _evidence_of_few_labels)):
             if len(part):
                 evidence += evidence_of(alone.of_snapshots(part), options, result.belief, poses[part])
@@ -108,7 +109,7 @@ def _evidence_of_sure_poses(
 ) -> float:
     """Log probability of a camera's observations (S, C, N), with poses (S,) fitted around `there`."""
     own = absorb(belief, alone, there, options)
-    information = _pose_information(own.belief, alone, own.rig_from_object)
+    information = _pose_information(_jacobian(own.belief, own.rig_from_object)[1], alone)
     turn = vector_from_rotation(own.rig_from_object.rotation @ there.rotation.mT)
     way = torch.cat((turn, own.rig_from_object.translation - there.translation), -1)
     spread = torch.tensor(ELSEWHERE, dtype=torch.float64)
@@ -121,9 +122,9 @@ def _evidence_of_few_labels(
     alone: Observations, options: EstimationOptions, belief: RigBelief, there: RigidTransform
 ) -> float:
     """The same if the camera sees too few fiducials for a pose: linearized at `there`, with the camera fixed."""
-    image, jacobian = _weighted_jacobian(belief, alone, there)
-    weight = torch.where(alone.seen, 1 / alone.sigma, 0.0)[..., None]
-    residual = torch.nan_to_num((alone.uv - image) * weight)
+    image, jacobian = _jacobian(belief, there)
+    jacobian = _weigh(jacobian, alone)
+    residual = _weigh(alone.uv - image, alone)
     precision = torch.tensor(ELSEWHERE, dtype=torch.float64).pow(-2).diag()
     information = torch.einsum("scnij,scnik->sjk", jacobian, jacobian) + precision
     pull = torch.einsum("scnij,scni->sj", jacobian, residual)
@@ -139,28 +140,29 @@ def drop_cameras(observations: Observations, cameras: Collection[int]) -> Observ
     return replace(observations, seen=seen)
 
 
-def _pose_information(belief: RigBelief, observations: Observations, rig_from_object: RigidTransform) -> Tensor:
+def _pose_information(jacobian: Tensor, observations: Observations) -> Tensor:
     """Information (S, 6, 6) of snapshots about the object's poses, as left rotation and translation (rad, mm)."""
-    _, jacobian = _weighted_jacobian(belief, observations, rig_from_object)
-    return torch.einsum("scnij,scnik->sjk", jacobian, jacobian)
+    weighted = _weigh(jacobian, observations)
+    return torch.einsum("scnij,scnik->sjk", weighted, weighted)
 
 
-def _weighted_jacobian(
-    belief: RigBelief, observations: Observations, rig_from_object: RigidTransform
-) -> tuple[Tensor, Tensor]:
-    """Images (S, C, N, 2) of the fiducials; derivatives (S, C, N, 2, 6) by the poses, divided by the sigmas."""
+def _weigh(values: Tensor, observations: Observations) -> Tensor:
+    """Divide values (S, C, N, ...) by the sigmas; zero where nothing is seen."""
+    weight = torch.where(observations.seen, 1 / observations.sigma, 0.0)
+    return torch.nan_to_num(values * weight.reshape(*weight.shape, *(1,) * (values.ndim - 3)))
+
+
+def _jacobian(belief: RigBelief, rig_from_object: RigidTransform) -> tuple[Tensor, Tensor]:
+    """Images (S, C, N, 2) of the fiducials, and their derivatives (S, C, N, 2, 6) by the poses."""
     nudge = torch.tensor(NUDGE, dtype=torch.float64).diag()
     turned, shifted = rotation_from_vector(nudge[:, :3]), nudge[:, 3:]
-
-    def image(rotation: Tensor, translation: Tensor) -> Tensor:
-        pose = RigidTransform(rotation, translation)
-        rig = belief.rig.expand(len(translation))
-        return rig.project_values(pose.apply(belief.points_object), belief.obj.radius).uv
-
-    start = image(rig_from_object.rotation, rig_from_object.translation)
-    columns = [
-        (image(turned[k] @ rig_from_object.rotation, rig_from_object.translation + shifted[k]) - start) / NUDGE[k]
-        for k in range(len(NUDGE))
-    ]
-    weight = torch.where(observations.seen, 1 / observations.sigma, 0.0)[..., None, None]
-    return start, torch.nan_to_num(torch.stack(columns, -1)) * weight
+    rotation, translation = rig_from_object.rotation, rig_from_object.translation
+    poses = RigidTransform(
+        torch.cat((rotation[None], turned[:, None] @ rotation)).flatten(0, 1),
+        torch.cat((translation[None], translation + shifted[:, None])).flatten(0, 1),
+    )
+    points = poses.apply(belief.points_object)
+    uv = belief.rig.expand(len(points)).project_values(points, belief.obj.radius).uv
+    start, *after = uv.unflatten(0, (1 + len(NUDGE), -1))
+    columns = [(image - start) / step for image, step in zip(after, NUDGE, strict=True)]
+    return start, torch.stack(columns, -1)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from imgcal.association import PipelineOptions
 from imgcal.geometry import RigidTransform
+from imgcal.medians import median_of_known
 from imgcal.monitoring import RigBelief
 from imgcal.online.camera_visibility import least_back
 from imgcal.online.label_consistency import LEAST_AGREEING, Checked, check_labels
@@ -196,7 +197,7 @@ class Search:
         return self.sought[camera].since if camera in self.sought else time
 
     def _usual(self) -> NDArray[np.float64]:
-        return np.median(self.spare, axis=0) if self.spare else np.zeros(self.num_cameras)
+        return median_of_known(np.stack(self.spare)) if self.spare else np.zeros(self.num_cameras)
 
     def _spare(self, blobs: Detections) -> NDArray[np.float64]:
         """Number of unlabelled blobs of each camera beyond its usual number: (C,)."""

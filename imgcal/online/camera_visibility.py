@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from imgcal.medians import median
 from imgcal.online.events import Event
 from imgcal.types import CameraRig, Detections
 
@@ -110,7 +111,7 @@ class CameraVisibility:
         times = self.heard.get(camera, ())
         if len(times) < 3:
             return ABSENT_SECONDS
-        return max(SILENT_SECONDS, RESTS * float(np.median(np.diff(times))))
+        return max(SILENT_SECONDS, RESTS * median(np.diff(times)))
 
     def _why(self, camera: int, look: VisibleObject) -> tuple[float, str] | None:
         first, times, latest = self.astray.get(camera, (look.time, 0, look.time))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from imgcal.detection import Frame
 from imgcal.geometry import RigidTransform
+from imgcal.medians import median, median_of_known
 from imgcal.monitoring import ClockSlip, MeasurementUpdate
 from imgcal.online.events import Event
 from imgcal.online.rig_state import RigState
@@ -74,8 +75,8 @@ class ClockOffsets:
         self._period = state.time - last[0]
         went = np.linalg.norm(places - last[2], axis=-1)
         went = went[np.isfinite(went)]
-        least = max(LEAST_MOTION, LEAST_SIGMAS * float(np.median(state.detections.sigma)))
-        if not len(went) or np.median(went) < least:
+        least = max(LEAST_MOTION, LEAST_SIGMAS * median(state.detections.sigma))
+        if not len(went) or median(went) < least:
             return ()
         # Use the current rig for both: what is learnt about cameras is no motion.
         self._add(state, (state.predicted - self._predicted(state, last[1])) / self._period)
@@ -120,7 +121,7 @@ class ClockOffsets:
         offset = np.where(known, (inverse[:, 0] * self._right / scale).sum(1) / scale[:, 0], np.nan)
         sigma = np.where(known, np.sqrt(inverse[:, 0, 0]) / scale[:, 0], np.nan)
         # Most cameras keep their known delay. If half of them slip together, the known delays stay.
-        offset += self.late - (np.nanmedian(offset) if known.any() else 0.0)
+        offset += self.late - (median_of_known(offset) if known.any() else 0.0)
         return offset, sigma
 
     @staticmethod

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.detection import Frame
+from imgcal.medians import median_of_known
 from imgcal.monitoring import Cusum, MeasurementUpdate
 from imgcal.online.camera_visibility import well_inside
 from imgcal.online.events import Event, EventKind
@@ -266,5 +267,5 @@ def _own_part(z: Array) -> Array:
     """Subtract the effect shared by most cameras from z (3, C), if there are enough cameras."""
     enough = np.isfinite(z).sum(1) >= SHARED_CAMERAS
     common = np.zeros(len(z))
-    common[enough] = np.maximum(np.nanmedian(z[enough], axis=1), 0.0)
+    common[enough] = np.maximum(median_of_known(z[enough].T), 0.0)
     return z - common[:, None]

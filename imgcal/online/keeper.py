@@ -16,6 +16,7 @@ from imgcal.association import PipelineOptions, Proposer
 from imgcal.detection import DetectionOptions, Frame
 from imgcal.errors import InputError, RefusedError
 from imgcal.geometry import RigidTransform
+from imgcal.medians import median
 from imgcal.monitoring import MeasurementUpdate, MonitorUpdate, RigBelief
 from imgcal.online.camera_health import camera_health, describe_health, take_health
 from imgcal.online.camera_visibility import VisibleObject
@@ -131,7 +132,7 @@ class RigKeeper:
     @property
     def noise(self) -> float:
         """Noise (px, one standard deviation) of the blobs beyond their own sigmas."""
-        return float(np.median(self._memory.noise.additive))
+        return median(self._memory.noise.additive)
 
     def update(
         self, source: Mapping[str, Frame | None] | Detections, time: float, silent: Collection[str] = ()

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from imgcal.association import PipelineOptions, to_observations
 from imgcal.geometry import RigidTransform
+from imgcal.medians import median
 from imgcal.monitoring import RigBelief, RigFilter, RigMonitor, belief_from_posterior, calibration_posterior
 from imgcal.online.camera_search import Search, Surroundings
 from imgcal.online.camera_visibility import CameraVisibility
@@ -163,9 +164,7 @@ class KeeperMemory:
         """Maximum error of most cameras, px."""
         if len(self.usual) < USUAL_SNAPSHOTS:
             return math.inf
-        return self.options.identity_error + UNUSUAL * max(
-            float(np.median(self.usual)), float(np.median(self.noise.additive))
-        )
+        return self.options.identity_error + UNUSUAL * max(median(self.usual), median(self.noise.additive))
 
     def predicted(self, pose: RigidTransform | None) -> NDArray[np.float64]:
         """Project the fiducials of an object in a pose (1,): (C, N, 2) pixels; nan without a pose."""

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from imgcal.association import PipelineOptions, find_merged, to_observations
 from imgcal.estimation import EstimationOptions, fit_pose
 from imgcal.geometry import RigidTransform, kernels
+from imgcal.medians import median
 from imgcal.online.light_points import FoundLights
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 from renderers.compiling import njit
@@ -74,9 +75,9 @@ def check_labels(
     uv, there = seen.uv[0].numpy(), seen.seen[0].numpy()
     rest, moved = np.full(there.shape, np.nan), np.full(len(there), np.nan)
     _compare(uv, fit.residual, there, options.identity_error, rest, moved)
-    usual_rest = float(np.median(rest[there])) if there.any() else 0.0
+    usual_rest = median(rest[there]) if there.any() else 0.0
     measured = np.isfinite(moved)
-    usual = float(np.median(moved[measured])) if measured.any() else 0.0
+    usual = median(moved[measured]) if measured.any() else 0.0
     least = options.identity_error + MOST_APART * usual_rest
     stray = there & (rest > least + DEPTH * np.nan_to_num(moved)[:, None])
     off = measured & (np.nan_to_num(moved) > options.identity_error + MOST_APART * usual)
@@ -86,7 +87,7 @@ def check_labels(
     off &= ~nonsense
     # Too few labels to agree with each other: compare them with the rig.
     distance = np.linalg.norm(fit.residual, axis=-1)
-    limit = options.identity_error + MOST_APART * float(np.median(distance[there])) if there.any() else 0.0
+    limit = options.identity_error + MOST_APART * median(distance[there]) if there.any() else 0.0
     stray |= there & ~measured[:, None] & (distance > limit)
     image = rig.expand(1).project_values(fit.rig_from_object.apply(obj.points), obj.radius)
     stray |= find_merged(named, there & ~stray, image.uv[0].numpy(), image.visible[0].numpy())

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from imgcal.association import Associations, PipelineOptions, SnapshotIdentity
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
+from imgcal.medians import median, median_of_known
 from imgcal.monitoring import MeasurementUpdate, shared_shifts
 from imgcal.online.labelling import NEAR_PREDICTION
 from imgcal.pipeline import fit_labelled
@@ -103,8 +104,8 @@ class NoiseLevel:
         return True
 
     def _differs(self, additive: float) -> bool:
-        sigma = float(np.median(self._early[-1][0].sigma))
-        before, now = math.hypot(sigma, float(np.median(self.additive))), math.hypot(sigma, additive)
+        sigma = median(self._early[-1][0].sigma)
+        before, now = math.hypot(sigma, median(self.additive)), math.hypot(sigma, additive)
         return max(before, now) > DIFFERENT_LEVEL * min(before, now)
 
     def _follow(self, observations: Observations, result: MeasurementUpdate, count: int) -> None:
@@ -130,12 +131,12 @@ class NoiseLevel:
         some = often & observations.seen[0].any(1).numpy()
         if not some.any():
             return
-        ratio = np.nanmedian(known[:, some], axis=(0, 2))
+        ratio = median_of_known(known[:, some].swapaxes(1, 2).reshape(-1, int(some.sum())))
         other = np.maximum(ratio, 1 / np.maximum(ratio, 1e-9)) > DIFFERENT_LEVEL**2
         if not other.any():
             return
         sigma = torch.where(observations.seen[0], observations.sigma[0], torch.nan)[torch.from_numpy(some)]
-        variance = np.square(np.nanmedian(sigma.numpy(), axis=1))
+        variance = np.square(median_of_known(sigma.numpy().T))
         before = self.additive[some]
         own = np.maximum(variance - before**2, 0.0)
         self.additive = self.additive.copy()

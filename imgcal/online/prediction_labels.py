@@ -10,6 +10,7 @@ from torch import Tensor
 
 from imgcal.association import PipelineOptions, distances_to_nearest, mutual_nearest, track
 from imgcal.geometry import RigidTransform
+from imgcal.medians import median
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
 TOO_NEAR = 0.6
@@ -34,7 +35,7 @@ def near_prediction(blobs: Detections, predicted: NDArray[np.float64]) -> NDArra
     """
     labels = np.full(len(blobs), -1, dtype=np.int64)
     gaps = distances_to_nearest(predicted)
-    reach = 0.25 * float(np.median(gaps))
+    reach = 0.25 * median(gaps)
     order = np.lexsort((blobs.uv[:, 0], blobs.camera))
     ends = np.searchsorted(blobs.camera[order], np.arange(len(predicted) + 1))
     for places, crowded, begin, end in zip(predicted, gaps < TOO_NEAR, ends[:-1], ends[1:], strict=True):

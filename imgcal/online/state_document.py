@@ -72,6 +72,7 @@ def state_entries(kind: type) -> tuple[Entry, ...]:
 
 def is_array(kind: Any) -> bool:
     """Tell whether a type is an array or tensor."""
+    kind = getattr(get_origin(kind) or kind, "__value__", kind)  # since NumPy 2.5, NDArray is a type alias
     return kind is torch.Tensor or kind is np.ndarray or get_origin(kind) is np.ndarray
 
 
@@ -309,6 +310,8 @@ def _is_of(kind: Any, value: Any) -> bool:
         return isinstance(value, bool | np.bool_)
     if kind is None:
         return value is None
+    if is_array(kind):
+        return isinstance(value, torch.Tensor if kind is torch.Tensor else np.ndarray)
     of = origin or kind
     return isinstance(value, dict if of is Mapping else of)
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from imgcal.association import Associations, merging_distance
 from imgcal.geometry import RigidTransform
+from imgcal.medians import median_of_known
 from imgcal.types import CalibrationObject, CameraRig
 
 MARGIN = 0.05
@@ -138,13 +139,13 @@ def _count_placed(labelled: Associations, poses: RigidTransform, rig: CameraRig,
 
 def _usual_false_blobs(false: Counts) -> Counts:
     """Number of false blobs (S, C) that is normal in a frame of each snapshot: (S, 1)."""
-    usual = np.median(false, axis=1, keepdims=True)
+    usual = median_of_known(false.T)[:, None]
     return np.floor(usual + 2 * np.sqrt(usual)).astype(np.int64)
 
 
 def _usual_extra_blobs(false: Counts, whole: NDArray[np.bool_]) -> Counts:
     """Usual number of blobs (S, C) per camera beside the `whole` object (S, C): (C,); 0 = it never was whole."""
-    usual = np.nanmedian(np.where(whole, false, np.nan)[:, whole.any(0)], axis=0)
+    usual = median_of_known(np.where(whole, false, np.nan)[:, whole.any(0)])
     counts = np.zeros(whole.shape[1], dtype=np.int64)
     counts[whole.any(0)] = np.floor(usual)
     return counts

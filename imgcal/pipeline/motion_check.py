@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import hypergeom
 
 from imgcal.association import Associations, PipelineOptions, associate
 from imgcal.errors import RefusedError
@@ -267,6 +266,8 @@ def _find_gone(fit: _Fit, labelled: Associations, rig: CameraRig, known: set[str
             continue
         place = np.arange(least, total - least + 1)
         before = np.cumsum(wrong)[place - 1]
+        from scipy.stats import hypergeom  # slow to import, and rarely needed
+
         chance = np.minimum(
             hypergeom.sf(before - 1, total, count, place), hypergeom.sf(count - before - 1, total, count, total - place)
         )

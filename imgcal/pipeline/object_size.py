@@ -16,6 +16,7 @@ from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, correlation_time
+from imgcal.medians import median
 
 Floats = NDArray[np.float64]
 
@@ -79,15 +80,13 @@ def find_step(size: Floats, sigma: Floats) -> SizeStep | None:
     at = inner.start + int(gain[inner].argmax())
     level = np.where(np.arange(len(x)) <= at, moment[at] / before[at], later[at] / after[at])
     left = (x - level) * np.sqrt(weight)
-    spread = max(1.0, 1.4826 * float(np.median(np.abs(left))))
-    lasting = float(correlation_time(left[:, None])[0])
-    noise = spread * math.sqrt(lasting * (1 / before[at] + 1 / after[at]))
-    step = float(change[at])
     about = (x - (weight * x).sum() / weight.sum()) * np.sqrt(weight)
-    explained = np.median(np.abs(left)) <= math.sqrt(LARGEST_SHARE) * np.median(np.abs(about))
-    if abs(step) < max(LEAST_STEP, SURE * noise) or not explained:
+    step, rest = float(change[at]), median(np.abs(left))
+    if abs(step) < LEAST_STEP or rest > math.sqrt(LARGEST_SHARE) * median(np.abs(about)):
         return None
-    return SizeStep(int(known[at + 1]), step, noise)
+    lasting = float(correlation_time(left[:, None])[0])
+    noise = max(1.0, 1.4826 * rest) * math.sqrt(lasting * (1 / before[at] + 1 / after[at]))
+    return SizeStep(int(known[at + 1]), step, noise) if abs(step) >= SURE * noise else None
 
 
 def require_one_size(fit: Estimate, names: tuple[str, ...]) -> None:

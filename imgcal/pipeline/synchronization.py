@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import spearmanr
 from torch import Tensor
 
 from imgcal.association import Associations, accepted_observations
@@ -104,6 +103,8 @@ def _verdict(
     speed: NDArray[np.float64], shift: NDArray[np.float64], scatter: NDArray[np.float64]
 ) -> Unsynchronized | None:
     """Compare images (K,) by speed (px per snapshot), shift (px) and the scatter of their points (px^2)."""
+    from scipy.stats import spearmanr  # slow to import, and rarely needed
+
     grows, order = spearmanr(speed, shift), np.argsort(speed)
     slow, fast = order[: len(order) // 3], order[-(len(order) // 3) :]
     low, high = (float(np.sqrt(np.square(shift[part]).mean())) for part in (slow, fast))

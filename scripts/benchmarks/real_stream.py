@@ -3,7 +3,7 @@
 Run as `python -m scripts.benchmarks.real_stream`. A calibration uses every eighth of frames 0-2399; the keeper starts
 from it and follows frames 2400-4799. Nothing moved in this recording, so every event except a loss of the wand is
 false. A rotation can only be detected while the camera sees the wand, so delays count only that time. Finished runs of
-the same code are not repeated (`out/work/real_stream`).
+the same code are not repeated (`out/work/real_stream`). The result is written after each case.
 
 With `--lights`, the wand is unknown: its markers are separate lights at unknown positions.
 """
@@ -273,7 +273,7 @@ class Options:
     bumps: tuple[float, ...] = (0.1, 0.3, 1.0)  #: degrees
     bump_strides: tuple[int, ...] = (1,)  #: steps between frames, with a rotated camera
     cameras: tuple[int, ...] = tuple(range(10))  #: cameras to rotate, each in a separate run
-    cores: int = 1
+    cores: int = 1  #: processes over the cases; the result is the same
     fresh: bool = False  #: calibrate again instead of using the cached calibration
     lights: bool = False  #: follow the markers as unknown lights
     out: Path | None = None  #: default: docs/benchmarks/real_stream.json, or real_stream_lights.json
@@ -291,13 +291,21 @@ def main() -> None:
         for degrees in options.bumps
         for camera in options.cameras
     ]
+    out = options.out or (LIGHTS_RESULT if options.lights else RESULT)
     with workers(None, options.cores, StoredResults(WORK / "real_stream", f"{rms!r}\n" + "\n".join(texts))) as mapped:
         found = []
         for case, row in zip(cases, mapped(run, cases), strict=True):
             found.append(row)
             print(case.key, _brief(row), flush=True)
+            result = collect(found, rms)
+            write_json(out, result)  # after each case: what is done is kept if the rest is not
+    print("\n\n".join(tables(result).values()))
+
+
+def collect(found: Sequence[dict[str, Any]], rms: float) -> dict[str, Any]:
+    """Collect the rows of finished cases; `rms`: residual of the calibration in pixels."""
     runs = [row for row in found if "degrees" in row]
-    result = {
+    return {
         **surroundings(),
         "calibration_rms_px": rms,
         "gates": {"final_to_batch": WORST_FINAL, "worst_to_start": WORST_ON_THE_WAY, "false": 0},
@@ -305,8 +313,6 @@ def main() -> None:
         "bumps": summarize(runs),
         "bump_runs": runs,
     }
-    write_json(options.out or (LIGHTS_RESULT if options.lights else RESULT), result)
-    print("\n\n".join(tables(result).values()))
 
 
 def _brief(row: dict[str, Any]) -> str:

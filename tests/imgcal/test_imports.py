@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
@@ -15,37 +14,59 @@ from imgcal.cli.main import COMMANDS
 
 HEAVY = {"torch", "numba", "cv2", "scipy", "kornia", "timm", "tensorboard", "accelerate", "matplotlib"}
 NO_ARGUMENTS = {"evaluate", "warmup"}  # work without any
+IMPORTED = """
+import os, sys
+exec(sys.argv[1])
+for code in sys.argv[2:]:
+    child = os.fork()
+    if not child:
+        try:
+            exec(code)
+        except SystemExit:
+            pass
+        print()
+        print("|", *sys.modules, flush=True)
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0, code
+"""
 OF_OTHER_COMMANDS = {"timm", "tensorboard", "accelerate", "matplotlib"}
 
 
-def imported_by(code: str) -> set[str]:
-    """Top-level modules there after a piece of code, in a process of its own; SystemExit is passed over."""
-    script = f"import sys\ntry:\n    {code}\nexcept SystemExit:\n    pass\nprint('|', *sys.modules)"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    return {name.partition(".")[0] for name in done.stdout.rpartition("|")[2].split()}
+def imported_by(*codes: str, first: str = "pass") -> list[set[str]]:
+    """Top-level modules there after each piece of code, in a process of its own; SystemExit is passed over.
+
+    The processes are forked from one that has run the code that all begin with.
+    """
+    done = subprocess.run([sys.executable, "-c", IMPORTED, first, *codes], capture_output=True, text=True, check=True)
+    lines = [line.removeprefix("|") for line in done.stdout.splitlines() if line.startswith("|")]
+    assert len(lines) == len(codes), done.stderr
+    return [{name.partition(".")[0] for name in line.split()} for line in lines]
 
 
 def test_import_waits_for_nothing() -> None:
-    assert not imported_by("import imgcal") & (HEAVY | {"numpy", "pydantic"})
+    (found,) = imported_by("import imgcal")
+    assert not found & (HEAVY | {"numpy", "pydantic"})
+
+
+MAIN = "from imgcal.cli.main import main"
 
 
 @pytest.mark.parametrize("given", [["--help"], [], ["calibarte"], ["--tyro-print-completion", "bash"]])
 def test_what_concerns_all_commands_waits_for_nothing_heavy(given: list[str]) -> None:
-    assert not imported_by(f"from imgcal.cli.main import main; main({given})") & HEAVY
+    (found,) = imported_by(f"{MAIN}; main({given})")
+    assert not found & HEAVY
 
 
 @pytest.mark.parametrize("given", [["--help"], ["--no-such-option"], []])
 def test_help_and_slips_of_a_command_wait_for_nothing_heavy(given: list[str]) -> None:
     commands = [name for name in COMMANDS if given or name not in NO_ARGUMENTS]
-    scripts = [f"from imgcal.cli.main import main; main({[command, *given]})" for command in commands]
-    with ThreadPoolExecutor(2) as pool:
-        found = dict(zip(commands, pool.map(imported_by, scripts), strict=True))
-    assert not {command: names & HEAVY for command, names in found.items() if names & HEAVY}
+    found = imported_by(*(f"main({[command, *given]})" for command in commands), first=MAIN)
+    assert not {command: names & HEAVY for command, names in zip(commands, found, strict=True) if names & HEAVY}
 
 
 def test_a_command_waits_for_no_network_or_plot(tmp_path: Path) -> None:
     given = ["rig", "look-at", "--cameras", "3", "--out", str(tmp_path / "rig.yaml")]
-    found = imported_by(f"from imgcal.cli.main import main; main({given})")
+    (found,) = imported_by(f"{MAIN}; main({given})")
     assert (tmp_path / "rig.yaml").is_file() and "torch" in found and not found & OF_OTHER_COMMANDS
 
 

@@ -28,10 +28,10 @@ class Count(event.Listener):
         pass
 
 event.register("numba:compile", Count())
-from renderers.additive_splatting_cpu import _widest
+from imgcal.geometry.kernels import fill_free_turns  # its file imports no PyTorch, which takes seconds
 from renderers.compiling import cache_folder
 
-_widest(np.ones((1, 2), np.dtype(sys.argv[1])), np.ones((1, 2), bool))
+fill_free_turns(np.ones((2, 3), np.dtype(sys.argv[1])), np.ones((3, 3), np.dtype(sys.argv[1])))
 print(Count.times, repr(config.CACHE_DIR), cache_folder(), sep="|")
 """
 
@@ -52,7 +52,7 @@ def test_compiled_code_is_kept_by_version_in_the_users_cache_and_only_ours(tmp_p
     times, config, folder = run("float32", XDG_CACHE_HOME=str(tmp_path))
     assert times > 0 and config == "''"
     assert folder == tmp_path / "imgcal" / version("imgcal")
-    assert kept(folder) == {"additive_splatting_cpu"}
+    assert kept(folder) == {"kernels"}
     assert run("float32", XDG_CACHE_HOME=str(tmp_path))[0] == 0
 
 

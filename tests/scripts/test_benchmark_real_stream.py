@@ -1,6 +1,8 @@
 """How bumps of the real stream are made, and how reports of them are judged."""
 
+import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import torch
 
 import imgcal
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+from scripts.benchmarks import real_stream
 from scripts.benchmarks.real_stream import judge, summarize
 from scripts.benchmarks.wand_recording import turned
 
@@ -65,3 +68,24 @@ def test_only_the_time_in_which_the_bumped_camera_sees_the_object_counts():
         True,
     )
     assert not judge([event(399)], "cam02", "rotation", 100, seeing, 1.0, stride=3)["in_time"]
+
+
+def test_finished_cases_are_written_if_a_later_one_fails(tmp_path, monkeypatch):
+    row = {**judge([event(130)], "cam02", "rotation", 100, range(120, 600), 1.0), "stride": 1, "degrees": 0.3}
+
+    def run(case):
+        if case.camera:
+            raise RuntimeError("killed")
+        return row
+
+    known = SimpleNamespace(calibration=SimpleNamespace(rms=0.1))
+    monkeypatch.setattr(real_stream, "calibrated", lambda anew: known)
+    monkeypatch.setattr(real_stream, "WORK", tmp_path)
+    monkeypatch.setattr(real_stream, "run", run)
+    out = tmp_path / "real_stream.json"
+    monkeypatch.setattr("sys.argv", f"real_stream --strides --bumps 0.3 --cameras 0 1 --out {out}".split())
+    with pytest.raises(RuntimeError, match="killed"):
+        real_stream.main()
+    written = json.loads(out.read_text())
+    assert [one["camera"] for one in written["bump_runs"]] == ["cam02"]
+    assert written["bumps"][0]["bumps"] == 1

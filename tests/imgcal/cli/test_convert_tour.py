@@ -5,6 +5,7 @@ Each comes out verified on known points, or is refused with one line whose reaso
 
 import json
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +28,20 @@ from imgcal.formats import (
     read_foreign_rig,
 )
 from imgcal.formats.conversion import NATIVE
-from imgcal.formats.fitting import fit_lens
+from imgcal.formats.fitting import fit_lens as fit_a_lens
 from tests.imgcal.formats.test_registry import SAMPLES
 
 TARGETS: dict[str, Format | None] = {OURS: None, **{one.name: one for one in FORMATS if one.write is not None}}
 VERIFIED = re.compile(
     r"re-read: worst difference (?P<worst>\S+) px on (?P<points>\d+) points, lens models (?P<between>\S+)"
 )
+
+fit_lens = cache(fit_a_lens)  # many formats can store the same lenses
+
+
+@pytest.fixture(autouse=True)
+def fit_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("imgcal.formats.conversion.fit_lens", fit_lens)
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:

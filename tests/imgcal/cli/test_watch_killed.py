@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,15 +18,12 @@ from tests.imgcal.streams import Stream
 
 SNAPSHOTS, BUMPED_AT = 48, 20
 
-DYING = """
-import os, signal, sys
+WATCHES = """
+import json, os, signal, subprocess, sys
+from imgcal.cli import watch  # once, for all processes that are forked here
 from imgcal.cli.main import run
 from imgcal.io import atomic
 from imgcal.watch import event_log, loop, rig_files
-
-moment, number = sys.argv.pop(1).split(":")
-loop.SAVED_EVERY = 0.0
-left = [int(number)]
 
 def passed():
     left[0] -= 1
@@ -49,19 +47,52 @@ def after(owner, name, counts):
         return result
     setattr(owner, name, dying)
 
-if moment == "learnt":  # the state of a while ago is what is there
-    loop.SAVED_EVERY = 0.3
-    after(loop.Watch, "process", lambda self, snapshot: True)
-elif moment == "told":
-    after(event_log.EventLog, "append", lambda self, event: event.kind == "moved")
-elif moment == "saving":  # the new state is written beside the old one, and has not taken its place
-    # Each save is written before the next snapshot: the thread leaves out those that it has no time for.
-    rig_files.RigFiles.write = lambda self, state, *, keep=False, also=None, then=None: self._write(
-        also, then, state, [state] if keep else []
-    )
-    before(atomic.os, "replace", lambda source, target: str(target).endswith("state.json"))
-run()
+def die_at(moment):
+    loop.SAVED_EVERY = 0.0
+    if moment == "learnt":  # the state of a while ago is what is there
+        loop.SAVED_EVERY = 0.3
+        after(loop.Watch, "process", lambda self, snapshot: True)
+    elif moment == "told":
+        after(event_log.EventLog, "append", lambda self, event: event.kind == "moved")
+    elif moment == "saving":  # the new state is written beside the old one, and has not taken its place
+        # Each save is written before the next snapshot: the thread leaves out those that it has no time for.
+        rig_files.RigFiles.write = lambda self, state, *, keep=False, also=None, then=None: self._write(
+            also, then, state, [state] if keep else []
+        )
+        before(atomic.os, "replace", lambda source, target: str(target).endswith("state.json"))
+
+for line in sys.stdin:
+    job = json.loads(line)
+    child = os.fork()
+    if not child:
+        written = os.open(job["said"], os.O_WRONLY | os.O_CREAT)
+        os.dup2(written, 1)
+        os.dup2(written, 2)
+        if job["piped"]:
+            given = subprocess.Popen(["cat", job["stdin"]], stdout=subprocess.PIPE).stdout.fileno()
+        else:
+            given = os.open(job["stdin"], os.O_RDONLY)
+        os.dup2(given, 0)
+        sys.stdin = open(0)
+        if job["killed"]:
+            moment, number = job["killed"].split(":")
+            left = [int(number)]
+            die_at(moment)
+        sys.argv[1:] = job["arguments"]
+        run()
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
+
+
+@pytest.fixture(scope="module")
+def watches() -> Iterator[subprocess.Popen[str]]:
+    """A process that has imported the command, and forks a process for each job."""
+    with subprocess.Popen(
+        [sys.executable, "-c", WATCHES], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONPATH": str(Path.cwd())},
+    ) as process:  # fmt: skip
+        yield process
+        process.stdin.close()
 
 
 @pytest.fixture(scope="module")
@@ -93,19 +124,26 @@ def frames(tmp_path_factory):
     return str(folder / "capture"), None, [*known, "--until-idle", "0.5"]
 
 
-def watch(given, out, *, killed=None, piped=False):
-    """Run the command in a process of its own."""
-    source, stdin, options = given
-    code = [sys.executable, "-m", "imgcal"] if killed is None else [sys.executable, "-c", DYING, killed]
-    options = [*options, "--out", str(out), *(["--keep-all"] if piped else [])]
-    with open(os.devnull if stdin is None else stdin, "rb") as file:
-        fed = {"input": file.read()} if piped else {"stdin": file}
-        done = subprocess.run(
-            [*code, "watch", source, *options], capture_output=True, timeout=600, **fed,
-            env=os.environ | {"PYTHONPATH": str(Path.cwd())},
-        )  # fmt: skip
-    assert done.returncode == (0 if killed is None else -signal.SIGKILL), done.stderr.decode()
-    return done.stdout.decode()
+@pytest.fixture
+def watch(watches, tmp_path):
+    """Return a function that runs the command in a process of its own."""
+
+    def run(given, out, *, killed=None, piped=False):
+        source, stdin, options = given
+        job = {
+            "arguments": ["watch", source, *options, "--out", str(out), *(["--keep-all"] if piped else [])],
+            "stdin": os.devnull if stdin is None else str(stdin),
+            "piped": piped,
+            "killed": killed,
+            "said": str(tmp_path / f"said{len(list(tmp_path.glob('said*')))}.txt"),
+        }
+        watches.stdin.write(json.dumps(job) + "\n")
+        watches.stdin.flush()
+        code, said = int(watches.stdout.readline()), Path(job["said"]).read_text()
+        assert code == (0 if killed is None else -signal.SIGKILL), said
+        return said
+
+    return run
 
 
 def events(out):
@@ -121,7 +159,7 @@ def assert_same(out, whole, snapshots):
 
 
 @pytest.mark.parametrize("piped", [False, True], ids=["file", "pipe"])
-def test_blobs_in_lines(blobs, piped, tmp_path):
+def test_blobs_in_lines(watch, blobs, piped, tmp_path):
     watch(blobs, tmp_path / "whole", piped=piped)
     assert {event["camera"] for event in events(tmp_path / "whole") if event["event"] == "moved"} == {"cam02"}
     out = tmp_path / "out"
@@ -132,7 +170,7 @@ def test_blobs_in_lines(blobs, piped, tmp_path):
     assert_same(out, tmp_path / "whole", SNAPSHOTS)
 
 
-def test_frames_in_a_folder(frames, tmp_path):
+def test_frames_in_a_folder(watch, frames, tmp_path):
     watch(frames, tmp_path / "whole")
     for moment in ("learnt:3", "saving:2"):
         watch(frames, tmp_path / "out", killed=moment)

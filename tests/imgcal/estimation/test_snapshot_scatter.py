@@ -8,6 +8,7 @@ import torch
 
 from imgcal.estimation import BlockScatter, block_scatter, camera_covariance, camera_std, estimate
 from imgcal.estimation.robust_losses import NamedLoss
+from imgcal.estimation.snapshot_scatter import linearize_blocks
 from imgcal.geometry import RigidTransform
 
 LOSS = NamedLoss("huber", 3.0)
@@ -88,3 +89,14 @@ def test_the_camera_whose_lens_is_bad_gets_the_larger_factor(simulate) -> None:
     factor = scatter(estimate(one, case.factory, case.obj, case.poses[0], prior_std=case.prior_std)).factor
     assert factor is not None
     assert factor[0] > 1.2 * factor[1:].max()
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 0.05])
+def test_the_total_information_is_that_of_all_blocks(simulate, tolerance: float) -> None:
+    case = simulate(snapshots=9, cameras=4)
+    obj = replace(case.obj, tolerance=torch.full((len(case.obj.points),), tolerance, dtype=torch.float64))
+    found = estimate(case.observations, case.factory, obj, prior_std=case.prior_std)
+    evidence = linearize_blocks(found.problem, found.solution.state, 3, LOSS)
+    each, size = evidence.information(), found.problem.prior_std[0].numel()
+    assert each.shape == (3, *2 * (size + (3 * len(obj.points) + 1 if tolerance else 0),))
+    torch.testing.assert_close(evidence.total(), each.sum(0), rtol=1e-9, atol=1e-9 * float(each.abs().max()))

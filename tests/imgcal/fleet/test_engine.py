@@ -9,12 +9,14 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import ray
 
 import imgcal
 from imgcal.fleet import Done, Engine, Lost
+from imgcal.fleet.engine import GRACE
 
 
 def square(number: int) -> int:
@@ -25,9 +27,17 @@ def misbehaving(items: Sequence[str]) -> list[str]:
     for item in items:
         if item == "crash":
             os.kill(os.getpid(), signal.SIGKILL)
-        if item == "hang":
-            time.sleep(1000)
     return [item.upper() for item in items]
+
+
+def hanging(items: Sequence[str | Path]) -> list[str]:
+    """Write the number of the process into a file, and do not end."""
+    for item in items:
+        if isinstance(item, Path):
+            item.with_suffix(".part").write_text(str(os.getpid()))
+            item.with_suffix(".part").rename(item)
+            time.sleep(1000)
+    return [str(item).upper() for item in items]
 
 
 def test_results_come_in_the_order_of_the_items(engine: Engine) -> None:
@@ -43,12 +53,20 @@ def test_only_the_item_that_kills_its_process_is_lost(engine: Engine) -> None:
     assert sorted(done) == ["A", "B", "C"]
 
 
-def test_what_does_not_end_is_stopped(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_does_not_end_is_stopped(engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ray.cloudpickle.register_pickle_by_value(__import__(__name__, fromlist=["square"]))
-    monkeypatch.setattr("imgcal.fleet.engine.GRACE", 20.0)  # a process must start within it
-    outcomes = list(engine.run(misbehaving, [["hang"], ["a"]], seconds=1.0))
-    assert [(o.item, o.timed_out) for o in outcomes if isinstance(o, Lost)] == [("hang", True)]
-    assert [o.results for o in outcomes if isinstance(o, Done)] == [["A"]]
+    outcomes = engine.run(hanging, [[tmp_path / "begun"], ["a"]], seconds=1.0)
+    assert next(outcomes).results == ["A"]
+    until = time.monotonic() + 120.0
+    while not (tmp_path / "begun").exists() and time.monotonic() < until:
+        time.sleep(0.05)
+    process = int((tmp_path / "begun").read_text())
+    late = SimpleNamespace(monotonic=lambda: time.monotonic() + GRACE + 2.0)  # nobody waits for so long
+    monkeypatch.setattr("imgcal.fleet.engine.time", late)
+    assert [(o.item, o.timed_out) for o in outcomes] == [(tmp_path / "begun", True)]
+    while Path(f"/proc/{process}").exists() and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{process}").exists()
 
 
 def test_no_more_is_read_than_is_needed(engine: Engine) -> None:

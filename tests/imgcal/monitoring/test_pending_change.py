@@ -1,5 +1,9 @@
 """Snapshots after a change determine its kind and size."""
 
+from collections.abc import Mapping
+from types import SimpleNamespace
+
+import pytest
 import torch
 
 import imgcal
@@ -47,6 +51,34 @@ def test_the_kind_the_size_and_what_is_believed_then() -> None:
     assert 0.4 < float(error @ torch.linalg.solve(belief.covariance(), error)) / len(error) < 1.8
     assert bool((belief.std()[1, :6] <= before.std()[1, :6] * 1.001).all())
     assert float((first.rig.focal_length - before.rig.focal_length)[1].norm()) > 0.5 * ZOOM
+
+
+@pytest.mark.parametrize(
+    ("tilt", "principal_point", "kind"), [(14, 15, "rotation"), (14, 16, "rotation"), (14, 22, "principal_point")]
+)
+def test_a_tilt_that_a_shift_of_the_lens_explains_as_well_is_a_rotation(tilt, principal_point, kind) -> None:
+    """A rotation about any axis has one more parameter, and pays for it."""
+    odds = {"tilt": tilt, "rotation": 10.0, "position": 5.0, "focal_length": 0.0, "principal_point": principal_point}
+
+    def evidence(changes: Mapping[int, str | None]) -> float:
+        return odds.get(changes[1] or "", 8.0)
+
+    before, result, _ = zoomed()
+    since = PendingChange.of(result, before, 0.0, {1: None})
+    since.most = since.count
+    assert since.decide(SimpleNamespace(odds=evidence), 1, last=True)[1] == kind  # type: ignore[arg-type, index]
+
+
+@pytest.mark.parametrize(("alone", "kind"), [(9950.0, "rotation"), (9800.0, None)])
+def test_a_change_of_all_kinds_is_reported_as_its_main_kind_if_there_is_one(alone, kind) -> None:
+    """A lens or a place that was never quite right shows, once the camera has moved."""
+    before, result, _ = zoomed()
+    since = PendingChange.of(result, before, 0.0, {1: None})
+
+    def evidence(changes: Mapping[int, str | None]) -> float:
+        return 10_000.0 if changes[1] is None else alone if changes[1] == "rotation" else 0.0
+
+    assert since.decide(SimpleNamespace(odds=evidence), 1, last=False) == (None, kind)  # type: ignore[arg-type]
 
 
 def test_a_camera_that_is_let_free_may_be_anywhere_and_no_other() -> None:

@@ -5,13 +5,14 @@ import math
 from collections import deque
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args, get_origin
+from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from typing_extensions import TypeAliasType
 
 import imgcal
 from imgcal.geometry import RigidTransform
@@ -115,6 +116,20 @@ def test_every_kind_of_object_comes_back(kind: str) -> None:
     for name, value in vars(replace(obj)).items():
         again = getattr(found, name)
         assert torch.equal(again, value) if isinstance(value, Tensor) else again == value, name
+
+
+def test_an_alias_of_an_array_s_type_is_that_type() -> None:
+    """As NumPy's own NDArray since its version 2.5."""
+    scalar = TypeVar("scalar", bound=np.generic)
+    alias = TypeAliasType("alias", np.ndarray[Any, np.dtype[scalar]], type_params=(scalar,))
+    writer, values = StateWriter(), np.arange(3.0)
+    for kind in (alias[np.float64], alias[np.float64] | None):
+        plain = writer.write(kind, values)
+        assert (StateReader(writer.tables()).read(kind, plain, "values") == values).all()
+    with pytest.raises(TypeError):
+        writer.write(alias[np.float64], 1.0)
+    with pytest.raises(ValueError, match="values"):
+        StateReader(writer.tables()).read(alias[np.float64], 1.0, "values")
 
 
 def test_sums_over_an_array_go_in_the_same_order() -> None:
