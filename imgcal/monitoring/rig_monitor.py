@@ -520,13 +520,13 @@ class RigMonitor:
         test = pending.test(self.filter.walk)
         decided, kinds = pending.decide_kinds(test, self.open, last)
         pending.kinds.update(kinds)
-        if any(kind is not None for kind in kinds.values()):
+        # Snapshots that were linearized while a camera could be anywhere are absorbed again. Where the first of them are no
+        # longer kept, so many have come since that the camera is well known whatever the kind of its change.
+        if any(kind is not None for kind in kinds.values()) and pending.count <= len(self._recent):
             first, belief, information = pending.adopt_kinds(test)
             self._recent.rebase(belief, information)
-            # Snapshots that were linearized while a camera could be anywhere are absorbed again.
-            if pending.count <= len(self._recent):
-                with contextlib.suppress(RefusedError):
-                    belief = self._restart(first, *self._recent.latest(pending.count)).belief
+            with contextlib.suppress(RefusedError):
+                belief = self._restart(first, *self._recent.latest(pending.count)).belief
             self.filter.suppose(first, age_belief(belief, pending.seconds, self.filter.walk))
         self.open = {camera: change for camera, change in self.open.items() if camera not in kinds}
         if not self.open:
