@@ -28,14 +28,9 @@ from imgcal.types import PARAMETER_KINDS, CameraRig
 
 CHANGES: Mapping[str, slice] = {kind: part for kind, part in PARAMETER_KINDS.items() if kind != "distortion"}
 """Kinds of change, and the camera parameters that each one covers."""
-_PARTS = {**CHANGES, "tilt": slice(0, 2)}
-FORMS: Mapping[str, tuple[slice, ...]] = {name: (part,) for name, part in _PARTS.items()} | {
-    f"{name} and lens": (part, PARAMETER_KINDS["distortion"]) for name, part in _PARTS.items()
-}
-"""Forms of these kinds, and their parameters. A tilt is a rotation about an axis in the image plane, as by a mount's
-joints. After a change, a camera may see the object where its distortion is not well known."""
-FORMS_OF = {kind: tuple(name for name in FORMS if kind in name or (kind == "rotation" and "tilt" in name))
-            for kind in CHANGES}  # fmt: skip
+FORMS = {**CHANGES, "tilt": slice(0, 2)}
+"""The same, and a rotation about an axis in the image plane, as by the joints of a mount."""
+FORMS_OF = {kind: (kind, "tilt") if kind == "rotation" else (kind,) for kind in CHANGES}
 JUMPS = (0.6, 6.0, 60.0, 600.0)
 """Pixels: prior standard deviations of a change, all equally probable. They are image shifts, whatever the kind of
 change, so that no kind is preferred."""
@@ -79,8 +74,8 @@ def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = 
     """
     std = torch.zeros_like(pixels)
     for camera, kind in changes.items():
-        for part in (slice(None),) if kind is None else FORMS[kind]:
-            std[camera, part] = jump * pixels[camera, part]
+        part = slice(None) if kind is None else FORMS[kind]
+        std[camera, part] = jump * pixels[camera, part]
     std[:, 6:] *= min(1.0, LENS / jump)
     return std
 

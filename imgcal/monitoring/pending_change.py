@@ -13,7 +13,6 @@ from imgcal.estimation import displace, error_between
 from imgcal.monitoring.case import mean_evidence
 from imgcal.monitoring.change_test import (
     CHANGES,
-    FORMS,
     FORMS_OF,
     LARGE,
     ChangeTest,
@@ -34,8 +33,7 @@ MAIN_KIND_SHARE = 0.99
 """A change of all kinds together is reported as its main kind if that one has this share of the log odds: the rest
 shifts the image by a tenth of it at most."""
 LENS_KINDS, LENS_LOG_PRIOR = ("focal_length", "principal_point"), -3.0
-"""Changes of the lens alone, and their prior log odds against a rotation or a shift: bumps hit the camera, not the
-lens."""
+"""Changes of the lens alone, and their prior log odds against a rotation or a shift if the snapshots cannot tell."""
 DECIDE_AFTER = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """Numbers of snapshots since a change at which its kind is decided if possible."""
 
@@ -63,7 +61,7 @@ class PendingChange:
     weighted: Tensor  # (D,) gradient at the origin
     count: int  # snapshots
     seconds: float
-    kinds: dict[int, str | None]  # form by camera that changed; None = undecided
+    kinds: dict[int, str | None]  # by camera that changed; None = undecided
     most: int = DECIDE_AFTER[-1]  # decide the kinds after so many snapshots
 
     @property
@@ -126,23 +124,21 @@ class PendingChange:
         """Decide how a camera has changed, now if it is the `last` chance.
 
         Returns:
-            The form of change to believe (None = any) and the kind to report (None = no single kind); None = cannot be
-            decided yet.
+            The kind to believe (None = any) and the kind to report (None = no single kind); None = cannot be decided
+            yet.
         """
         odds: dict[str | None, float] = {None: test.odds({**self.others(camera), camera: None})}
-        likeliest = dict[str | None, str | None]()
         for kind, forms in FORMS_OF.items():
-            found = {form: test.odds({**self.others(camera), camera: form}) for form in forms}
-            odds[kind] = mean_evidence(list(found.values()), len(found)) + LENS_LOG_PRIOR * (kind in LENS_KINDS)
-            likeliest[kind] = max(found, key=lambda form: found[form])
+            found = [test.odds({**self.others(camera), camera: form}) for form in forms]
+            odds[kind] = mean_evidence(found, len(found))
         best, second = sorted(odds, key=lambda kind: -odds[kind])[:2]
+        # Bumps hit the camera, not the lens.
+        likely = max(CHANGES, key=lambda kind: odds[kind] + LENS_LOG_PRIOR * (kind in LENS_KINDS))
         least = ALL_KINDS_LEAD if best is None else SINGLE_KIND_LEAD if second is None else KIND_LEAD
-        kind = max(CHANGES, key=lambda kind: odds[kind])
         if odds[best] - odds[second] >= least:
-            main = kind if odds[kind] >= MAIN_KIND_SHARE * odds[None] else None
-            return likeliest.get(best), main if best is None else best
+            return best, best or (likely if odds[likely] >= MAIN_KIND_SHARE * odds[None] else None)
         # Report the most probable kind, but believe that any is possible.
-        return (None, kind if self.overdue else None) if last else None
+        return (None, likely if self.overdue else None) if last else None
 
     def decide_kinds(
         self, test: ChangeTest, changes: Mapping[int, Change], last: bool
@@ -150,7 +146,7 @@ class PendingChange:
         """Decide the kinds of pending changes, by camera, where possible or overdue.
 
         Returns:
-            The decided changes to report, and the forms to believe for their cameras.
+            The decided changes to report, and the kinds to believe for their cameras.
         """
         decided, kinds = [], dict[int, str | None]()
         for camera, change in changes.items():
@@ -182,7 +178,7 @@ class PendingChange:
         step = torch.zeros_like(self.before.unit)
         for camera, kind in self.kinds.items():
             if kind is not None:
-                (part, *_) = FORMS[kind]
+                part = CHANGES[kind]
                 step[camera, part] = test.condition_on(self.others(camera)).jump(camera, part)[0]
         first = free_cameras(replace(self.before, rig=self.before.rig.retract(step)), self.kinds)
         information = first.information + self.brought

@@ -520,8 +520,8 @@ class RigMonitor:
         test = pending.test(self.filter.walk)
         decided, kinds = pending.decide_kinds(test, self.open, last)
         pending.kinds.update(kinds)
-        # Snapshots that were linearized while a camera could be anywhere are absorbed again. Where the first of them are no
-        # longer kept, so many have come since that the camera is well known whatever the kind of its change.
+        # Snapshots that were linearized while a camera could be anywhere are absorbed again. Where the first of them
+        # are no longer kept, there are so many that the camera is well known whatever the kind of its change.
         if any(kind is not None for kind in kinds.values()) and pending.count <= len(self._recent):
             first, belief, information = pending.adopt_kinds(test)
             self._recent.rebase(belief, information)

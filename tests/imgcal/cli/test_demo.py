@@ -20,7 +20,7 @@ def test_the_address_is_printed_and_an_interruption_ends_it(monkeypatch, capsys)
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["dead"], "'dead'"),
+        (["dead"], "found dead, expected live"),
         (["live", "--rate", "0"], "--rate: found 0.0"),
         (["live", "--serve", "a:b:c"], "expected HOST:PORT"),
         (["live", "--serve", "0.0.0.0:0", "--token", "short"], "expected 16 to 128"),

@@ -54,7 +54,7 @@ def test_the_kind_the_size_and_what_is_believed_then() -> None:
 
 
 @pytest.mark.parametrize(
-    ("tilt", "principal_point", "kind"), [(14, 15, "rotation"), (14, 16, "rotation"), (14, 22, "principal_point")]
+    ("tilt", "principal_point", "kind"), [(14, 15, "rotation"), (14, 16, "rotation"), (14, 18, "principal_point")]
 )
 def test_a_tilt_that_a_shift_of_the_lens_explains_as_well_is_a_rotation(tilt, principal_point, kind) -> None:
     """A rotation about any axis has one more parameter, and pays for it."""

@@ -95,7 +95,7 @@ with RigKeeper(rig, obj, horizon=2) as keeper:
 """
 NETWORKS = [ROOT / "data" / "models" / f"{name}-O10-asymmetric8.safetensors" for name in ("points", "vit")]
 OF_A_LENS = "<locals>"  # called through numba's overloads, which a function does not name
-UNUSED = {"_minimize_all", "_pair", "_gradients", "_through_profile"}  # many rigs at once, and training
+UNUSED = {"_gradients", "_through_profile"}  # training
 
 
 def run_watched(folder: Path, work: str, *arguments: object) -> dict[str, list[str]]:
