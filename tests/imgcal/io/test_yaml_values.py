@@ -39,9 +39,9 @@ def test_values(text, expected):
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("[" * 100, f"more than {MOST_DEPTH} levels"),
-        ("{a: " * 100, f"more than {MOST_DEPTH} levels"),
-        ("- " * 100_000, f"more than {MOST_DEPTH} levels"),
+        ("[" * 100, f"more than {MOST_DEPTH} nested levels"),
+        ("{a: " * 100, f"more than {MOST_DEPTH} nested levels"),
+        ("- " * 100_000, f"more than {MOST_DEPTH} nested levels"),
         ("a: &a [*a]", "alias"),
         ("a: *b", "alias"),
         ("a: &a 1\n*a : 2", "as a key"),
@@ -73,7 +73,7 @@ def test_what_no_file_of_ours_holds(text, problem):
 @pytest.mark.parametrize("text", ["[" * 100_000, "{a: " * 100_000])
 def test_brackets_deeper_than_any_stack(text):
     # libyaml looks ahead for the end of a key, and newer versions stop there by themselves.
-    with pytest.raises(yaml.MarkedYAMLError, match=f"more than {MOST_DEPTH} levels|maximum nesting depth"):
+    with pytest.raises(yaml.MarkedYAMLError, match=f"more than {MOST_DEPTH} nested levels|maximum nesting depth"):
         read_values(text.encode())
 
 
