@@ -32,11 +32,13 @@ from imgcal.matching import MatchedFilter
 from imgcal.networks import Evidence, InfraredNetwork, Queries, load_infrared, load_measurer
 from imgcal.pipeline.learned_proposer import LearnedProposer
 from imgcal.pipeline.sources import Detector
+from imgcal.synthesis import DIFFICULTIES
 from imgcal.training import HELD_OUT, TRAIN
 from imgcal.training.labelled_crops import cut_labelled
 from imgcal.types import CameraRig, Detections
 from scripts.output import RESULTS, ROOT, command, fill, machine, markdown, read_json, write_json
 from scripts.results import degraded_captures as captures
+from scripts.results import infrared
 from scripts.results.degradations import DEGRADATIONS
 from tests.captures.sets import dot_grid
 
@@ -278,21 +280,54 @@ def _outcomes(rows: list[dict[str, Any]], references: dict[str, float]) -> str:
     return " / ".join(str(said.count(kind)) for kind in ("calibrated", "refused", "wrong")) if said else ""
 
 
+def measure_levels(runs: Path, count: int) -> None:
+    """Measure the shipped and the adapted networks on rendered frames of all named levels of difficulty."""
+    torch.set_num_threads(1)
+    networks = {"shipped": ROOT / "data" / "models" / "ir-cnn.safetensors"} | {
+        f"adapted to {name}, seed {seed}": adapted(runs, name, "ir-cnn", seed) / MODEL
+        for name in captures.SETS for seed in SEEDS
+    }  # fmt: skip
+    rig, obj, rows = imgcal.load_rig("O10"), imgcal.load_object("asymmetric8"), {}
+    for name, path in networks.items():
+        method, tally = LearnedProposer(load_infrared(path).network, shipped_measurer()), infrared.Tally()
+        for difficulty in DIFFICULTIES.values():
+            for number, case in enumerate(infrared.cases(rig, obj, difficulty, count)):
+                found = lambda snapshot, method=method: method.propose(snapshot).detections  # noqa: E731
+                infrared.ask(found, case, infrared.NEARLY, number, tally)
+        rows[name] = tally.result()
+        print(name, rows[name], flush=True)
+    write_json(JSON, read_json(JSON) | {"levels": rows, "levels_snapshots": count})
+
+
+def tables_of_levels(rows: dict[str, dict[str, float]]) -> str:
+    """Right and wrong markers on rendered frames; of adapted networks, for each seed."""
+    lines = [["shipped", _share(rows["shipped"])]]
+    for name, title in captures.SETS.items():
+        lines.append([f"adapted to {title}", ", ".join(_share(rows[f"adapted to {name}, seed {k}"]) for k in SEEDS)])
+    return markdown(["network", "right % of visible / wrong % of claimed, all named levels"], lines)
+
+
+def _share(row: dict[str, float]) -> str:
+    return f"{row['right_percent']:.1f} / {row['wrong_percent']:.1f}"
+
+
 def main(
     runs: Path,
-    steps: tuple[str, ...] = ("prepare", "train", "measure", "page"),
+    steps: tuple[str, ...] = ("prepare", "train", "measure", "levels", "page"),
     cores: int = 1,
     only: tuple[str, ...] = (),
     device: str = "cpu",
+    count: int = 3,
 ) -> None:
     """Adapt, calibrate, and write the JSON and the table.
 
     Args:
         runs: folder of data sets and training runs.
-        steps: prepare, train, measure, page.
+        steps: prepare, train, measure, levels, page.
         cores: processes at once.
         only: detectors to measure; none = all.
         device: of the query networks.
+        count: snapshots of each named level of difficulty.
     """
     if "prepare" in steps:
         prepare(runs)
@@ -300,8 +335,11 @@ def main(
         train(runs, cores)
     if "measure" in steps:
         measure(runs, cores, cases(runs, only or detectors(), device))
+    if "levels" in steps:
+        measure_levels(runs, count)
     if "page" in steps:
-        fill(PAGE, {"own frames": tables(read_json(JSON)["outcomes"])})
+        found = read_json(JSON)
+        fill(PAGE, {"own frames": tables(found["outcomes"]), "own frames levels": tables_of_levels(found["levels"])})
 
 
 if __name__ == "__main__":
