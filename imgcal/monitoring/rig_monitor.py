@@ -261,7 +261,7 @@ class RigMonitor:
             return replace(anew, changes=(*found.changes, *decided, *anew.changes))
         if verdict.best.name == LensMisfit.name:
             best = verdict.best
-            return MonitorUpdate(self._restart(best.before, best.snapshots, case.pauses[-case.count :]))
+            return MonitorUpdate(self._restart(best.before, best.snapshots, case.pauses[-case.count :]), found.changes)
         if verdict.best.finding.slips and len(verdict.best.snapshots) > case.count:  # late from the beginning
             return replace(self._adopt(case, verdict), changes=found.changes)
         return replace(found, slips=self._clock_slips(verdict))

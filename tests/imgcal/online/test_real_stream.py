@@ -82,3 +82,17 @@ def test_a_camera_that_was_turned_far_is_reported_once_and_then_stays_known(reco
     moves = [(event.camera, event.change) for event in reported if event.kind == "moved"]
     assert moves == [("cam05", "unknown"), ("cam05", "rotation")]
     assert {event.kind for event in reported} <= {"moved", "relearnt"}
+
+
+def test_a_lens_that_was_calibrated_in_the_middle_of_its_image_has_not_moved(recording) -> None:
+    """The second half of the recording does not show cam03's border, where the first half sees the wand come in."""
+    rig, obj, blobs = recording
+    late = [s for s, name in enumerate(blobs.snapshot_names) if int(name) >= 2400 and int(name) % 8 == 0]
+    calibration = imgcal.calibrate(selected(blobs, late), rig, obj)
+    loud = []
+    with imgcal.RigKeeper(calibration.rig, obj) as keeper:
+        for number, snapshot in frames(blobs, 1000, 1330):
+            if number % 2 == 0:
+                state = keeper.update(snapshot, number / RATE)
+                loud += [(number, event.kind, event.camera) for event in state.events if event.kind not in QUIET]
+    assert not loud
