@@ -121,7 +121,7 @@ def changed_cameras(
 
 def _largest_shift(test: ChangeTest, camera: int) -> float:
     """Largest image shift (px) by a change of a single kind, if no other camera changed."""
-    kinds = (test.jump(camera, part)[0] / test.pixels[camera, part] for part in CHANGES.values())
+    kinds = (test.jump(camera, kind)[0] / test.pixels[camera, part] for kind, part in CHANGES.items())
     return max(float(shift.norm()) for shift in kinds)
 
 

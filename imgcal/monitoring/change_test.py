@@ -177,10 +177,10 @@ class ChangeTest:
         taken = torch.linalg.solve_triangular(factor, scaled, upper=False)
         return ChangeTest(self.pull - taken.mT @ pull, self.learnt - taken.mT @ taken, self.pixels, self.lasting)
 
-    def jump(self, camera: int, own: slice) -> tuple[Tensor, Tensor]:
-        """Estimate a change of K parameters of a camera, if no other changed: (K,) and covariance (K, K)."""
+    def jump(self, camera: int, kind: str) -> tuple[Tensor, Tensor]:
+        """Estimate a camera's change in a kind with K parameters, if no other changed: (K,) and covariance (K, K)."""
         first = camera * self.pixels.shape[1]
-        part = slice(first + own.start, first + own.stop)
+        part = slice(first + CHANGES[kind].start, first + CHANGES[kind].stop)
         covariance = torch.linalg.pinv(self.learnt[part, part], hermitian=True)
         return covariance @ self.pull[part], covariance
 

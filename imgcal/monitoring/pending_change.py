@@ -162,7 +162,7 @@ class PendingChange:
 
     def size(self, test: ChangeTest, camera: int, kind: str) -> tuple[float, float]:
         """Size of a camera's change, assuming this kind alone, and its standard deviation."""
-        change, covariance = test.condition_on(self.others(camera)).jump(camera, CHANGES[kind])
+        change, covariance = test.condition_on(self.others(camera)).jump(camera, kind)
         size = float(change.norm())
         along = change / max(size, 1e-30)
         return size, float((along @ covariance @ along).clamp_min(0).sqrt())
@@ -178,8 +178,7 @@ class PendingChange:
         step = torch.zeros_like(self.before.unit)
         for camera, kind in self.kinds.items():
             if kind is not None:
-                part = CHANGES[kind]
-                step[camera, part] = test.condition_on(self.others(camera)).jump(camera, part)[0]
+                step[camera, CHANGES[kind]] = test.condition_on(self.others(camera)).jump(camera, kind)[0]
         first = free_cameras(replace(self.before, rig=self.before.rig.retract(step)), self.kinds)
         information = first.information + self.brought
         factor = torch.linalg.cholesky(information)

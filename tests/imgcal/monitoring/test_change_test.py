@@ -92,7 +92,7 @@ def test_the_kind_of_a_change_is_the_most_probable_one(followed, kind: str) -> N
     assert max(odds, key=lambda name: odds[name]) == kind
     assert test.odds({1: kind}) > test.odds({0: kind})
     assert max(float(scores[[0, 2, 3]].max()) for scores in test.condition_on({1: None}).scores().values()) < 40
-    change, covariance = test.jump(1, CHANGES[kind])
+    change, covariance = test.jump(1, kind)
     error = change - torch.tensor([size, -0.5 * size, 0.3 * size], dtype=torch.float64)[: len(change)]
     assert float(error @ torch.linalg.solve(covariance, error)) < 25
 
