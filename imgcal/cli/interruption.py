@@ -4,37 +4,37 @@ import contextlib
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
+
+Handler = Callable[[int, FrameType | None], object] | signal.Handlers
 
 
 @contextlib.contextmanager
 def end_at_once() -> Iterator[None]:
     """End the process with one line at Ctrl-C: within an import, KeyboardInterrupt can surface as anything."""
-    # In the background of a shell, Ctrl-C is not for us; and other programs may have handlers of their own.
-    ours = threading.current_thread() is threading.main_thread()
-    if not (ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler):
+    with _handler(signal.SIGINT, signal.default_int_handler, _end):  # in a shell's background, Ctrl-C is not for us
         yield
-        return
-    signal.signal(signal.SIGINT, _end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @contextlib.contextmanager
 def unwind_at_termination() -> Iterator[None]:
     """Let SIGTERM raise KeyboardInterrupt, so that worker processes are ended and the command says one line."""
-    ours = threading.current_thread() is threading.main_thread()
-    if not (ours and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL):  # other programs may have their handlers
+    with _handler(signal.SIGTERM, signal.SIG_DFL, _unwind):
+        yield
+
+
+@contextlib.contextmanager
+def _handler(number: signal.Signals, usual: Handler, ours: Handler) -> Iterator[None]:
+    """Handle a signal in the main thread, unless another program has a handler of its own."""
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(number) is not usual:
         yield
         return
-    signal.signal(signal.SIGTERM, _unwind)
+    signal.signal(number, ours)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(number, usual)
 
 
 def _unwind(number: int, frame: FrameType | None) -> None:
