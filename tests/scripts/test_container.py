@@ -15,6 +15,7 @@ from imgcal import load_object, load_rig
 from imgcal.cli.main import parse
 from imgcal.live_page import LivePage, parse_address
 from scripts.container import steps
+from tests.imgcal.compile_listener import LISTEN
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "scripts" / "container"
@@ -98,23 +99,15 @@ def test_health_is_whether_the_page_answers(address):
     assert not answers(port)
 
 
-USE = """
+USE = (
+    LISTEN
+    + """
 import json, sys
-from numba.core import event
-
-class Compiled(event.Listener):
-    names = []
-    def on_start(self, happening):
-        self.names.append(happening.data["dispatcher"].py_func.__qualname__)
-    def on_end(self, happening):
-        pass
-
-event.register("numba:compile", Compiled())
-from imgcal.cli.main import main
 
 assert main(["detect", sys.argv[1], "--out", "blobs.csv"]) == 0
 print(json.dumps(Compiled.names))
 """
+)
 DETECTION_ALONE = """
 
 def warm_up(all_lenses: bool = False) -> None:

@@ -13,6 +13,7 @@ from imgcal.io import data_path
 from imgcal.online import warm_up
 from imgcal.online.warmup import replace_lenses
 from imgcal.types import CameraRig
+from tests.imgcal.compile_listener import LISTEN
 
 ROOT = Path(__file__).parents[3]
 
@@ -28,20 +29,11 @@ def test_other_lenses_are_warmed_up_where_that_is_asked_for(monkeypatch: pytest.
     torch.testing.assert_close(*images)  # the same lens in other words
 
 
-WATCHED = """
+WATCHED = (
+    LISTEN
+    + """
 import inspect, json, sys
-from numba.core import event
 from numba.core.dispatcher import Dispatcher
-
-class Compiled(event.Listener):
-    names = []
-    def on_start(self, happening):
-        self.names.append(happening.data["dispatcher"].py_func.__qualname__)
-    def on_end(self, happening):
-        pass
-
-event.register("numba:compile", Compiled())
-from imgcal.cli.main import main
 
 {work}
 
@@ -73,6 +65,7 @@ print(json.dumps({{
              if value not in reached and value.targetoptions.get("inline") != "always"],
 }}))
 """
+)
 COMMANDS = """
 from imgcal import RigKeeper, load_object, load_rig
 from imgcal.io import open_capture
