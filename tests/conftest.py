@@ -1,5 +1,6 @@
 """Fixtures for all tests, and which tests run by default."""
 
+import gc
 import os
 import shutil
 from functools import cache
@@ -66,6 +67,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             config.hook.pytest_deselected(items=left)
             items[:] = [item for item in items if item not in set(left)]
     config.stash[LEFT_OUT] = counts
+
+
+def pytest_collection_finish() -> None:
+    """Let the garbage collector pass over what has been imported: it would look at all of it every few tests."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000, 20, 20)
 
 
 @cache

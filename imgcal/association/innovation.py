@@ -58,6 +58,7 @@ def innovations(
     count, cameras, fiducials = labels.shape
     radius_squared = np.zeros(fiducials) if problem.radius_squared is None else problem.radius_squared.numpy()
     noise, typical = blobs.noise
+    labels = np.ascontiguousarray(labels)
     shape = (count, cameras, fiducials)
     # Uninitialized: filled completely below, and may be many megabytes.
     squared, log_det, own = np.empty((*shape, blobs.uv.shape[1])), np.zeros(shape), np.full(shape, np.inf)

@@ -98,7 +98,7 @@ def outline(frame: Frame, screening: Screening, options: DetectionOptions, scale
     tile = np.zeros((screening.shape[0] + 2, screening.shape[1] + 2), np.int32)
     smooth = _smooth_tiles(frame, screening.blocks, tile, scale if options.polarity == "dark" else -1)
     labels = np.empty((count + 1, BLOCK, BLOCK), np.int32)
-    largest = 4 * options.radius_limit + 8  # includes merged blobs, which are reported
+    largest = 4.0 * options.radius_limit + 8  # includes merged blobs, which are reported
     level = screening.base + screening.excess
     raised, excess = np.arange(count), screening.excess
     for _ in range(LEVELS):

@@ -79,11 +79,12 @@ def measure(frame: Frame, candidates: Candidates, options: DetectionOptions, sca
     saturation = 0.995 * scale if options.saturation is None else options.saturation
     least = 0.0 if options.threshold is None else options.threshold
     limits = (least, options.min_radius, options.radius_limit, options.max_elongation)
+    # Options may be whole numbers: without `float`, the kernel would be compiled again for them.
     measure_all(
         frame,
         (candidates.tile, candidates.labels, boxes, candidates.label, candidates.whole),
-        (scale, scale if options.polarity == "dark" else -1, saturation),
-        limits,
+        (scale, scale if options.polarity == "dark" else -1, float(saturation)),
+        tuple(map(float, limits)),
         (blobs.uv, blobs.sigma, blobs.radius, blobs.contrast, blobs.flags, kept),
     )
     return blobs.select(_first(blobs, kept))

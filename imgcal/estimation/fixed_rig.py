@@ -71,7 +71,8 @@ def fit_pose(
     """
     seen = observations.seen.numpy()
     uv = np.ascontiguousarray(np.where(seen[..., None], observations.uv.numpy(), 0.0).swapaxes(-1, -2), np.float64)
-    weight = np.where(seen, 1 / np.where(seen, observations.sigma.numpy(), 1.0), 0.0).astype(np.float64)
+    weight = np.where(seen, 1 / np.where(seen, observations.sigma.numpy(), 1.0), 0.0)
+    weight = np.ascontiguousarray(weight, np.float64)
     points = points.double()
     centroid = points.mean(0)
     fixed_std = rig.focal_length.new_zeros(rig.num_cameras, 10 + rig.distortion.shape[-1]).double()
@@ -115,7 +116,7 @@ def _fit_pose(given, offset, poses, blocks, loss, threshold):
     """Run Levenberg-Marquardt on a pose. Returns the row of the best state, or -1 where the pose is not determined."""
     rotation, centre = poses
     camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual = blocks
-    own, steady = np.empty(0), np.empty((0, 0))
+    own, steady, cameras_first = np.empty(0), np.empty((0, 0)), np.bool_(False)  # no literal: that is a type of its own
     lower, step, turn, left = np.empty((6, 6)), np.empty(6), np.empty((3, 3)), np.empty((3, 3))
     damping, best, cost, gain = 0.0, 0, np.inf, np.inf
     for tried in range(MOST_STEPS + 1):
@@ -124,7 +125,7 @@ def _fit_pose(given, offset, poses, blocks, loss, threshold):
             camera[t], coupling[t], pose[t], border[t], camera_gradient[t], pose_gradient[t], own_gradient[t],
             residual[t],
         )  # fmt: skip
-        trial = linearize_rig(given, (offset, rotation[t], centre[t], own), row, False, loss, threshold, steady)
+        trial = linearize_rig(given, (offset, rotation[t], centre[t], own), row, cameras_first, loss, threshold, steady)
         if tried:
             if trial <= cost:
                 best, cost = t, trial

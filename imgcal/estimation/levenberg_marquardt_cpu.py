@@ -88,7 +88,7 @@ class RigSolver:
         self, problem: Problem, start: State, loss: str, threshold: float, max_iterations: int, tolerance: float
     ) -> Solution:
         """Do the work of `minimize` for a problem that differs from this one's in its observations."""
-        uv, root_weight = (array[0] for array in _arrays((problem.uv, problem.root_weight)))
+        uv, root_weight = (array[0] for array in _arrays((problem.uv, problem.root_weight.to(problem.uv))))
         offset = start.object_offset
         own = np.zeros_like(self._given[-1]) if offset is None else offset.detach().numpy()[0]
         first = (*(part.detach().numpy()[0] for part in (start.offset, start.rotation, start.centre)), own)
@@ -211,7 +211,7 @@ def _problem_arrays(problem: Problem) -> tuple[Tensor, ...]:
     factory = problem.factory
     pinhole = (factory.focal_length, factory.principal_point, factory.distortion)
     rig = (factory.cam_from_rig.rotation.detach(), camera_positions(factory), *pinhole)
-    return (problem.uv, problem.root_weight, *rig, problem.prior_std)
+    return (problem.uv, problem.root_weight.to(problem.uv), *rig, problem.prior_std)
 
 
 def camera_positions(rig: CameraRig) -> Tensor:
@@ -258,7 +258,8 @@ def _arrays(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:
 @njit(parallel=True, cache=True, fastmath=kernels.FAST)
 def _minimize_all(given, state, blocks, cost, converged, iterations, limits, tolerances):
     """Run Levenberg-Marquardt on all rigs of a batch; the outputs receive the best states and their equations."""
-    for b in prange(len(cost)):
+    for row in prange(len(cost)):
+        b = np.int64(row)  # as in `linearize_all`: for the unsigned number, all would be compiled once more
         own, found = select_state(state, b), select_blocks(blocks, b)
         offset, rotation, centre, own_offset = own
         camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual = found
@@ -310,9 +311,10 @@ def _minimize_rig(given, states, blocks, cost, converged, iterations, limits, to
     camera_step, pose_step = np.empty(camera_gradient.shape[1:], kind), np.empty(pose_gradient.shape[1:], kind)
     own_step = np.empty(own_gradient.shape[1], kind)
     rounding, steady = 4 * np.finfo(kind).eps, np.empty((0, 0))
-    damping, growth, relax, best = LEAST_DAMPING, FIRST_GROWTH, RELAX, 0
+    # A literal 0 is a type of its own: all that is called with it would be compiled twice.
+    damping, growth, relax, best = LEAST_DAMPING, FIRST_GROWTH, RELAX, np.int64(0)
     cost[0] = linearize_rig(
-        given, select_state(states, 0), select_blocks(blocks, 0), cameras_first, loss, threshold, steady
+        given, select_state(states, best), select_blocks(blocks, best), cameras_first, loss, threshold, steady
     )
     for iteration in range(max_iterations):
         iterations[0] = iteration + 1

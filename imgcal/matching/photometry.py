@@ -63,7 +63,8 @@ def measure_markers(
         return _nothing(len(expected), usual)
     half = min(max(math.ceil(2.2 * usual + 4), 5), LARGEST)
     grey, corner = _part(frame, expected[inside], 2 * half * float(scale.max()), dark)
-    start, sure = np.where(inside[:, None], expected - corner, 0.0), np.asarray(sure, dtype=bool)
+    start = np.ascontiguousarray(np.where(inside[:, None], expected - corner, 0.0))
+    sure = np.asarray(sure, dtype=bool)
     uv, found, misfit = np.empty_like(start), np.zeros((len(start), 5)), np.zeros(len(start))
     size = fit_camera(grey, start, inside, sure, scale, half, np.array(iterations), uv, found, misfit)
     if size == 0:

@@ -142,8 +142,9 @@ def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brou
     half, pull, distance = brought
     wide = len(prior)
     step, right, poses = np.empty(wide), np.empty(wide), np.empty(half.shape)
-    damping, best = 0.0, 0
-    cost = _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, 0, loss, threshold)
+    # A literal 0 is a type of its own: all that is called with it would be compiled twice.
+    damping, best = 0.0, np.int64(0)
+    cost = _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, best, loss, threshold)
     fresh = True
     for iteration in range(most):
         enough = tolerance * LOOSER ** max(0, iteration - LOOSEN_AFTER)
@@ -250,7 +251,7 @@ def _evaluate(shared, seen, known_rig, known, rigs, states, blocks, distance, b,
 def _linearize(given, state, centre, blocks, loss, threshold, shake):
     """Linearize one snapshot of an object or of lights; the number of axes of `centre` decides at compile time."""
     if centre.ndim == 2:
-        return linearize_rig(given, state, blocks, False, loss, threshold, shake)
+        return linearize_rig(given, state, blocks, np.bool_(False), loss, threshold, shake)
     (_, radius_squared, lenses, uv, root_weight, rotation, position, focal, principal, distortion, unit, _) = given
     camera, coupling, pose, _, camera_gradient, pose_gradient, _, residual = blocks
     lights = (

@@ -212,7 +212,7 @@ class RecentSnapshots:
     def screen(self) -> NDArray[np.float64]:
         """Score each camera since each of `SCREENED_AGES`: (ages, C); see `screen`."""
         scores = np.empty((len(SCREENED_AGES), len(self._change)))
-        known = (self._at, self._change.numpy(), PARTS)
+        known = (self._at, self._change.contiguous().numpy(), PARTS)
         screen(self._ring, self._totals, self._next, len(self), *known, SCREENED_AGES, scores)
         return scores
 

@@ -34,6 +34,7 @@ def near_prediction(blobs: Detections, predicted: NDArray[np.float64]) -> NDArra
     Fiducials with nearly coinciding predictions get no blob.
     """
     labels = np.full(len(blobs), -1, dtype=np.int64)
+    predicted = np.ascontiguousarray(predicted)  # in another order, kernels would be compiled again
     gaps = distances_to_nearest(predicted)
     reach = 0.25 * median(gaps)
     order = np.lexsort((blobs.uv[:, 0], blobs.camera))

@@ -93,10 +93,10 @@ def test_permuted_cameras_fiducials_and_blobs_give_permuted_votes_and_labels(o10
     assert (labels == snapshot.labels(blobs, 8)).mean() > 0.9
     random = np.random.default_rng(4)
     cameras, fiducials, slots = random.permutation(10), random.permutation(8), random.permutation(blobs.uv.shape[1])
-    parts = (part[cameras][:, slots] for part in (blobs.uv, blobs.ideal, blobs.sigma, blobs.radius, blobs.row))
+    parts = (part[cameras[:, None], slots] for part in (blobs.uv, blobs.ideal, blobs.sigma, blobs.radius, blobs.row))
     mixed = PaddedBlobs(*parts, blobs.count[cameras], blobs.rows)
     assert (blobs.count == blobs.uv.shape[1]).all()
-    shuffled = predicted[:, cameras][:, :, fiducials]
+    shuffled = np.ascontiguousarray(predicted[:, cameras][:, :, fiducials])
     other = vote(mixed, shuffled, 6.0, 60.0)
     np.testing.assert_array_equal(other.count, votes.count[:, cameras])
     np.testing.assert_array_equal(other.shift, votes.shift[:, cameras])

@@ -79,7 +79,7 @@ def test_equations_are_those_of_dense_derivatives(shake) -> None:
 def test_a_light_that_nobody_sees_says_nothing() -> None:
     rig = imgcal.load_rig("T4")
     places = np.array([[0.0, 0.0, 600.0], [0.0, 50.0, 600.0]])
-    uv, root = image(rig, places), np.array([[1.0, 0.0]] * 4)
+    uv, root = np.ascontiguousarray(image(rig, places)), np.array([[1.0, 0.0]] * 4)
     blocks = (
         np.empty((4, 15, 15)), np.full((6, 60), np.nan), np.full((6, 6), np.nan), np.empty((4, 15)), np.empty(6),
         np.empty((4, 2, 2)),
