@@ -50,9 +50,7 @@ MOST_KEPT_NUMBERS = 2**17
 """Random numbers cached for the next estimate of the same size: drawing them takes as long as using them."""
 
 
-def curvature_covariance(
-    estimate: Estimate, quantity: Callable[[CameraRig, Tensor], Tensor], flat: Tensor
-) -> Tensor:
+def curvature_covariance(estimate: Estimate, quantity: Callable[[CameraRig, Tensor], Tensor], flat: Tensor) -> Tensor:
     """Mean square of the second-order change of a quantity.
 
     Args:
