@@ -1,6 +1,9 @@
 """Resources of the machine that this process may use."""
 
+import contextlib
+import gc
 import os
+from collections.abc import Iterator
 
 
 def usable_cores() -> int:
@@ -13,3 +16,20 @@ def usable_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+@contextlib.contextmanager
+def without_garbage_collection() -> Iterator[None]:
+    """Pause the garbage collector, and leave out of later collections what is there by then.
+
+    For imports: the modules of a command stay until it ends, and looking for garbage among them takes a fifth of the
+    time that it takes to import them.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        if enabled:
+            gc.enable()

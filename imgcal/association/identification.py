@@ -75,6 +75,8 @@ def identify(
     candidates: Sequence[RigidTransform] = (),
     options: IdentityOptions = IdentityOptions(),
     guesses: Sequence[RigidTransform] = (),
+    *,
+    search: bool = True,
 ) -> Identity:
     """Label the blobs of one snapshot: try the candidate poses, then the guesses, then search for others.
 
@@ -88,6 +90,7 @@ def identify(
         options: how certain the result must be.
         guesses: rig_from_object that are mere guesses worth a try: a labelling found there must beat all rotations of
             the object, as one found without them.
+        search: search for others; without, at least one candidate or guess is needed.
 
     Returns:
         The decision; `Identity.accepted` tells whether the labels may be used.
@@ -101,6 +104,8 @@ def identify(
         if found.accepted and found.explained >= CONVINCING:
             return found
         partial = found if partial is None and found.accepted else partial
+    if not search:
+        return partial or found
     anew = _relocalize(scene, options)
     return partial if partial is not None and anew.explained <= partial.explained else anew
 

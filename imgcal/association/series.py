@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from imgcal.association.identity import PipelineOptions
 from imgcal.association.proposals import Sight
@@ -203,7 +204,7 @@ class _Series:
         patience = Patience(self.count)
         for number, s in enumerate(order):
             if self.coded[s] or patience.tries(number, self.tracker.in_vain):
-                self.decide(s)
+                self.decide(s, self._expected_pose(s))
             else:
                 self._not_tried(s)
 
@@ -214,14 +215,31 @@ class _Series:
         tracker.in_vain, tracker.looks_in_vain = 0, 0
         # Start with those nearest to accepted snapshots: they most probably show the object.
         for number, s in enumerate(sorted(incomplete, key=lambda s: _gap(s, accepted))):
-            first = self.results[s][0]
+            before = self.results[s]
+            first, known_rig = before[0], self.rigs.get(s) is tracker.rig
             if patience.tries(number, tracker.in_vain):
                 tracker.pose = self._nearest_pose(s, accepted) or tracker.pose
-                self.decide(s)
+                # With the same rig, another search for a pose would find as little as the first.
+                self.decide(s, search=first.status != "refused" or not known_rig)
             found, labels = self.results[s]
+            if found.status == "refused" and known_rig:
+                self.results[s] = before
             if first.status != "refused" and found.status != "refused":
                 # It helped to estimate the rig, so more labels with this rig do not make it more certain.
                 self.results[s] = replace(found, status=first.status, alternatives=first.alternatives), labels
+
+    def _expected_pose(self, s: int) -> RigidTransform | None:
+        """Pose of the object if it moves on; None where motion predicts the last snapshot no better than rest."""
+        before = (self.results.get(i) for i in range(s - 3, s))
+        first, second, third = (None if result is None else result[0].rig_from_object for result in before)
+        if first is None or second is None or third is None:
+            return None
+        points = self.tracker.obj.points.to(third.rotation)
+
+        def off(pose: RigidTransform) -> float:
+            return float((pose.apply(points) - third.apply(points)).norm(dim=-1).mean())
+
+        return _continue(second, third, points) if off(_continue(first, second, points)) < off(second) else None
 
     def _nearest_pose(self, s: int, accepted: NDArray[np.int64]) -> RigidTransform | None:
         """Pose of the nearest of the accepted snapshots, which may be the snapshot itself."""
@@ -233,8 +251,8 @@ class _Series:
         for s in sorted(refused, key=lambda s: _gap(s, accepted) if len(accepted) else s):
             self.look(s, sight)
 
-    def decide(self, s: int) -> None:
-        """Decide one snapshot by its given labels, its frames or its blobs."""
+    def decide(self, s: int, expected: RigidTransform | None = None, search: bool = True) -> None:
+        """Decide one snapshot by its given labels, its frames or its blobs; see `Tracker.decide`."""
         name = self.detections.snapshot_names[s]
         self.rigs[s] = self.tracker.rig
         if self.coded[s]:
@@ -242,7 +260,7 @@ class _Series:
         elif self.sight is not None and not self.sight.where_blobs_fail:
             self.look(s, self.sight)
         else:
-            self.results[s] = self.tracker.decide(self.detections.select(self.rows[s]), name)
+            self.results[s] = self.tracker.decide(self.detections.select(self.rows[s]), name, expected, search)
 
     def look(self, s: int, sight: Sight) -> None:
         """Decide one snapshot by its frames, as long as this is promising."""
@@ -308,6 +326,14 @@ def refuse_snapshots(labelled: Associations, rows: Sequence[int], reason: str) -
     detections = labelled.detections
     fiducial = np.where(np.isin(detections.snapshot, numbers), -1, detections.fiducial)
     return Associations(replace(detections, fiducial=fiducial), tuple(snapshots))
+
+
+def _continue(before: RigidTransform, last: RigidTransform, points: Tensor) -> RigidTransform:
+    """Pose after the motion between two snapshots has happened once more, about the centroid of points (N, 3)."""
+    centre = points.mean(0, keepdim=True)
+    rotation = last.rotation @ before.rotation.mT @ last.rotation
+    there = 2 * last.apply(centre)[0] - before.apply(centre)[0]
+    return RigidTransform(rotation, there - rotation @ centre[0])
 
 
 def _gap(snapshot: int, accepted: NDArray[np.int64]) -> int:

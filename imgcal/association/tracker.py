@@ -127,9 +127,11 @@ class Tracker:
         few = self._too_few(name, labels)
         return few or SnapshotIdentity(name, "coded", "labelled in the input", 1, None), labels
 
-    def decide(self, blobs: Detections, name: str) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
-        """Label the blobs of one snapshot."""
-        return self._conclude(self._identify(blobs), blobs, name)
+    def decide(
+        self, blobs: Detections, name: str, expected: RigidTransform | None = None, search: bool = True
+    ) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
+        """Label the blobs of one snapshot; `expected` and `search` as for `propose`."""
+        return self._conclude(self._adopt(self.propose(blobs, expected, search)), blobs, name)
 
     def look(
         self, sight: Sight, number: int, blobs: Detections, name: str
@@ -203,14 +205,21 @@ class Tracker:
     def _identify(self, blobs: Detections) -> Identity:
         return self._adopt(self.propose(blobs))
 
-    def propose(self, blobs: Detections) -> Identity:
-        """Label the blobs of one snapshot without changing the state."""
+    def propose(self, blobs: Detections, expected: RigidTransform | None = None, search: bool = True) -> Identity:
+        """Label the blobs of one snapshot without changing the state.
+
+        Args:
+            blobs: of the snapshot.
+            expected: pose to try before the last one.
+            search: also search for a pose elsewhere.
+        """
         error = np.hypot(self.options.identity_error, self._tolerance_px(blobs))
         blobs = replace(blobs, sigma=np.hypot(blobs.sigma, error))
-        known = [] if self.pose is None else [self.pose]
+        known = [pose for pose in (expected, self.pose) if pose is not None]
         # In many captures the object is at the origin of the rig's frame; this is cheap to try first.
         guesses = [] if known else [RigidTransform.identity(dtype=self.rig.focal_length.dtype)]
-        return identify(blobs, self.rig, self.obj, self.prior_std, known, self.options.identity, guesses)
+        options = self.options.identity
+        return identify(blobs, self.rig, self.obj, self.prior_std, known, options, guesses, search=search)
 
     def conclude(self, proposed: Identity, blobs: Detections, name: str) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
         """Update the state with the result of `propose` for these blobs."""

@@ -14,17 +14,21 @@ from imgcal.machine import usable_cores
 
 HINT = "compiling for this machine: 10 to 60 s, once; `imgcal warmup` compiles everything ahead of time"
 WAIT = "waiting for another process that compiles for this machine"
-HELP = "from imgcal.online import warm_up_fits; warm_up_fits()"
+HELP = """
+from imgcal.machine import without_garbage_collection
+with without_garbage_collection():
+    from imgcal.online import warm_up_fits
+warm_up_fits()
+"""
 NEEDED_LAST = "levenberg_marquardt_cpu.*"  # files of the cache that show that there is nothing to help with
 
 
 @contextlib.contextmanager
-def announce_compilation(hint: str = HINT, helped: bool = False) -> Iterator[list[object]]:
+def announce_compilation(hint: str = HINT) -> Iterator[list[object]]:
     """Print a notice on standard error when the first function is compiled, here or in another process.
 
     Args:
         hint: what to say.
-        helped: compile in a second process what a calibration needs last, while this one compiles what it needs first.
 
     Yields:
         A list that gets an entry for each function that is compiled.
@@ -37,15 +41,10 @@ def announce_compilation(hint: str = HINT, helped: bool = False) -> Iterator[lis
 
     from renderers.compiling import WAITING
 
-    helpers: list[subprocess.Popen[bytes]] = []
-
     class Told(event.Listener):
         def on_start(self, happening: event.Event) -> None:
             if not compiled:
                 print(f"imgcal: {hint}", file=sys.stderr, flush=True)
-                if helped and is_useful():
-                    with contextlib.suppress(OSError):  # alone, then
-                        helpers.append(start_helper())
             compiled.append(happening.data)
 
         def on_end(self, happening: event.Event) -> None:
@@ -70,17 +69,33 @@ def announce_compilation(hint: str = HINT, helped: bool = False) -> Iterator[lis
     finally:
         for kind, listener in listeners.items():
             event.unregister(kind, listener)
-        for helper in helpers:  # what is not done by now is not needed
+
+
+@contextlib.contextmanager
+def help_to_compile() -> Iterator[None]:
+    """Compile in a second process what a calibration needs last, while this one imports and compiles what comes first.
+
+    The second process ends with the context: what it has not compiled by then is not needed.
+    """
+    helper = None
+    if is_useful():
+        with contextlib.suppress(OSError):  # alone, then
+            helper = start_helper()
+    try:
+        yield
+    finally:
+        if helper is not None:
             helper.terminate()
             helper.wait()
 
 
 def is_useful() -> bool:
     """Tell whether a second process can compile beside this one, and leave it where this one finds it."""
+    if not sys.executable or usable_cores() - _load() <= 1:
+        return False
     from renderers.compiling import cache_folder, is_shared
 
-    idle = usable_cores() - _load() > 1
-    return bool(idle and sys.executable and is_shared() and not any(Path(cache_folder()).rglob(NEEDED_LAST)))
+    return is_shared() and not any(Path(cache_folder()).rglob(NEEDED_LAST))
 
 
 def _load() -> float:

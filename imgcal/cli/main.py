@@ -21,10 +21,11 @@ from typing import Annotated, Any, Protocol, Union, get_type_hints
 import tyro
 
 import imgcal
-from imgcal.cli.compiling import announce_compilation
+from imgcal.cli.compiling import announce_compilation, help_to_compile
 from imgcal.cli.interruption import end_at_once
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice
+from imgcal.machine import without_garbage_collection
 from imgcal.messages import one_line, quote, shorten
 
 ONE_OF = {"calibrate": ("--rig", "--cameras")}
@@ -63,9 +64,10 @@ def main(arguments: list[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     debug = DEBUG in given
     try:
-        command = parse([argument for argument in given if argument != DEBUG])
-        helped = "calibrate" in given[:2]
-        with announce_compilation(helped=helped) if "warmup" not in given[:2] else contextlib.nullcontext():
+        with contextlib.ExitStack() as stack:
+            command = parse([argument for argument in given if argument != DEBUG], stack)
+            if "warmup" not in given[:2]:
+                stack.enter_context(announce_compilation())
             command.run()
     except SystemExit as stop:  # help was asked for
         return DONE if stop.code is None else int(stop.code)
@@ -81,8 +83,12 @@ def main(arguments: list[str] | None = None) -> int:
     return DONE
 
 
-def parse(arguments: list[str]) -> Runnable:
+def parse(arguments: list[str], stack: contextlib.ExitStack | None = None) -> Runnable:
     """Turn a command line into its command; imports that command alone, once its arguments are understood.
+
+    Args:
+        arguments: the command line.
+        stack: gets what helps the command until it ends; None = no help.
 
     Raises:
         InputError: the command line is not understood.
@@ -93,14 +99,14 @@ def parse(arguments: list[str]) -> Runnable:
     drawn = io.StringIO()
     try:
         with contextlib.redirect_stderr(drawn):
-            return _parse(arguments)
+            return _parse(arguments, stack)
     except SystemExit as stop:
         if stop.code in (None, DONE):
             raise
         raise InputError(_strip_boxes(drawn.getvalue(), arguments)) from None
 
 
-def _parse(arguments: list[str]) -> Runnable:
+def _parse(arguments: list[str], stack: contextlib.ExitStack | None) -> Runnable:
     if not arguments:
         raise InputError(f"no command given, expected one of {', '.join(COMMANDS)}; see imgcal --help")
     first = arguments[0]
@@ -113,7 +119,9 @@ def _parse(arguments: list[str]) -> Runnable:
             _join_help_lines()
         given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=options)
         _check_values(given, options)
-        with end_at_once():  # imports take a while
+        with end_at_once(), without_garbage_collection():  # imports take a while
+            if first == "calibrate" and stack is not None:
+                stack.enter_context(help_to_compile())
             command = getattr(import_module(f"imgcal.cli.{first}"), first.capitalize())
         return command(**vars(given))
     # The shell's completion knows the options of every command; all else ends here, and names and summaries will do.

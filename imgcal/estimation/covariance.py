@@ -71,7 +71,7 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
     if not curved:
         return result
     centre = estimate.rig.reshape(len(covariance)).map_tensors(lambda tensor, _: tensor.unsqueeze(1))
-    return result + curvature_covariance(estimate, lambda rigs, _: rigs.local(centre).flatten(-2))
+    return result + curvature_covariance(estimate, lambda rigs, _: rigs.local(centre).flatten(-2), result)
 
 
 def _by_modes(estimate: Estimate) -> Tensor:
@@ -355,7 +355,8 @@ def relative_covariance(estimate: Estimate, reference: int = 0) -> Tensor:
     def relative(rigs: CameraRig, _: Tensor) -> Tensor:
         return relative_difference(rigs, centre, reference).flatten(-2)
 
-    return jacobian @ covariance @ jacobian.mT + curvature_covariance(estimate, relative)
+    flat = jacobian @ covariance @ jacobian.mT
+    return flat + curvature_covariance(estimate, relative, flat)
 
 
 def relative_jacobian(rig: CameraRig, reference: int) -> Tensor:
@@ -487,4 +488,4 @@ def object_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
     if not curved:
         return flat
     centre = points_at(problem, estimate.solution.state).unsqueeze(1)
-    return flat + curvature_covariance(estimate, lambda _, points: (points - centre).flatten(-2))
+    return flat + curvature_covariance(estimate, lambda _, points: (points - centre).flatten(-2), flat)

@@ -41,27 +41,41 @@ from imgcal.estimation.map_estimate import Estimate
 from imgcal.types import CameraRig
 
 MOST_PAIRS, LEAST_PAIRS = 256, 64
-"""Pairs drawn for one snapshot, and for many, where the posterior is narrow and hardly curved."""
+"""Pairs drawn for one snapshot of a curved posterior, and for many snapshots, where it is narrow and hardly curved."""
+SLIGHT = 0.1
+"""Share of the variance up to which the second order is slight: the least number of pairs is then precise enough."""
 AT_ONCE, POINTS_AT_ONCE = 16, 2**16
 """Pairs that are projected together; more as long as they have at most this many points in all."""
 MOST_KEPT_NUMBERS = 2**17
 """Random numbers cached for the next estimate of the same size: drawing them takes as long as using them."""
 
 
-def curvature_covariance(estimate: Estimate, quantity: Callable[[CameraRig, Tensor], Tensor]) -> Tensor:
+def curvature_covariance(estimate: Estimate, quantity: Callable[[CameraRig, Tensor], Tensor], flat: Tensor) -> Tensor:
     """Mean square of the second-order change of a quantity.
 
     Args:
         estimate: with batch axes *B.
         quantity: maps rigs (B, K) and their fiducials about the object's centroid (B, K, N, 3) mm to numbers (B, K, Q),
             zero for the estimate itself.
+        flat: (*B, Q, Q) covariance of the quantity in the Gaussian posterior: the less the posterior is curved, the
+            fewer pairs are drawn.
 
     Returns:
-        (*B, Q, Q), positive semidefinite: to be added to the covariance of the Gaussian posterior.
+        (*B, Q, Q), positive semidefinite: to be added to `flat`.
     """
+    pairs = MOST_PAIRS // estimate.problem.uv.shape[1]
+    found = _mean_square(estimate, quantity, LEAST_PAIRS)
+    if pairs > LEAST_PAIRS:
+        variance, added = (matrix.diagonal(dim1=-2, dim2=-1) for matrix in (flat, found))
+        if bool((added > SLIGHT * variance).any()):
+            return _mean_square(estimate, quantity, pairs)
+    return found
+
+
+def _mean_square(estimate: Estimate, quantity: Callable[[CameraRig, Tensor], Tensor], pairs: int) -> Tensor:
+    """Average the square (*B, Q, Q) of the second-order change of a quantity over pairs of steps."""
     problem, solution = estimate.problem, estimate.solution
     factorization = solution.factorization
-    pairs = max(LEAST_PAIRS, MOST_PAIRS // problem.uv.shape[1])
     x = _draw(factorization, solution.state, pairs)
     follow = _follow(problem, solution.state, factorization, x)
     there, back = quantity(*_step_rigs(problem, solution.state, _both_ways(x), follow)).chunk(2, dim=1)

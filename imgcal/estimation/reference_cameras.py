@@ -94,7 +94,7 @@ class Gauge:
         covariance = jacobian @ camera_covariance(estimate, curved=False) @ jacobian.mT
         centre = estimate.rig.reshape(1).map_tensors(lambda tensor, _: tensor.unsqueeze(1))
         covariance = covariance + curvature_covariance(
-            estimate, lambda rigs, _: self.difference(rigs, centre).flatten(-2)
+            estimate, lambda rigs, _: self.difference(rigs, centre).flatten(-2), covariance
         )
         return self._root(covariance.diagonal())
 

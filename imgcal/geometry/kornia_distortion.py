@@ -1,10 +1,11 @@
-"""Kornia's distortion functions on the z = 1 plane; the formulas of the lens models are compared with them."""
+"""Kornia's distortion functions on the z = 1 plane; the formulas of the lens models are compared with them.
+
+Kornia is imported where it is used: it is slow to import, and only training needs it.
+"""
 
 from __future__ import annotations
 
 import torch
-from kornia.geometry.calibration import distort_points
-from kornia.geometry.camera import distort_points_kannala_brandt
 from torch import Tensor
 
 
@@ -13,6 +14,8 @@ def opencv_distortion(xy: Tensor, coefficients: Tensor) -> Tensor:
 
     Source: kornia.geometry.calibration.distort_points (kornia 0.9), which takes pixels.
     """
+    from kornia.geometry.calibration import distort_points
+
     eye = torch.eye(3, dtype=xy.dtype, device=xy.device).expand(len(xy), 3, 3)
     return distort_points(xy, eye, coefficients, new_K=eye)
 
@@ -22,6 +25,8 @@ def kannala_brandt_distortion(xy: Tensor, coefficients: Tensor) -> Tensor:
 
     Source: kornia.geometry.camera.distort_points_kannala_brandt (kornia 0.9), which returns pixels.
     """
+    from kornia.geometry.camera import distort_points_kannala_brandt
+
     affine = coefficients.new_tensor([1.0, 1.0, 0.0, 0.0]).expand(len(coefficients), 4)
     parameters = torch.cat((affine, coefficients), dim=-1).unsqueeze(1)
     return distort_points_kannala_brandt(xy, parameters.expand(*xy.shape[:2], 8))

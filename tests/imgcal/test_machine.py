@@ -1,6 +1,9 @@
+import gc
 import os
 
-from imgcal.machine import usable_cores
+import pytest
+
+from imgcal.machine import usable_cores, without_garbage_collection
 
 
 def test_a_system_that_does_not_say_lets_all_cores_be_used(monkeypatch):
@@ -11,3 +14,17 @@ def test_a_system_that_does_not_say_lets_all_cores_be_used(monkeypatch):
     assert usable_cores() == 7
     monkeypatch.setattr(os, "cpu_count", lambda: None)
     assert usable_cores() == 1
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_garbage_is_collected_again_after_a_pause(enabled):
+    before = gc.isenabled()
+    (gc.enable if enabled else gc.disable)()
+    try:
+        with pytest.raises(ImportError), without_garbage_collection():
+            assert not gc.isenabled()
+            raise ImportError
+        assert gc.isenabled() == enabled and gc.get_freeze_count() > 0
+    finally:
+        gc.unfreeze()
+        (gc.enable if before else gc.disable)()

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association import associate, identify, match_to_rig, series, to_observations, tracker
+from imgcal.association import associate, identification, identify, match_to_rig, series, to_observations, tracker
 from imgcal.errors import InputError, RefusedError
+from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from imgcal.types import CalibrationObject
 
@@ -141,10 +142,10 @@ def trackers(monkeypatch) -> list:
             self.tried, self.starts = [], []
             made.append(self)
 
-        def decide(self, blobs, name):
+        def decide(self, blobs, name, *how):
             self.tried.append(name)
             self.starts.append(self.pose)
-            return super().decide(blobs, name)
+            return super().decide(blobs, name, *how)
 
     monkeypatch.setattr(series, "Tracker", Kept)
     return made
@@ -172,3 +173,39 @@ def test_stray_lights_are_looked_at_again_only_with_a_better_rig(o10, asymmetric
     labelled = associate(without_labels(kept), o10, asymmetric8)
     assert labelled.used == [0, 1, 2, 3, 4]
     assert trackers[0].tried[5:] == [seen.snapshot_names[1]]
+
+
+def turning(obj, distance: float, rad: float, count: int) -> RigidTransform:
+    """Poses of an object that turns about its centroid by the same angle from snapshot to snapshot."""
+    axis = torch.tensor([0.3, 0.2, 1.0]).double()
+    rotation = rotation_from_vector(rad * torch.arange(count).double()[:, None] * axis / axis.norm())
+    there = torch.tensor([0.0, 0.0, distance]).double()
+    return RigidTransform(rotation, there - rotation @ obj.points.double().mean(0))
+
+
+@pytest.fixture
+def searches(monkeypatch) -> list:
+    """One entry for each search for a pose."""
+    made = []
+    search = identification._relocalize
+    monkeypatch.setattr(identification, "_relocalize", lambda *given: made.append(0) or search(*given))
+    return made
+
+
+def test_an_object_that_moves_on_is_followed_not_searched_for(o10, asymmetric8, searches):
+    truth = simulate_truth(o10, asymmetric8, 10, torch.Generator().manual_seed(0), None)
+    poses = turning(asymmetric8, o10.working_distance, 0.5, 10)
+    uv = truth.rig.expand(10).project(poses.apply(asymmetric8.points.double())).uv
+    seen = true_detections(replace(truth, rig_from_object=poses, uv=uv))
+    found = associate(without_labels(seen), o10, asymmetric8)
+    assert np.array_equal(found.detections.fiducial, seen.fiducial)
+    assert len(searches) <= 4  # until three snapshots show how it moves
+
+
+def test_a_refused_snapshot_is_searched_again_only_with_a_better_rig(seen, o10, asymmetric8, searches):
+    noise = np.random.default_rng(0).uniform(0, 1000, seen.uv.shape)
+    for number, times in ((3, 4), (1, 5)):  # each is searched once, and the second again: the third changes the rig
+        uv = np.where((seen.snapshot == number)[:, None], noise, seen.uv)
+        before = len(searches)
+        assert number not in associate(without_labels(replace(seen, uv=uv)), o10, asymmetric8).used
+        assert len(searches) - before == times

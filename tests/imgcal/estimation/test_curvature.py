@@ -10,6 +10,7 @@ from imgcal.estimation.curvature import curvature_covariance
 from imgcal.synthesis import PhysicalDrift, RelativeDrift
 
 SQUARED = EstimationOptions(loss="squared")
+NARROW, WIDE = torch.zeros(1, 1), torch.full((1, 1), 1e9)  # Gaussian posteriors
 
 
 def at_truth(simulate, scale: float, tolerance: float | None = None):
@@ -32,7 +33,7 @@ def pixels(found):
 @pytest.mark.parametrize("tolerance", [None, 0.3])
 def test_it_is_of_fourth_order_in_noise_and_prior(simulate, tolerance) -> None:
     large, small = (at_truth(simulate, scale, tolerance) for scale in (1.0, 0.1))
-    one, other = (curvature_covariance(found, pixels(found)) for found in (large, small))
+    one, other = (curvature_covariance(found, pixels(found), NARROW) for found in (large, small))
     assert one.shape == (2, 6, 6)
     trace, less = (part.diagonal(dim1=-2, dim2=-1).sum(-1) for part in (one, other))
     assert (trace > 0).all()
@@ -41,23 +42,32 @@ def test_it_is_of_fourth_order_in_noise_and_prior(simulate, tolerance) -> None:
 
 def test_it_is_a_covariance_and_always_the_same(simulate) -> None:
     found = at_truth(simulate, 1.0)
-    one = curvature_covariance(found, pixels(found))
+    one = curvature_covariance(found, pixels(found), NARROW)
     torch.testing.assert_close(one, one.mT)
     assert torch.linalg.eigvalsh(one).min() > -1e-9 * one.abs().max()
-    assert torch.equal(one, curvature_covariance(found, pixels(found)))
+    assert torch.equal(one, curvature_covariance(found, pixels(found), NARROW))
 
 
 def test_what_nothing_moves_has_none_and_what_moves_twice_as_much_has_four_times_as_much(simulate) -> None:
     found = at_truth(simulate, 1.0)
-    nothing = curvature_covariance(found, lambda rigs, _: torch.zeros(*rigs.focal_length.shape[:2], 4).double())
+    nothing = curvature_covariance(found, lambda rigs, _: torch.zeros(*rigs.focal_length.shape[:2], 4).double(), WIDE)
     assert not nothing.any()
     point = pixels(found)
-    doubled = curvature_covariance(found, lambda rigs, points: 2 * point(rigs, points))
-    torch.testing.assert_close(doubled, 4 * curvature_covariance(found, point))
+    doubled = curvature_covariance(found, lambda rigs, points: 2 * point(rigs, points), NARROW)
+    torch.testing.assert_close(doubled, 4 * curvature_covariance(found, point, NARROW))
 
 
 def test_numbers_too_many_to_keep_are_drawn_again(simulate, monkeypatch) -> None:
     found = at_truth(simulate, 1.0)
-    kept = curvature_covariance(found, pixels(found))
+    kept = curvature_covariance(found, pixels(found), NARROW)
     monkeypatch.setattr(curvature, "MOST_KEPT_NUMBERS", 0)
-    assert torch.equal(kept, curvature_covariance(found, pixels(found)))
+    assert torch.equal(kept, curvature_covariance(found, pixels(found), NARROW))
+
+
+def test_fewer_pairs_serve_where_the_posterior_is_hardly_curved(simulate, monkeypatch) -> None:
+    found = at_truth(simulate, 1.0)
+    precise, rough = (curvature_covariance(found, pixels(found), flat) for flat in (NARROW, WIDE))
+    torch.testing.assert_close(rough.diagonal(dim1=1, dim2=2), precise.diagonal(dim1=1, dim2=2), rtol=0.5, atol=0)
+    assert not torch.equal(rough, precise)
+    monkeypatch.setattr(curvature, "MOST_PAIRS", curvature.LEAST_PAIRS)
+    assert torch.equal(rough, curvature_covariance(found, pixels(found), NARROW))
