@@ -293,7 +293,7 @@ class RigMonitor:
         excluded = {Steady.name: "a test of every camera has excluded it"}
         if pending is not None and free:
             excluded[ObjectChanged.name] = "a change of a camera is pending"
-        free, evidence = changed_cameras(self._recent.test(age), free, self.noise.least_shifts)
+        free, evidence = changed_cameras(self._recent, age, free, self.noise.episode, self.noise.least_shifts)
         self.undecided |= dict.fromkeys(free, UNDECIDED_SNAPSHOTS)
         if self._is_new(age):
             excluded[ObjectChanged.name] = "too little was known before"

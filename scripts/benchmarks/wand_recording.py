@@ -186,7 +186,7 @@ def recording(arrangement: Arrangement = Arrangement()) -> Recording:
         kept = detections.select(np.isin(detections.camera, index))
         new = np.full(factory.num_cameras, -1)
         new[index] = np.arange(len(index))
-        detections = replace(kept, camera=new[kept.camera])
+        detections = replace(kept, camera=new[kept.camera], camera_names=arrangement.only)
         factory = factory.select(index)
     frames = np.array([int(name) for name in detections.snapshot_names])
     given = Recording(detections, frames, factory, obj)
