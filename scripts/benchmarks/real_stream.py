@@ -1,11 +1,12 @@
 """Targets for a running rig on the real stream: untouched, and with one camera rotated.
 
 Run as `python -m scripts.benchmarks.real_stream`. A calibration uses every eighth of frames 0-2399; the keeper starts
-from it and follows frames 2400-4799. `--arrangement.calibrate 2400:4800 --arrangement.follow 0:2400` turns them round,
-`--arrangement.follow 4800:2400` plays them backwards, and `--arrangement.only cam01 cam04 cam08` leaves out all other
-cameras; `--out` must name the result then. Nothing moved in this recording, so every event except a loss of the wand is
+from it and follows frames 2400-4799. Nothing moved in this recording, so every event except a loss of the wand is
 false. A rotation can only be detected while the camera sees the wand, so delays count only that time. Finished runs of
 the same code are not repeated (`out/work/real_stream`). The result is written after each case.
+
+Other arrangements of the recording, whose results `--out` must name: `--calibrate 2400:4800 --follow 0:2400` turns its
+halves round, `--follow 4800:2400` plays frames backwards, `--only cam01 cam04 cam08` leaves out all other cameras.
 
 With `--lights`, the wand is unknown: its markers are separate lights at unknown positions. With `--stick 0 1 2`, the
 distances of these markers are known, and the others are lights.
@@ -306,7 +307,7 @@ class Options:
     fresh: bool = False  #: calibrate again instead of using the cached calibration
     lights: bool = False  #: follow the markers as unknown lights
     stick: tuple[int, ...] = ()  #: markers of the wand whose distances are known; the others are lights
-    arrangement: Arrangement = Arrangement()
+    arrangement: tyro.conf.OmitArgPrefixes[Arrangement] = Arrangement()
     out: Path | None = None  #: default: docs/benchmarks/real_stream.json, ..._lights.json or ..._stick_0_1_2.json
 
 
