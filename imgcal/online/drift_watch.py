@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from imgcal.estimation import Gauge
-from imgcal.geometry import undistort
 from imgcal.monitoring import CHANGES, RigBelief
 from imgcal.online.events import ChangeKind, Event
 from imgcal.online.relearning import relative_std
@@ -23,11 +22,9 @@ LEAST_DRIFT = {"rotation": math.radians(0.05), "position": 0.5, "focal_length": 
 DRIFT_SIGMAS = 5.0
 """Significance of the drift, in standard deviations of the values at the start of the measurement."""
 LEAST_SEEN = 0.5
-"""Image shift by the change of all values of a camera, relative to that by the drift alone. A drift shifts the image;
-values that change together so that it hardly moves are being learnt better, such as a focal length and a distortion
-where the lens has shown few labels before."""
-IMAGE_GRID = 9
-"""Points along each side of the image at which its shift is measured."""
+"""Shift of the labels' places by the change of all values of a camera, relative to that by the drift alone. A drift
+shifts them; values that change together so that they hardly move are being learnt better, such as a focal length and a
+distortion where the lens had shown few labels."""
 HOW = {
     "rotation": "has slowly turned by",
     "position": "has slowly shifted by",
@@ -48,14 +45,14 @@ class DriftWatch:
     unsettled: frozenset[int] = frozenset()  # cameras unsettled at any time since the last check
 
     def observe(
-        self, belief: RigBelief, unsettled: frozenset[int], place: Tensor, time: float, number: int
+        self, belief: RigBelief, unsettled: frozenset[int], points: Callable[[int], Tensor], time: float, number: int
     ) -> list[Event]:
         """Return the cameras that have drifted.
 
         Args:
             belief: the current belief.
             unsettled: cameras that moved and have not been relearnt, or that do not see the object.
-            place: (3,) mm, where the object is.
+            points: where a camera has lately seen the object: (P, 3) mm.
             time: s since the epoch.
             number: of the update.
         """
@@ -73,7 +70,7 @@ class DriftWatch:
         for camera in range(len(self.names)):
             if camera in unsettled:
                 continue
-            found = self._largest(camera, change[camera], torch.maximum(self.std, std)[camera], place)
+            found = self._largest(camera, change[camera], torch.maximum(self.std, std)[camera], points)
             if found is not None:
                 events.append(self._event(camera, *found, std[camera], time, number))
                 restarted.add(camera)
@@ -82,7 +79,9 @@ class DriftWatch:
         self._begin(restarted, belief, std, time)
         return events
 
-    def _largest(self, camera: int, change: Tensor, std: Tensor, place: Tensor) -> tuple[ChangeKind, float] | None:
+    def _largest(
+        self, camera: int, change: Tensor, std: Tensor, points: Callable[[int], Tensor]
+    ) -> tuple[ChangeKind, float] | None:
         """Most significant kind of change and its size, or None if none is worth a report."""
         assert self.reference is not None
         best: tuple[float, ChangeKind, float] | None = None
@@ -95,8 +94,10 @@ class DriftWatch:
             return None
         alone = torch.zeros_like(change)
         alone[CHANGES[best[1]]] = change[CHANGES[best[1]]]
-        together, by_itself = _image_shifts(self.reference.select([camera]), torch.stack((change, alone)), place)
-        return best[1:] if together >= LEAST_SEEN * by_itself else None
+        together, by_itself = _image_shifts(
+            self.reference.select([camera]), torch.stack((change, alone)), points(camera)
+        )
+        return best[1:] if together > LEAST_SEEN * by_itself else None
 
     def _event(self, camera: int, kind: ChangeKind, size: float, std: Tensor, time: float, number: int) -> Event:
         name = self.names[camera]
@@ -120,16 +121,10 @@ class DriftWatch:
         self.since |= dict.fromkeys(chosen, time)
 
 
-def _image_shifts(camera: CameraRig, changes: Tensor, place: Tensor) -> list[float]:
-    """Median shift of a camera's image (px) by changes (M, K) of its values, as far away as the object at a place."""
-    distance = (camera.positions[0] - place).norm()
-    rows, columns = (size * torch.linspace(0, 1, IMAGE_GRID) for size in camera.image_size[0].flip(0).double())
-    uv = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).flatten(0, 1)
-    on_plane, good = undistort(
-        ((uv - camera.principal_point) / camera.focal_length)[None], camera.distortion, camera.lens_model
-    )
-    rays = torch.cat((on_plane, torch.ones_like(on_plane[..., :1])), -1)[:, good[0]]
-    points = camera.cam_from_rig.inverse().apply(distance * rays)
+def _image_shifts(camera: CameraRig, changes: Tensor, points: Tensor) -> list[float]:
+    """Median shift of points (P, 3) in a camera's image (px) by changes (M, K) of its values; zeros without points."""
+    if not len(points):
+        return [0.0] * len(changes)
     steps = torch.cat((torch.zeros_like(changes[:1]), changes))[:, None]
     uv = camera.expand(len(steps)).retract(steps).project_values(points.expand(len(steps), -1, -1), None).uv[:, 0]
     return [float(shift) for shift in (uv[1:] - uv[:1]).norm(dim=-1).median(-1).values]
