@@ -201,7 +201,8 @@ def _relocalize(scene: Scene, options: IdentityOptions) -> Identity:
             result = _decide(scene, fits, options, known_pose=False)
             # If two labellings explain enough, more hypotheses will not separate them.
             undecided += result.undecided
-        if result.accepted or undecided == PATIENCE or search.hypotheses > options.most_hypotheses:
+        enough = undecided == PATIENCE or search.exhausted or search.hypotheses > options.most_hypotheses
+        if result.accepted or enough:
             break
     if compared is not None and not result.accepted:
         result = compared

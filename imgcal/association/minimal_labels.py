@@ -87,23 +87,36 @@ def compare_labellings(scene: Scene, options: IdentityOptions) -> Identity:
 
 
 def _compare(scene: Scene) -> _Compared:
-    """Fit every labelling from its best pose and, for a planar object, from its mirror image."""
-    camera, fiducials = int(scene.blobs.count.argmax()), scene.obj.num_fiducials
-    blobs = int(scene.blobs.count[camera])
+    """Fit every labelling from its best pose and, for a planar object, from its mirror image.
+
+    The other cameras have no labels, so they stay where their prior says.
+    """
+    camera = int(scene.blobs.count.argmax())
+    fitted = _compare_alone(scene.select_camera(camera))
+    fits, cameras = fitted.fits, scene.rig.num_cameras
+    labels = np.full((len(fits.labels), cameras, scene.obj.num_fiducials), -1, dtype=np.int64)
+    offset = fits.state.offset.new_zeros(len(labels), *scene.std.shape)
+    labels[:, camera], offset[:, camera] = fits.labels[:, 0], fits.state.offset[:, 0]
+    return replace(fitted, fits=replace(fits, labels=labels, state=replace(fits.state, offset=offset)))
+
+
+def _compare_alone(scene: Scene) -> _Compared:
+    """Do the same for a single camera."""
+    blobs, fiducials = int(scene.blobs.count[0]), scene.obj.num_fiducials
     chosen = np.array(list(permutations(range(max(blobs, fiducials)), min(blobs, fiducials))))  # (K, n)
-    labels = np.full((len(chosen), scene.rig.num_cameras, fiducials), -1, dtype=np.int64)
+    labels = np.full((len(chosen), 1, fiducials), -1, dtype=np.int64)
     if blobs >= fiducials:
-        labels[:, camera] = chosen
+        labels[:, 0] = chosen
     else:
-        labels[np.arange(len(chosen))[:, None], camera, chosen] = np.arange(blobs)
+        labels[np.arange(len(chosen))[:, None], 0, chosen] = np.arange(blobs)
     seen = torch.from_numpy(labels >= 0)[:, None]
-    uv = torch.from_numpy(scene.blobs.uv[np.arange(scene.rig.num_cameras)[:, None], np.maximum(labels, 0)])[:, None]
+    uv = torch.from_numpy(scene.blobs.uv[0, np.maximum(labels, 0)])[:, None]
     sigma = torch.ones(seen.shape, dtype=uv.dtype)
     found = initial_pose(Observations(uv, sigma, seen), scene.rig, scene.obj)[:, 0]
     poses = Poses(found.rotation.numpy(), found.translation.numpy())
     fitted = _minimize(scene, start(scene, poses, labels))
     if scene.obj.planar:
-        fitted = _better(fitted, _minimize(scene, start(scene, _mirror(scene, poses, camera), labels)))
+        fitted = _better(fitted, _minimize(scene, start(scene, _mirror(scene, poses), labels)))
     return fitted
 
 
@@ -132,13 +145,13 @@ def _minimize(scene: Scene, fits: Fits) -> _Compared:
     return _Compared(replace(fits, state=solution.state, cost=cost), cost, off)
 
 
-def _mirror(scene: Scene, poses: Poses, camera: int) -> Poses:
-    """Poses (K,) of a planar object that look almost alike from a camera: mirrored in depth about the view."""
+def _mirror(scene: Scene, poses: Poses) -> Poses:
+    """Poses (K,) of a planar object that look almost alike from the camera: mirrored in depth about the view."""
     points = scene.obj.points.double().numpy()
     centroid = points.mean(0)
     normal = np.linalg.svd(points - centroid)[2][2]
     centre = poses.rotation @ centroid + poses.translation
-    view = centre - scene.rig.positions[camera].numpy()
+    view = centre - scene.rig.positions[0].numpy()
     view /= np.linalg.norm(view, axis=1, keepdims=True)
     flip = np.eye(3) - 2 * view[:, :, None] * view[:, None, :]
     rotation = flip @ poses.rotation @ (np.eye(3) - 2 * np.outer(normal, normal))

@@ -34,6 +34,7 @@ EDGES_TRIED = 2  # cameras in which neighbours on the hull are taken for an edge
 MANY = 40  # fiducials of a planar object above which there are too many triples
 MOST_STEPS = 6  # of a lattice, by which a camera's image is moved
 VERIFIED = 2  # number of best different labellings to fit per round
+MOST_REPEATS = 3 * TRIPLES  # successive blob triples, all drawn before, after which further ones would be the same
 DECISIVE = 0.7  # labelled share of what could be seen that no wrong labelling of a whole rig reaches
 DECISIVE_CAMERAS = 3  # in which it must have labels
 
@@ -65,6 +66,13 @@ class Search:
     planar: dict[int, list[Poses]] = field(default_factory=dict)  # by camera: they are the same in every round
     likely: dict[tuple[int, bool], NDArray[np.int64]] = field(default_factory=dict)  # by arguments of `likely_blobs`
     triples: FiducialTriples | None = None  # to match blobs with, once they are needed
+    drawn: set[tuple[int, ...]] = field(default_factory=set)  # cameras, each with a triple of blobs in ascending order
+    repeats: int = 0  # triples drawn since the last new one
+
+    @property
+    def exhausted(self) -> bool:
+        """Tell whether further rounds would repeat earlier ones: few blobs form few triples."""
+        return self.repeats >= MOST_REPEATS
 
     def run_round(self, hypotheses: int, generator: np.random.Generator) -> Fits | None:
         """Make hypotheses, let the rig vote within the bounds, and fit the best ones; None = no result.
@@ -122,6 +130,9 @@ class Search:
             for c in cameras.tolist()
         ]
         camera = np.repeat(cameras, each)
+        for row in np.column_stack((camera, np.sort(np.concatenate(drawn)))).tolist():
+            self.repeats = self.repeats + 1 if tuple(row) in self.drawn else 0
+            self.drawn.add(tuple(row))
         self.hypotheses += len(camera) * len(triples.triples)
         return single_camera_poses(scene.blobs, scene.rig, camera, np.concatenate(drawn), triples, self.bounds[0], KEPT)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions
@@ -31,6 +31,9 @@ SLOW_TESTS = {16: (16, 0), 64: (32, 8)}
 no snapshot waits for both: for young rigs."""
 NEARBY_SNAPSHOTS = 4
 """Half width, in snapshots, of the search for the first snapshot after a change."""
+
+EPISODE_STEPS = 4
+"""Steps, for each length of an episode, by which it is moved over the snapshots to be left out."""
 
 FIT_CHI2_PER_DOF = 4.0
 """Largest chi-squared per degree of freedom of a snapshot that fits, where it would otherwise be refused."""
@@ -90,33 +93,57 @@ def likeliest_camera(test: ChangeTest, cameras: Collection[int] | None = None) -
 
 
 def changed_cameras(
-    test: ChangeTest, known: dict[int, str | None], least_shifts: Sequence[float] | None = None
+    recent: RecentSnapshots,
+    age: int,
+    known: dict[int, str | None],
+    episode: Callable[[int, float], int],
+    least_shifts: Sequence[float],
 ) -> tuple[dict[int, str | None], dict[int, float]]:
     """Free the cameras that have changed, most likely first, until the later snapshots are explained.
 
+    All but the first camera, which the alarm has tested, must have changed without the episode that supports it most.
+
     Args:
-        test: of the later snapshots.
+        recent: the latest snapshots.
+        age: number of snapshots since the change.
         known: cameras already known to have changed, and how.
-        least_shifts: smallest image shift, in pixels, that counts as a change; applies to all but the first camera.
+        episode: as for `find_alarm`.
+        least_shifts: as for `find_alarm`.
 
     Returns:
         The changed cameras, at least one, and how each changed (None = in any way); the chi-squared of each new one.
     """
-    least = least_shifts or [0.0] * len(test.pixels)
-    free, evidence = dict(known), dict[int, float]()
-    while len(free) < len(test.pixels):
+    test = recent.test(age)
+    free, evidence, passing = dict(known), dict[int, float](), set[int]()
+    while len(free) + len(passing) < len(test.pixels):
         given = test.condition_on(free) if free else test
         scores = given.scores()
         others = {
             camera: max(float(score[camera]) for score in scores.values())
             for camera in range(len(test.pixels))
-            if camera not in free and (not free or _largest_shift(given, camera) >= least[camera])
+            if camera not in free
+            and camera not in passing
+            and (not free or _largest_shift(given, camera) >= least_shifts[camera])
         }
         if free and max(others.values(), default=0.0) < ALARM_CHI2:
             break
         camera = likeliest_camera(given, others)
+        if free and _may_pass(recent, age, free, camera, episode(camera, _largest_shift(given, camera))):
+            passing.add(camera)
+            continue
         free[camera], evidence[camera] = None, others[camera]
     return free, evidence
+
+
+def _may_pass(recent: RecentSnapshots, age: int, free: Mapping[int, str | None], camera: int, episode: int) -> bool:
+    """Tell whether a camera's change may be a passing error, given that others have changed."""
+    if episode <= 1:
+        return False
+    if age <= episode:
+        return True
+    starts = [*range(0, age - episode, math.ceil(episode / EPISODE_STEPS)), age - episode]
+    tests = (recent.test(age, without=range(start, start + episode)).condition_on(free) for start in starts)
+    return any(max(float(score[camera]) for score in test.scores().values()) < REMAINING_CHI2 for test in tests)
 
 
 def _largest_shift(test: ChangeTest, camera: int) -> float:

@@ -216,12 +216,13 @@ class RecentSnapshots:
         screen(self._ring, self._totals, self._next, len(self), *known, SCREENED_AGES, scores)
         return scores
 
-    def test(self, age: int, aged: bool = True) -> ChangeTest:
+    def test(self, age: int, aged: bool = True, without: range = range(0)) -> ChangeTest:
         """Test for changes before the latest `age` snapshots.
 
         Args:
             age: number of snapshots.
             aged: allow for all drift since then at once.
+            without: some successive ones of them to leave out, counted from the first.
 
         Raises:
             RefusedError: nothing is known about the rig.
@@ -229,6 +230,9 @@ class RecentSnapshots:
         number = self._next - age
         information, factor, at = self._known(number)
         brought, weighted = self._sums(number, self._next)
+        if without:
+            left_out = self._sums(number + without.start, number + without.stop)
+            brought, weighted = brought - left_out[0], weighted - left_out[1]
         pull = weighted - brought @ at
         variance = self.walk.square() * (self.seconds(age) / 3600)
         if aged and bool(variance.any()):

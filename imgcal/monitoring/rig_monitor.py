@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 from imgcal.errors import RefusedError
@@ -162,6 +163,14 @@ class RigMonitor:
             self._recent.lasting = self.noise.model_error
             self.filter.rescale((self.noise.time / before).sqrt())
 
+    def seen_points(self, camera: int) -> Tensor:
+        """Where a camera has lately seen fiducials or lights: (P, 3) mm in the rig's frame."""
+        latest, _ = self._recent.latest(len(self._recent))
+        shown = [one for one in latest if bool(one[0].seen[0, camera].any())]
+        belief = self.filter.belief
+        found = [belief.points_at(pose)[0][seen.seen[0, camera]] for seen, pose in shown]
+        return torch.cat(found) if found else belief.points_object[:0]
+
     def _is_new(self, age: int = 0) -> bool:
         """Tell whether hardly anything was known about the rig before the latest `age` snapshots."""
         return self.filter.learnt_since(self.known_since) - age < FEW_SNAPSHOTS
@@ -293,7 +302,7 @@ class RigMonitor:
         excluded = {Steady.name: "a test of every camera has excluded it"}
         if pending is not None and free:
             excluded[ObjectChanged.name] = "a change of a camera is pending"
-        free, evidence = changed_cameras(self._recent.test(age), free, self.noise.least_shifts)
+        free, evidence = changed_cameras(self._recent, age, free, self.noise.episode, self.noise.least_shifts)
         self.undecided |= dict.fromkeys(free, UNDECIDED_SNAPSHOTS)
         if self._is_new(age):
             excluded[ObjectChanged.name] = "too little was known before"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import torch
@@ -21,6 +21,10 @@ LEAST_DRIFT = {"rotation": math.radians(0.05), "position": 0.5, "focal_length": 
 """Drift (rad, mm, pixels) that is reported if significant."""
 DRIFT_SIGMAS = 5.0
 """Significance of the drift, in standard deviations of the values at the start of the measurement."""
+LEAST_SEEN = 0.5
+"""Shift of the labels' places by the change of all values of a camera, relative to that by the drift alone. A drift
+shifts them; values that change together so that they hardly move are being learnt better, such as a focal length and a
+distortion where the lens had shown few labels."""
 HOW = {
     "rotation": "has slowly turned by",
     "position": "has slowly shifted by",
@@ -40,12 +44,15 @@ class DriftWatch:
     since: dict[int, float] = field(default_factory=dict)  # camera -> time of its reference
     unsettled: frozenset[int] = frozenset()  # cameras unsettled at any time since the last check
 
-    def observe(self, belief: RigBelief, unsettled: frozenset[int], time: float, number: int) -> list[Event]:
+    def observe(
+        self, belief: RigBelief, unsettled: frozenset[int], points: Callable[[int], Tensor], time: float, number: int
+    ) -> list[Event]:
         """Return the cameras that have drifted.
 
         Args:
             belief: the current belief.
             unsettled: cameras that moved and have not been relearnt, or that do not see the object.
+            points: where a camera has lately seen the object: (P, 3) mm.
             time: s since the epoch.
             number: of the update.
         """
@@ -63,7 +70,7 @@ class DriftWatch:
         for camera in range(len(self.names)):
             if camera in unsettled:
                 continue
-            found = self._largest(change[camera], torch.maximum(self.std, std)[camera])
+            found = self._largest(camera, change[camera], torch.maximum(self.std, std)[camera], points)
             if found is not None:
                 events.append(self._event(camera, *found, std[camera], time, number))
                 restarted.add(camera)
@@ -72,15 +79,25 @@ class DriftWatch:
         self._begin(restarted, belief, std, time)
         return events
 
-    def _largest(self, change: Tensor, std: Tensor) -> tuple[ChangeKind, float] | None:
+    def _largest(
+        self, camera: int, change: Tensor, std: Tensor, points: Callable[[int], Tensor]
+    ) -> tuple[ChangeKind, float] | None:
         """Most significant kind of change and its size, or None if none is worth a report."""
+        assert self.reference is not None
         best: tuple[float, ChangeKind, float] | None = None
         for kind, part in CHANGES.items():
             size = float(change[part].norm())
             least = max(LEAST_DRIFT[kind], DRIFT_SIGMAS * float(std[part].max()))
             if size >= least and (best is None or size / least > best[0]):
                 best = size / least, kind, size  # type: ignore[assignment]
-        return None if best is None else best[1:]
+        if best is None:
+            return None
+        alone = torch.zeros_like(change)
+        alone[CHANGES[best[1]]] = change[CHANGES[best[1]]]
+        together, by_itself = _image_shifts(
+            self.reference.select([camera]), torch.stack((change, alone)), points(camera)
+        )
+        return best[1:] if together > LEAST_SEEN * by_itself else None
 
     def _event(self, camera: int, kind: ChangeKind, size: float, std: Tensor, time: float, number: int) -> Event:
         name = self.names[camera]
@@ -102,6 +119,15 @@ class DriftWatch:
             self.reference, self.std = replace_cameras(self.reference, now, chosen), self.std.clone()
             self.std[chosen] = std[chosen]
         self.since |= dict.fromkeys(chosen, time)
+
+
+def _image_shifts(camera: CameraRig, changes: Tensor, points: Tensor) -> list[float]:
+    """Median shift of points (P, 3) in a camera's image (px) by changes (M, K) of its values; zeros without points."""
+    if not len(points):
+        return [0.0] * len(changes)
+    steps = torch.cat((torch.zeros_like(changes[:1]), changes))[:, None]
+    uv = camera.expand(len(steps)).retract(steps).project_values(points.expand(len(steps), -1, -1), None).uv[:, 0]
+    return [float(shift) for shift in (uv[1:] - uv[:1]).norm(dim=-1).median(-1).values]
 
 
 def replace_cameras(rig: CameraRig, other: CameraRig, cameras: list[int]) -> CameraRig:

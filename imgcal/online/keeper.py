@@ -286,7 +286,8 @@ class RigKeeper:
         )
         if found is not None:
             unsettled = frozenset(memory.relearning.events) | frozenset(memory.sightings.lost) | frozenset(memory.off)
-            events += memory.drift_watch.observe(memory.belief, unsettled, time, number)
+            seen = memory.monitor.seen_points
+            events += memory.drift_watch.observe(memory.belief, unsettled, seen, time, number)
         for test in self.tests:
             for event in test(state, frames, None if found is None else found.update):
                 events.append(event)

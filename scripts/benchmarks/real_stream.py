@@ -5,6 +5,9 @@ from it and follows frames 2400-4799. Nothing moved in this recording, so every 
 false. A rotation can only be detected while the camera sees the wand, so delays count only that time. Finished runs of
 the same code are not repeated (`out/work/real_stream`). The result is written after each case.
 
+Other arrangements of the recording, whose results `--out` must name: `--calibrate 2400:4800 --follow 0:2400` turns its
+halves round, `--follow 4800:2400` plays frames backwards, `--only cam01 cam04 cam08` leaves out all other cameras.
+
 With `--lights`, the wand is unknown: its markers are separate lights at unknown positions. With `--stick 0 1 2`, the
 distances of these markers are known, and the others are lights.
 """
@@ -17,7 +20,7 @@ import time
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -25,19 +28,20 @@ from typing import Any
 import tyro
 
 import imgcal
+from imgcal.errors import InputError
 from imgcal.fleet import StoredResults, workers
 from imgcal.types import CalibrationObject
 from scripts.benchmarks import wand_recording
 from scripts.benchmarks.lights import part_of
-from scripts.benchmarks.wand_recording import FOLLOWED, RATE, SEEN, calibrated, recording, turned
+from scripts.benchmarks.wand_recording import RATE, SEEN, Arrangement, calibrated, recording, turned
 from scripts.output import ROOT, WORK, command, markdown, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "real_stream.json"
 LIGHTS_RESULT = RESULT.with_name("real_stream_lights.json")
 QUIET = ("camera_lost", "camera_back")
 """True events: cameras lose the wand. Each should be reported once."""
-BUMPED = 3000
-"""First frame after a camera is rotated."""
+BUMPED = 600
+"""Followed frames before a camera is rotated."""
 AFTER = 6.0
 """Seconds of seeing the wand for which a rotated camera is followed, unless the recording ends before."""
 LIMITS = {0.1: 5.0}
@@ -72,12 +76,24 @@ class Case:
     degrees: float = 0.0
     lights: bool = False  # the wand is unknown
     stick: tuple[int, ...] = ()  # markers whose distances are known
+    arrangement: Arrangement = Arrangement()
 
     @property
     def key(self) -> str:
         """Identify the result of the run."""
         seen = f"lights{''.join(f' {marker}' for marker in self.stick)}, " if self.lights else ""
+        seen += "" if self.arrangement == Arrangement() else f"{self.arrangement}, "
         return f"{seen}stride {self.stride}, camera {self.camera}, {self.degrees} degrees"
+
+    @property
+    def frames(self) -> list[int]:
+        """Followed frames."""
+        return self.arrangement.followed[:: self.stride]
+
+    @property
+    def bumped_at(self) -> int:
+        """First frame after a camera is rotated."""
+        return self.arrangement.followed[BUMPED]
 
 
 def run(case: Case) -> dict[str, Any]:
@@ -87,11 +103,11 @@ def run(case: Case) -> dict[str, Any]:
 
 def untouched(case: Case) -> dict[str, Any]:
     """Follow the original stream; list all events, and score the rig on the way."""
-    given, known, stride = recording(), calibrated(), case.stride
+    given, known, stride = recording(case.arrangement), calibrated(arrangement=case.arrangement), case.stride
     batch, batch_median = known.score(known.calibration.rig)
     events, scores, refused, began = [], [], Counter[str](), time.process_time()
     with start(known.calibration, case.lights, case.stick) as keeper:
-        for count, number in enumerate(FOLLOWED[::stride]):
+        for count, number in enumerate(case.frames):
             state = keeper.update(given.frame(number), time=number / RATE)
             events += [plain(event, number) for event in state.events]
             if state.refused is not None:
@@ -123,33 +139,34 @@ def untouched(case: Case) -> dict[str, Any]:
 
 def bumped(case: Case) -> dict[str, Any]:
     """Rotate one camera, and follow the stream until it has seen the wand for a while."""
-    given, known = recording(), calibrated()
+    given, known = recording(case.arrangement), calibrated(arrangement=case.arrangement)
     assert case.camera is not None
-    name, frames = given.factory.camera_names[case.camera], FOLLOWED[:: case.stride]
-    seeing = [n for n in frames if n >= BUMPED and given.counts[n, case.camera] >= SEEN]
+    name, since = given.factory.camera_names[case.camera], case.bumped_at
+    seeing = [n for n in case.frames if n >= since and given.counts[n, case.camera] >= SEEN]
     last = seeing[: math.ceil(AFTER * RATE / case.stride)][-1]
-    events, saved = kept_until_bump(case.stride, case.lights, case.stick)
+    events, saved = kept_until_bump(replace(case, camera=None, degrees=0.0))
     with tempfile.TemporaryDirectory() as folder:
         (path := Path(folder) / "keeper.json").write_bytes(saved)
         keeper = imgcal.RigKeeper.restore(path)
     with keeper:
-        for number in (n for n in frames if BUMPED <= n <= last):
+        for number in (n for n in case.frames if since <= n <= last):
             blobs = turned(given.frame(number), known.calibration.rig, case.camera, case.degrees)
             events = [*events, *(plain(e, number) for e in keeper.update(blobs, time=number / RATE).events)]
     limit = LIGHTS_LIMIT if case.lights else LIMITS.get(case.degrees, LIMIT)
     return {
         "stride": case.stride,
         "degrees": case.degrees,
-        **judge(events, name, "rotation", BUMPED, seeing, limit, case.stride),
+        **judge(events, name, "rotation", since, seeing, limit, case.stride),
     }
 
 
 @lru_cache(maxsize=1)
-def kept_until_bump(stride: int, lights: bool, stick: tuple[int, ...]) -> tuple[list[dict[str, Any]], bytes]:
+def kept_until_bump(case: Case) -> tuple[list[dict[str, Any]], bytes]:
     """Follow the stream until a camera is rotated; return all events, and the state of the keeper."""
-    given, events = recording(), []
-    with start(calibrated().calibration, lights, stick) as keeper, tempfile.TemporaryDirectory() as folder:
-        for number in (n for n in FOLLOWED[::stride] if n < BUMPED):
+    given, events = recording(case.arrangement), []
+    calibration = calibrated(arrangement=case.arrangement).calibration
+    with start(calibration, case.lights, case.stick) as keeper, tempfile.TemporaryDirectory() as folder:
+        for number in (n for n in case.frames if n < case.bumped_at):
             events += [plain(e, number) for e in keeper.update(given.frame(number), time=number / RATE).events]
         keeper.save(path := Path(folder) / "keeper.json")
         return events, path.read_bytes()
@@ -290,21 +307,28 @@ class Options:
     fresh: bool = False  #: calibrate again instead of using the cached calibration
     lights: bool = False  #: follow the markers as unknown lights
     stick: tuple[int, ...] = ()  #: markers of the wand whose distances are known; the others are lights
+    arrangement: tyro.conf.OmitArgPrefixes[Arrangement] = Arrangement()
     out: Path | None = None  #: default: docs/benchmarks/real_stream.json, ..._lights.json or ..._stick_0_1_2.json
 
 
 def main() -> None:
     """Run the cases, then count, write and print the results."""
     options = tyro.cli(Options, description=__doc__)
-    known = calibrated(options.fresh)
+    arrangement = options.arrangement
+    if arrangement != Arrangement() and options.out is None:
+        raise InputError("out: found nothing, expected the file for the result of another arrangement")
+    known = calibrated(options.fresh, arrangement)
     texts = [Path(str(module)).read_text("utf-8") for module in (__file__, wand_recording.__file__)]
     rms = float(known.calibration.rms)
     lights = options.lights or bool(options.stick)
-    cases = [Case(stride, lights=lights, stick=options.stick) for stride in options.strides] + [
-        Case(stride, camera, degrees, lights, options.stick)
+    cases = [
+        Case(stride, lights=lights, stick=options.stick, arrangement=arrangement) for stride in options.strides
+    ] + [
+        Case(stride, camera, degrees, lights, options.stick, arrangement)
         for stride in options.bump_strides
         for degrees in options.bumps
         for camera in options.cameras
+        if not arrangement.only or camera < len(arrangement.only)
     ]
     name = f"real_stream_stick_{'_'.join(map(str, options.stick))}.json"
     usual = RESULT.with_name(name) if options.stick else LIGHTS_RESULT if lights else RESULT

@@ -28,13 +28,57 @@ from scripts.output import WORK, make_folder
 FOLDER = "wand-ten-cameras-stream"
 RATE = 60.0  # frames/s
 SEEN = 4  # least number of blobs for a camera to see the wand
-CALIBRATED = range(0, 2400, 8)  # frames
-FOLLOWED = range(2400, 4800)  # frames
-SCORED = range(2400, 4800, 7)  # frames
+CALIBRATED = range(0, 2400, 8)  # frames, in the usual arrangement
+FRAMES = 4800  # in the recording
+CALIBRATED_EVERY, SCORED_EVERY = 8, 7  # frames
 LEAST_CAMERAS = 3  # least number of cameras that see the wand in a scored frame
 ROUNDS = 4  # rounds of outlier removal
 LEAST_POINTS = 6  # in a snapshot, to fit its pose
 CACHE = WORK / "wand_recording.pkl"
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """Which frames are calibrated, which are followed, and which cameras belong to the rig.
+
+    Frames are written as in `0:1200,2400:3600`. A range that falls, `4800:2400`, is played backwards.
+    """
+
+    calibrate: str = "0:2400"  #: frames to calibrate from, of which every eighth is taken
+    follow: str = "2400:4800"  #: frames to follow
+    only: tuple[str, ...] = ()  #: cameras of the rig; default: all
+
+    @property
+    def calibrated(self) -> NDArray[np.int64]:
+        """Frames to calibrate from."""
+        return np.sort(np.concatenate([part[::CALIBRATED_EVERY] for part in _ranges(self.calibrate)]))
+
+    @property
+    def backwards(self) -> bool:
+        """Tell whether the followed frames are played backwards."""
+        return _ranges(self.follow)[0].step < 0
+
+    @property
+    def followed(self) -> list[int]:
+        """Followed frames in the order of play, numbered so that they ascend: from the end if played backwards."""
+        return sorted(FRAMES - 1 - n if self.backwards else n for part in _ranges(self.follow) for n in part)
+
+
+def _ranges(text: str) -> list[range]:
+    """Read ranges of frames.
+
+    Raises:
+        InputError: not such ranges, or both rising and falling ones.
+    """
+    try:
+        ends = [tuple(int(end) for end in part.split(":")) for part in text.split(",")]
+        found = [range(a, b) if a < b else range(a - 1, b - 1, -1) for a, b in ends]
+    except ValueError:
+        found = []
+    inside = all(len(part) and min(part) >= 0 and max(part) < FRAMES for part in found)
+    if not inside or len({part.step for part in found}) != 1:
+        raise InputError(f"frames: found {text!r}, expected ranges within 0:{FRAMES} such as 0:1200,2400:3600")
+    return found
 
 
 @dataclass(frozen=True)
@@ -49,7 +93,7 @@ class Recording:
     @cached_property
     def counts(self) -> NDArray[np.int64]:
         """Blobs of each frame and camera: (4800, C)."""
-        counts = np.zeros((FOLLOWED.stop, self.factory.num_cameras), dtype=np.int64)
+        counts = np.zeros((FRAMES, self.factory.num_cameras), dtype=np.int64)
         np.add.at(counts, (self.frames[self.detections.snapshot], self.detections.camera), 1)
         return counts
 
@@ -59,7 +103,7 @@ class Recording:
         number = self.frames[self.detections.snapshot]
         if (np.diff(number) < 0).any():
             raise InputError(f"{FOLDER}: found frames out of order, expected ascending numbers")
-        return np.searchsorted(number, np.arange(FOLLOWED.stop + 1))
+        return np.searchsorted(number, np.arange(FRAMES + 1))
 
     def frame(self, number: int) -> Detections:
         """Blobs of one frame, possibly none."""
@@ -67,7 +111,18 @@ class Recording:
         blobs = self.detections.select(rows)
         return replace(blobs, snapshot=np.zeros(len(rows), dtype=np.int64), snapshot_names=(f"{number:05d}",))
 
-    def chosen(self, frames: range) -> Detections:
+    def backwards(self) -> Recording:
+        """The same frames in the opposite order, with numbers that ascend."""
+        count, given = len(self.frames), self.detections
+        rows = np.argsort(count - 1 - given.snapshot, kind="stable")
+        frames = FRAMES - 1 - self.frames[::-1]
+        blobs = given.select(rows)
+        names = tuple(f"{number:05d}" for number in frames)
+        return replace(
+            self, detections=replace(blobs, snapshot=count - 1 - blobs.snapshot, snapshot_names=names), frames=frames
+        )
+
+    def chosen(self, frames: range | NDArray[np.int64] | list[int]) -> Detections:
         """Blobs of some frames, as one capture."""
         kept = np.flatnonzero(np.isin(self.frames, frames))
         row = np.full(len(self.frames), -1)
@@ -79,7 +134,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Calibrated:
-    """Calibration from the first half, and labels of frames in the second half, on which rigs are scored."""
+    """Calibration from some frames, and labels of frames among those that are followed, on which rigs are scored."""
 
     calibration: imgcal.Calibration
     observations: Observations  # (S, C, N)
@@ -118,25 +173,43 @@ def folder() -> Path:
     return Path(captures) / FOLDER
 
 
-@lru_cache(maxsize=1)
-def recording() -> Recording:
-    """Read the recording."""
+@lru_cache(maxsize=2)
+def recording(arrangement: Arrangement = Arrangement()) -> Recording:
+    """Read the recording as its cameras saw it, backwards if it is played so."""
     factory, obj = imgcal.load_rig(folder() / "factory.yaml"), imgcal.load_object(folder() / "object.csv")
     detections = imgcal.load_detections(folder() / "detections.csv.gz", factory, obj.num_fiducials)
-    return Recording(detections, np.array([int(name) for name in detections.snapshot_names]), factory, obj)
+    if arrangement.only:
+        unknown = set(arrangement.only) - set(factory.camera_names)
+        if unknown:
+            raise InputError(f"only: found {min(unknown)}, expected some of {', '.join(factory.camera_names)}")
+        index = [factory.camera_names.index(name) for name in arrangement.only]
+        kept = detections.select(np.isin(detections.camera, index))
+        new = np.full(factory.num_cameras, -1)
+        new[index] = np.arange(len(index))
+        detections = replace(kept, camera=new[kept.camera], camera_names=arrangement.only)
+        factory = factory.select(index)
+    frames = np.array([int(name) for name in detections.snapshot_names])
+    given = Recording(detections, frames, factory, obj)
+    return given.backwards() if arrangement.backwards else given
 
 
 @lru_cache(maxsize=1)
-def calibrated(anew: bool = False) -> Calibrated:
-    """Calibrate from every eighth frame of the first half, or use the cached result unless `anew`."""
-    if not anew and CACHE.is_file():
-        with CACHE.open("rb") as file:
+def calibrated(anew: bool = False, arrangement: Arrangement = Arrangement()) -> Calibrated:
+    """Calibrate from every eighth of the frames to calibrate, or use the cached result unless `anew`."""
+    cache = CACHE
+    if arrangement != Arrangement():
+        parts = (arrangement.calibrate, arrangement.follow, *arrangement.only)
+        cache = CACHE.with_name(f"{CACHE.stem} {' '.join(parts)}.pkl")
+    if not anew and cache.is_file():
+        with cache.open("rb") as file:
             found: Calibrated = pickle.load(file)  # written below, by this program
         return found
-    given = recording()
-    calibration = imgcal.calibrate(given.chosen(CALIBRATED), given.factory, given.obj)
+    given = recording(arrangement)
+    numbers = arrangement.calibrated
+    numbers = np.sort(FRAMES - 1 - numbers) if arrangement.backwards else numbers
+    calibration = imgcal.calibrate(given.chosen(numbers), given.factory, given.obj)
     seeing = (given.counts >= SEEN).sum(1) >= LEAST_CAMERAS
-    scored = given.chosen(SCORED)
+    scored = given.chosen(arrangement.followed[::SCORED_EVERY])
     kept = np.array([seeing[int(name)] for name in scored.snapshot_names])
     row = np.cumsum(kept) - 1
     blobs = scored.select(kept[scored.snapshot])
@@ -147,8 +220,8 @@ def calibrated(anew: bool = False) -> Calibrated:
     if poses is None:
         raise InputError(f"{FOLDER}: found scored frames without a pose")
     result = Calibrated(calibration, observations, poses)
-    make_folder(CACHE.parent)
-    with CACHE.open("wb") as file:
+    make_folder(cache.parent)
+    with cache.open("wb") as file:
         pickle.dump(result, file)
     return result
 

@@ -9,10 +9,11 @@ import pytest
 import torch
 
 import imgcal
+from imgcal.errors import InputError
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from scripts.benchmarks import real_stream
 from scripts.benchmarks.real_stream import judge, summarize
-from scripts.benchmarks.wand_recording import turned
+from scripts.benchmarks.wand_recording import Arrangement, Recording, turned
 
 
 def event(frame, kind="moved", camera="cam02", change="unknown", size=None):
@@ -79,7 +80,7 @@ def test_finished_cases_are_written_if_a_later_one_fails(tmp_path, monkeypatch):
         return row
 
     known = SimpleNamespace(calibration=SimpleNamespace(rms=0.1))
-    monkeypatch.setattr(real_stream, "calibrated", lambda anew: known)
+    monkeypatch.setattr(real_stream, "calibrated", lambda anew, arrangement: known)
     monkeypatch.setattr(real_stream, "WORK", tmp_path)
     monkeypatch.setattr(real_stream, "run", run)
     out = tmp_path / "real_stream.json"
@@ -89,3 +90,32 @@ def test_finished_cases_are_written_if_a_later_one_fails(tmp_path, monkeypatch):
     written = json.loads(out.read_text())
     assert [one["camera"] for one in written["bump_runs"]] == ["cam02"]
     assert written["bumps"][0]["bumps"] == 1
+
+
+def test_parts_of_the_recording_are_calibrated_and_followed():
+    usual = Arrangement()
+    assert (usual.calibrated.tolist(), usual.followed) == ([*range(0, 2400, 8)], [*range(2400, 4800)])
+    middle = Arrangement("1600:1616", "0:2,3200:3202")
+    assert (middle.calibrated.tolist(), middle.followed) == ([1600, 1608], [0, 1, 3200, 3201])
+    backwards = Arrangement("0:16", "4800:4797")
+    assert backwards.backwards and backwards.followed == [0, 1, 2]
+    for wrong in ("", "0", "5:5", "0:4801", "0:2,5:3", "-1:4"):
+        with pytest.raises(InputError, match="expected ranges within 0:4800"):
+            _ = Arrangement(follow=wrong).followed
+
+
+def test_a_recording_is_played_backwards():
+    rig, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    blobs = true_detections(simulate_truth(rig, obj, 3, torch.Generator().manual_seed(1), PhysicalDrift()))
+    given = Recording(blobs, np.array([10, 11, 4000]), rig, obj)
+    back = given.backwards()
+    assert back.frames.tolist() == [799, 4788, 4789]
+    for frame, mirrored in ((10, 4789), (11, 4788), (4000, 799)):
+        np.testing.assert_array_equal(given.frame(frame).uv, back.frame(mirrored).uv)
+        assert given.counts[frame].tolist() == back.counts[mirrored].tolist()
+
+
+def test_another_arrangement_is_not_written_over_the_usual_result(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["real_stream", "--follow", "0:2400"])
+    with pytest.raises(InputError, match="out: found nothing"):
+        real_stream.main()

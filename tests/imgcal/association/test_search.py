@@ -116,6 +116,17 @@ def test_planar_objects_with_many_fiducials_are_searched_as_planes(o10) -> None:
     assert min(conflicts(obj, snapshot.labels(scene.blobs, 60), labels) for labels in fits.labels) < 0.05
 
 
+def test_few_blobs_are_exhausted_after_few_rounds(o10, asymmetric8) -> None:
+    rig = o10.select([0])
+    for missing, triples in ((4, 4), (0, 56)):
+        scene = scene_of(take(rig, asymmetric8, 1, missing=missing), rig, asymmetric8)
+        search, generator = search_of(scene, [0]), np.random.default_rng(1)
+        for _ in range(8):
+            search.run_round(5000, generator)
+        assert search.exhausted == (missing > 0)
+        assert len(search.drawn) <= triples
+
+
 def test_a_round_without_poses_finds_nothing(o10) -> None:
     random = np.random.default_rng(1)
     obj = make_object(np.c_[random.uniform(-90, 90, (60, 2)), np.zeros(60)])

@@ -3,7 +3,8 @@
 import math
 
 from imgcal.monitoring.change_search import ALARM_CHI2, changed_cameras, find_alarm, likeliest_age, likeliest_camera
-from scripts.benchmarks.rig_streams import Bump
+from imgcal.monitoring.recent_snapshots import RecentSnapshots
+from scripts.benchmarks.rig_streams import Bump, Slip
 from tests.imgcal.monitoring.followed import followed
 
 TURN = math.radians(0.1)
@@ -22,18 +23,17 @@ def test_a_camera_that_was_turned_is_found_with_its_moment() -> None:
     test = turned.recent.test(age)
     assert likeliest_camera(test) == 2
     assert likeliest_age(turned.recent, 2, age) == 6
-    free, evidence = changed_cameras(turned.recent.test(6), {})
+    free, evidence = changed_cameras(turned.recent, 6, {}, *INDEPENDENT)
     assert free == {2: None} and evidence[2] >= ALARM_CHI2
 
 
 def test_two_cameras_are_found_and_what_is_known_is_not_found_again() -> None:
     turned = followed(46, bumps=[Bump(40, 1, "rotation", TURN), Bump(40, 3, "position", 1.0)])
-    test = turned.recent.test(6)
-    free, evidence = changed_cameras(test, {})
+    free, evidence = changed_cameras(turned.recent, 6, {}, *INDEPENDENT)
     assert free.keys() == evidence.keys() == {1, 3}
-    free, evidence = changed_cameras(test, {1: "rotation"})
+    free, evidence = changed_cameras(turned.recent, 6, {1: "rotation"}, *INDEPENDENT)
     assert free == {1: "rotation", 3: None} and evidence.keys() == {3}
-    assert likeliest_camera(test, (0, 2, 3)) == 3
+    assert likeliest_camera(turned.recent.test(6), (0, 2, 3)) == 3
 
 
 def test_what_may_be_one_passing_error_is_no_alarm() -> None:
@@ -50,9 +50,24 @@ def test_what_may_be_one_passing_error_is_no_alarm() -> None:
 
 def test_a_small_change_of_another_camera_may_be_an_error_that_lasts() -> None:
     turned = followed(46, bumps=[Bump(40, 1, "rotation", TURN), Bump(40, 3, "position", 1.0)])
-    test = turned.recent.test(6)
-    assert changed_cameras(test, {}, [0.5] * 4)[0].keys() == {1, 3}
-    assert changed_cameras(test, {}, [50.0] * 4)[0].keys() == {1}  # the first one has been tested before
+    episode = INDEPENDENT[0]
+    assert changed_cameras(turned.recent, 6, {}, episode, [0.5] * 4)[0].keys() == {1, 3}
+    # The first one has been tested before.
+    assert changed_cameras(turned.recent, 6, {}, episode, [50.0] * 4)[0].keys() == {1}
+
+
+def test_another_camera_whose_error_ends_has_not_changed() -> None:
+    """Camera 3 is off for six of the twelve snapshots since camera 1 was turned."""
+    turn, late, in_time = Bump(40, 1, "rotation", TURN), Slip(42, 3, 0.01), Slip(48, 3, 0.0)
+    passes, lasts = followed(52, bumps=[turn], slips=[late, in_time]), followed(52, bumps=[turn], slips=[late])
+
+    def found(recent: RecentSnapshots, episode: int) -> set[int]:
+        return set(changed_cameras(recent, 12, {}, lambda camera, shift: episode, [0.0] * 4)[0])
+
+    assert found(passes.recent, 1) == {1, 3}
+    assert found(passes.recent, 6) == {1}
+    assert found(lasts.recent, 6) == {1, 3}
+    assert found(lasts.recent, 12) == {1}  # all of it may be one episode
 
 
 def test_a_large_error_may_pass_sooner_than_a_small_one() -> None:

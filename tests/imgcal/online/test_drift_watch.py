@@ -1,6 +1,7 @@
 """Drift is reported once, for the right camera, when it is certain and large enough."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -8,6 +9,11 @@ import torch
 import imgcal
 from imgcal.monitoring import RigBelief
 from imgcal.online.drift_watch import EVERY_SECONDS, DriftWatch, replace_cameras
+
+
+def middle(camera: int) -> torch.Tensor:
+    """Where the cameras look."""
+    return 30.0 * torch.eye(3, dtype=torch.float64)
 
 
 def test_a_slow_turn_is_told_of_its_camera() -> None:
@@ -18,12 +24,12 @@ def test_a_slow_turn_is_told_of_its_camera() -> None:
     step[3, 1] = math.radians(0.03)
     for number in range(5):
         time = number * EVERY_SECONDS
-        told += watch.observe(replace(belief, rig=belief.rig.retract(number * step)), frozenset(), time, number)
+        told += watch.observe(replace(belief, rig=belief.rig.retract(number * step)), frozenset(), middle, time, number)
     assert [(event.kind, event.camera, event.change) for event in told] == [("drift", "cam04", "rotation")] * 2
     assert told[0].size is not None
     assert abs(told[0].size - 0.06) < 0.002
     assert told[0].since == 0.0
-    assert watch.observe(belief, frozenset(), 4 * EVERY_SECONDS + 1, 12) == []  # it was looked a moment ago
+    assert watch.observe(belief, frozenset(), middle, 4 * EVERY_SECONDS + 1, 12) == []  # it was looked a moment ago
 
 
 def test_a_camera_that_moved_does_not_drift() -> None:
@@ -34,10 +40,10 @@ def test_a_camera_that_moved_does_not_drift() -> None:
     )
     step = torch.zeros(7, 15, dtype=torch.float64)
     step[3, 1] = math.radians(1.0)
-    watch.observe(belief, frozenset(), 0.0, 0)
+    watch.observe(belief, frozenset(), middle, 0.0, 0)
     there = replace(belief, rig=rig.retract(step))
-    assert watch.observe(there, frozenset({3}), 20.0, 1) == []
-    assert watch.observe(there, frozenset(), 40.0, 2) == []  # from where it is now
+    assert watch.observe(there, frozenset({3}), middle, 20.0, 1) == []
+    assert watch.observe(there, frozenset(), middle, 40.0, 2) == []  # from where it is now
 
 
 def test_a_move_between_two_looks_is_no_drift() -> None:
@@ -45,10 +51,10 @@ def test_a_move_between_two_looks_is_no_drift() -> None:
     belief = RigBelief.of_prior(rig, obj, torch.full((7, 15), 1e-4, dtype=torch.float64))
     watch, step = DriftWatch(rig.camera_names), torch.zeros(7, 15, dtype=torch.float64)
     step[3, 1] = math.radians(1.0)
-    watch.observe(belief, frozenset(), 0.0, 0)
+    watch.observe(belief, frozenset(), middle, 0.0, 0)
     there = replace(belief, rig=rig.retract(step))
-    assert watch.observe(there, frozenset({3}), 2.0, 1) == []  # bumped, and learnt again before the next look
-    assert watch.observe(there, frozenset(), EVERY_SECONDS + 1, 2) == []
+    assert watch.observe(there, frozenset({3}), middle, 2.0, 1) == []  # bumped, and learnt again before the next look
+    assert watch.observe(there, frozenset(), middle, EVERY_SECONDS + 1, 2) == []
 
 
 def test_what_is_not_known_any_more_has_not_drifted() -> None:
@@ -57,9 +63,32 @@ def test_what_is_not_known_any_more_has_not_drifted() -> None:
     sure = RigBelief.of_prior(rig, obj, torch.full((7, 15), 1e-5, dtype=torch.float64))
     watch, step = DriftWatch(rig.camera_names), torch.zeros(7, 15, dtype=torch.float64)
     step[3, 1] = math.radians(0.2)
-    watch.observe(sure, frozenset(), 0.0, 0)
+    watch.observe(sure, frozenset(), middle, 0.0, 0)
     unsure = RigBelief.of_prior(rig.retract(step), obj, torch.full((7, 15), 0.01, dtype=torch.float64))
-    assert watch.observe(unsure, frozenset(), EVERY_SECONDS + 1, 1) == []
+    assert watch.observe(unsure, frozenset(), middle, EVERY_SECONDS + 1, 1) == []
+
+
+def test_values_that_change_without_moving_the_image_do_not_drift() -> None:
+    """A principal point makes up for a longer focal length where the camera sees the object: both are being learnt."""
+    rig, obj = imgcal.load_rig("U7").to(torch.float64), imgcal.load_object("asymmetric8")
+    belief = RigBelief.of_prior(rig, obj, torch.full((7, 15), 0.01, dtype=torch.float64))
+    step = torch.zeros(7, 15, dtype=torch.float64)
+    step[3, 6:8] = 2.0
+
+    before_camera = torch.tensor([[[200.0, 10.0, 1000.0], [200.0, -10.0, 1000.0]]], dtype=torch.float64)
+    seen = rig.select([3]).cam_from_rig.inverse().apply(before_camera)[0]
+
+    def drifts(points: Callable[[int], torch.Tensor] = lambda camera: seen) -> list[tuple[str | None, str | None]]:
+        watch = DriftWatch(rig.camera_names)
+        watch.observe(belief, frozenset(), points, 0.0, 0)
+        there = replace(belief, rig=rig.retract(step))
+        found = watch.observe(there, frozenset(), points, EVERY_SECONDS + 1, 1)
+        return [(event.camera, event.change) for event in found]
+
+    assert drifts() == [("cam04", "focal_length")]
+    assert drifts(lambda camera: seen[:0]) == []  # it has seen nothing lately
+    step[3, 8] = -0.4  # a fifth of the focal length's change
+    assert drifts() == []
 
 
 def test_cameras_are_replaced() -> None:
