@@ -43,7 +43,7 @@ LEAST_BLOCKS = 6
 """Smallest number of blocks for a reliable scatter."""
 MANY_BLOCKS = 32
 """Blocks at first (up to twice as many): each costs a factorization; they are then joined two by two."""
-SCATTER_SIGMAS = 3.0
+SCATTER_SIGMAS = 2.5
 """Standard deviations by which the scatter must exceed its value for independent noise."""
 CAMERA_SPREAD = 0.5
 """Standard deviation of the cameras' scatters about their average, relative to it, as in ten recorded cameras."""
