@@ -2,10 +2,9 @@
 
 Errors of real cameras are correlated in time: a half-hidden marker stays half hidden for some frames, and a lens error
 belongs to a place in the image. Snapshots that repeat an error add no new evidence. With a correlation time of tau
-snapshots, n of them are worth n / tau independent ones, so their variance is multiplied by tau. Such errors are also
-shared by the markers of a snapshot, so the image shifts by more than the mean of independent errors would: the variance
-is multiplied by that excess, too. A persistent shift of a whole image may also be mistaken for a small move. Such a
-shift is expected to go away, so a change of a camera must move the image by clearly more than that.
+snapshots, n of them are worth n / tau independent ones, so their variance is multiplied by tau. A persistent shift of a
+whole image may also be mistaken for a small move. Such a shift is expected to go away, so a change of a camera must
+move the image by clearly more than that.
 
 Such errors also have heavy tails. An image may be shifted by far more than usual for half a second, at the edge of a
 lens or behind somebody's arm. An image that was off in the previous snapshot will be off in the next one. Its labels
@@ -28,7 +27,7 @@ from torch import Tensor
 from imgcal.estimation import correlation_time
 from imgcal.medians import median_of_known, quantile_of_known
 from imgcal.monitoring.change_test import MODEL_ERROR
-from imgcal.monitoring.shaking import remaining_share, shared_shifts
+from imgcal.monitoring.shaking import shared_shifts
 from imgcal.types import Observations
 
 # Correlation times.
@@ -56,8 +55,6 @@ LARGEST = 10.0
 """Errors larger than this many times the usual persistent error last no longer than those seconds."""
 LEAST_LASTING = 0.05
 """Pixels: least size of persistent errors, as measured on ten well calibrated infrared cameras."""
-LARGEST_SHIFT = 5.0
-"""Standard deviations at which shifts are clipped before their variance is compared with that of independent noise."""
 LEAST_SHIFT = 6.0
 """Minimum image shift of a change, relative to the usual size of persistent errors."""
 TAIL, TAIL_SIGMAS = 0.99, 3.03
@@ -88,9 +85,7 @@ class NoiseCorrelation:
     cameras: int
     time: Tensor = field(init=False)  # (C,) correlation time in snapshots; 1 = independent
     lasting: Tensor = field(init=False)  # (C,) px, one standard deviation of a persistent image shift
-    excess: Tensor = field(init=False)  # (C,) variance of the shifts relative to that of independent noise; at least 1
-    shifts: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=MEMORY_SNAPSHOTS))
-    # (C, 3) px, px, px^2: shifts of the images, and their variance by independent noise
+    shifts: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=MEMORY_SNAPSHOTS))  # (C, 2) px
     taken: int = 0  # snapshots
     usual: float = 1.0  # least correlation time until enough snapshots are taken
     interval: float = 0.0  # s between snapshots; 0 = unknown
@@ -100,7 +95,7 @@ class NoiseCorrelation:
 
     def __post_init__(self) -> None:
         """Start with errors that are independent from snapshot to snapshot."""
-        self.time, self.excess = torch.ones(2, self.cameras, dtype=torch.float64)
+        self.time = torch.ones(self.cameras, dtype=torch.float64)
         self.lasting = torch.zeros(self.cameras, dtype=torch.float64)
         self.scale = torch.full_like(self.time, LEAST_LASTING)
         self.off = torch.full_like(self.time, math.nan)
@@ -156,22 +151,10 @@ class NoiseCorrelation:
         """
         if not bool((self.time > 1).any()):
             return observations
-        root = (self.time * self._unstated_excess(observations) / self._weight).sqrt()
+        root = (self.time / self._weight).sqrt()
         self.off = torch.full_like(self.off, math.nan)
         shake = None if observations.shake is None else observations.shake * root
         return replace(observations, sigma=observations.sigma * root[:, None], shake=shake)
-
-    @property
-    def inflation(self) -> Tensor:
-        """Factor (C,) on the variance of cameras that do not shake."""
-        return self.time * self.excess
-
-    def _unstated_excess(self, observations: Observations) -> Tensor:
-        """Part (C,) of the excess that the shake of observations (1, C, N) does not include; at least 1."""
-        if observations.shake is None:
-            return self.excess
-        precision = torch.where(observations.seen, observations.sigma**-2.0, 0.0).sum((0, 2))
-        return (self.excess / (1 + observations.shake[0].square() * precision)).clamp_min(1.0)
 
     @property
     def _weight(self) -> Tensor:
@@ -195,7 +178,7 @@ class NoiseCorrelation:
         (shift,), (variance,) = shared_shifts(observations, residual)
         shift[observations.seen[0].sum(1).numpy() < LEAST_POINTS] = np.nan
         shift[[camera for camera, settled in self.settled_at.items() if self.taken < settled]] = np.nan
-        self.shifts.append(np.concatenate((shift, variance[:, None]), axis=1))
+        self.shifts.append(shift)
         self.taken += 1
         scale = np.maximum(self.scale.numpy(), np.sqrt(variance))
         self.off = torch.from_numpy(np.square(shift / scale[:, None]).sum(1))
@@ -204,29 +187,19 @@ class NoiseCorrelation:
 
     def _measure(self) -> None:
         """Measure each camera alone and all together: cameras with few snapshots are assumed to be like the others."""
-        kept = np.stack(self.shifts)
-        series = kept[..., :2]
+        series = np.stack(self.shifts)
         seen = np.isfinite(series[..., 0])
         variance = np.nansum(np.square(series), axis=(0, 2)) / (2 * np.maximum(seen.sum(0), 1))
         whitened = series / np.sqrt(np.maximum(variance, 1e-12))[:, None]
         together = float(correlation_time(whitened[:, None])[0])
         time = np.maximum(correlation_time(series), max(together, self.usual))
         self.time = torch.from_numpy(time)
-        self.excess = torch.from_numpy(np.where(time > 1, self._measure_excess(series, kept[..., 2]), 1.0))
         # A passing error is rare and large: the tail of the distribution shows it better than the variance.
         length = np.where(seen, np.linalg.norm(series, axis=-1), np.nan)
         tail = np.nan_to_num(quantile_of_known(length, TAIL))
         self.lasting = torch.from_numpy(np.where(time > 1, tail / TAIL_SIGMAS, 0.0))
         usual = np.nan_to_num(median_of_known(length))
         self.scale = torch.from_numpy(np.maximum(usual / MEDIAN, LEAST_LASTING))
-
-    def _measure_excess(self, shifts: NDArray[np.float64], variance: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Compare shifts (S, C, 2) with their variance (S, C) by independent noise: (C,), at least 1."""
-        limit = LARGEST_SHIFT * np.sqrt(variance)[..., None]
-        squared = np.square(np.clip(shifts, -limit, limit)).sum(-1) / variance
-        seen = np.isfinite(squared)
-        mean = np.where(seen, squared, 0.0).sum(0) / np.maximum(2 * seen.sum(0), 1)
-        return np.maximum(mean / remaining_share(self.cameras), 1.0)
 
 
 def usual_time(seconds: float) -> float:

@@ -156,11 +156,11 @@ class RigMonitor:
     def _follow_noise(self, observations: Observations, residual: Tensor) -> None:
         """Update shake levels and error correlation times from a snapshot without suspicion."""
         self.shaking.observe(observations, residual)
-        measured, before = self.noise.time, self.noise.inflation
+        before = self.noise.time
         self.noise.add(observations, residual)
-        if self.noise.time is not measured:
+        if self.noise.time is not before:
             self._recent.lasting = self.noise.model_error
-            self.filter.rescale((self.noise.inflation / before).sqrt())
+            self.filter.rescale((self.noise.time / before).sqrt())
 
     def _is_new(self, age: int = 0) -> bool:
         """Tell whether hardly anything was known about the rig before the latest `age` snapshots."""

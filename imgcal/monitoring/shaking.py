@@ -89,11 +89,6 @@ def shared_shifts(observations: Observations, residual: Tensor) -> tuple[NDArray
     return np.einsum("scn,scni->sci", weight, residual.numpy()) / total[..., None], 1 / total
 
 
-def remaining_share(cameras: int) -> float:
-    """Share of the shifts' variance that the fit of the object's pose leaves in the residuals."""
-    return max(1 - 1.5 / cameras, 0.25)  # three values of the pose follow two coordinates of each camera
-
-
 def _smooth(shifts: NDArray[np.float64]) -> bool:
     """Tell whether successive shifts (S, C, 2) are smooth."""
     if len(shifts) < LEAST_SHIFTS:
@@ -146,8 +141,9 @@ class ShakeLevel:
         if not often.any():
             return
         found, expected = np.full((2, self.cameras), np.nan)
-        # The mean square of two coordinates has an exponential distribution. A constant shift is not shaking.
-        free = remaining_share(self.cameras)
+        # The mean square of two coordinates has an exponential distribution. The object's pose absorbs a part of the
+        # shifts. A constant shift is not shaking.
+        free = max(1 - 1.5 / self.cameras, 0.25)
         shifts = known[:, :2, often] - median_of_known(known[:, :2, often])
         found[often] = median_of_known(np.square(shifts).mean(1)) / (math.log(2) * free)
         expected[often] = median_of_known(known[:, 2, often])

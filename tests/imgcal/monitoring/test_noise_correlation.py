@@ -1,7 +1,6 @@
 """How long errors last: white noise stays as it is, errors that last count by their effective number."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from imgcal.monitoring.noise_correlation import (
     NoiseCorrelation,
     usual_time,
 )
-from imgcal.monitoring.shaking import remaining_share
 from imgcal.types import Observations
 
 SIGMA = 0.1
@@ -57,21 +55,9 @@ def test_errors_that_last_count_by_their_effective_number() -> None:
     assert 0.5 * expected < float(noise.time[0]) < 1.6 * expected
     noise.weigh(observations())  # the next one knows nothing of a snapshot before
     weighed = noise.weigh(observations())
-    assert torch.allclose(weighed.sigma[0, 0], SIGMA * noise.inflation[0].sqrt())
+    assert torch.allclose(weighed.sigma[0, 0], SIGMA * noise.time[0].sqrt())
     assert 0.7 * SIGMA < float(noise.lasting[0]) < 1.3 * SIGMA
     assert noise.episodes[0] == max(math.ceil(2 * float(noise.time[0])), 24)  # 0.4 s at 60 Hz
-
-
-def test_shifts_larger_than_independent_noise_would_make_them_count_less() -> None:
-    noise = follow([0.9, 0.0, 0.0, 0.0], count=MEMORY_SNAPSHOTS)
-    # A shift of one sigma beside five points of one sigma; no pose absorbs a part here.
-    expected = (1 + 1 / 5) * 5 / remaining_share(4)
-    assert 0.7 * expected < float(noise.excess[0]) < 1.4 * expected
-    assert float(noise.excess[1:].max()) < 2.0
-    noise.weigh(observations(4))  # the next one knows nothing of a snapshot before
-    shaking = replace(observations(4), shake=torch.tensor([[SIGMA, 0, 0, 0]], dtype=torch.float64))
-    ratio = float((noise.weigh(observations(4)).sigma / noise.weigh(shaking).sigma)[0, 0, 0])
-    assert ratio == pytest.approx(6**0.5)  # the shake explains that part
 
 
 def test_passing_errors_last_for_seconds_whatever_the_rate() -> None:
@@ -123,7 +109,7 @@ def test_an_image_that_was_off_a_moment_ago_counts_less() -> None:
     noise = follow([0.9, 0.9])
     seen, off = observations(), torch.zeros(1, 2, 5, 2, dtype=torch.float64)
     off[:, 0, :, 0] = 1.0
-    usual = SIGMA * noise.inflation.sqrt()
+    usual = SIGMA * noise.time.sqrt()
 
     def weights() -> list[float]:
         return (noise.weigh(seen).sigma[0, :, 0] / usual).pow(-2).tolist()
@@ -147,5 +133,5 @@ def test_the_mean_weight_of_usual_shifts_is_one() -> None:
         shift = 0.9 * shift + np.sqrt(1 - 0.81) * rng.normal(0, SIGMA, 2)
         residual = shift + rng.normal(0, SIGMA, (1, 1, 5, 2))
         noise.add(observations(1), torch.from_numpy(residual))
-        weights.append(SIGMA**2 * float(noise.inflation[0]) / float(noise.weigh(observations(1)).sigma[0, 0, 0]) ** 2)
+        weights.append(SIGMA**2 * float(noise.time[0]) / float(noise.weigh(observations(1)).sigma[0, 0, 0]) ** 2)
     assert 0.9 < np.mean(weights) < 1.1

@@ -96,7 +96,7 @@ def test_what_a_rig_file_may_hold_beside_its_cameras_is_gone_on_with(tmp_path: P
 
 def test_people_can_read_it(saved) -> None:
     content = json.loads(saved[0].read_text())
-    assert content["format"] == "imgcal-keeper/8"
+    assert content["format"] == "imgcal-keeper/7"
     assert content["sentence"].startswith("cam02 moved")
     assert content["snapshot"] == "00015"
     assert content["cameras"]["cam01"] == "ok"
