@@ -38,6 +38,7 @@ class Associations:
 
     detections: Detections  # `fiducial` filled in, -1 = not used
     snapshots: tuple[SnapshotIdentity, ...]  # S
+    rig: CameraRig | None = None  # to which the poses belong; None = the factory rig
 
     def __repr__(self) -> str:
         """Summarize how much was decided, and how."""
@@ -307,7 +308,7 @@ def refuse_snapshots(labelled: Associations, rows: Sequence[int], reason: str) -
         snapshots[number] = replace(snapshots[number], status="refused", reason=reason, rig_from_object=None)
     detections = labelled.detections
     fiducial = np.where(np.isin(detections.snapshot, numbers), -1, detections.fiducial)
-    return Associations(replace(detections, fiducial=fiducial), tuple(snapshots))
+    return replace(labelled, detections=replace(detections, fiducial=fiducial), snapshots=tuple(snapshots))
 
 
 def _gap(snapshot: int, accepted: NDArray[np.int64]) -> int:
