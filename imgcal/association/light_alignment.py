@@ -43,30 +43,44 @@ def epipolar_equations(xy, start, rotation, position, focal, scale, width, chanc
             most = max(most, start[s, c + 1] - start[s, c])
     weight, distance = np.empty((most, most)), np.empty((most, most))
     by_row, by_column = np.empty(most), np.empty(most)
-    jacobian = np.empty(2 * FREE)
+    line, spread1, spread2 = np.empty((most, 3)), np.empty(most), np.empty(most)
+    essential, jacobian, block = np.empty((3, 3)), np.empty(2 * FREE), np.empty((2 * FREE, 2 * FREE))
     cost, total = 0.0, 0.0
     information[:] = 0.0
     gradient[:] = 0.0
-    for s in range(len(start)):
-        for a in range(cameras):
-            for b in range(a + 1, cameras):
-                na, nb = start[s, a + 1] - start[s, a], start[s, b + 1] - start[s, b]
+    for a in range(cameras):
+        for b in range(a + 1, cameras):
+            _essential_matrix(rotation[a], rotation[b], position[a], position[b], essential)
+            block[:] = 0.0
+            for s in range(len(start)):
+                first, second = start[s, a], start[s, b]
+                na, nb = start[s, a + 1] - first, start[s, b + 1] - second
                 if na == 0 or nb == 0:
                     continue
-                for j in range(nb):
-                    by_column[j] = 0.0
                 for i in range(na):
                     by_row[i] = 0.0
+                    x, y = xy[first + i, 0], xy[first + i, 1]
+                    for k in range(3):
+                        line[i, k] = essential[0, k] * x + essential[1, k] * y + essential[2, k]
+                    spread2[i] = (line[i, 0] / focal[b, 0]) ** 2 + (line[i, 1] / focal[b, 1]) ** 2
+                for j in range(nb):
+                    by_column[j] = 0.0
+                    x, y = xy[second + j, 0], xy[second + j, 1]
+                    across = essential[0, 0] * x + essential[0, 1] * y + essential[0, 2]
+                    down = essential[1, 0] * x + essential[1, 1] * y + essential[1, 2]
+                    spread1[j] = (across / focal[a, 0]) ** 2 + (down / focal[a, 1]) ** 2
+                for i in range(na):
                     for j in range(nb):
-                        e = _distance(
-                            xy[start[s, a] + i], xy[start[s, b] + j], rotation[a], rotation[b],
-                            position[a], position[b], focal[a], focal[b], jacobian, False,
-                        )  # fmt: skip
-                        square = (e / width) ** 2
-                        w = math.exp(-0.5 * square) if square < CUT else 0.0
-                        weight[i, j], distance[i, j] = w, e
-                        by_row[i] += w
-                        by_column[j] += w
+                        weight[i, j] = 0.0
+                        t = line[i, 0] * xy[second + j, 0] + line[i, 1] * xy[second + j, 1] + line[i, 2]
+                        square, unit = t * t, width**2 * (spread1[j] + spread2[i])
+                        if square < CUT * unit and _are_in_front(
+                            xy[first + i], xy[second + j], rotation[a], rotation[b], position[a], position[b]
+                        ):
+                            weight[i, j] = math.exp(-0.5 * square / unit)
+                            distance[i, j] = t / math.sqrt(spread1[j] + spread2[i])
+                            by_row[i] += weight[i, j]
+                            by_column[j] += weight[i, j]
                 for i in range(na):
                     cost -= math.log(by_row[i] + chance)
                     for j in range(nb):
@@ -76,56 +90,76 @@ def epipolar_equations(xy, start, rotation, position, focal, scale, width, chanc
                         if r < 0.05:
                             continue
                         total += r
-                        _distance(
-                            xy[start[s, a] + i], xy[start[s, b] + j], rotation[a], rotation[b],
-                            position[a], position[b], focal[a], focal[b], jacobian, True,
+                        _distance_jacobian(
+                            xy[first + i], xy[second + j], rotation[a], rotation[b], position[a], position[b],
+                            focal[a], focal[b], jacobian,
                         )  # fmt: skip
                         for k in range(FREE):
                             jacobian[k] *= scale[a, k]
                             jacobian[FREE + k] *= scale[b, k]
                         r *= REDUNDANCY / width**2
                         for k in range(2 * FREE):
-                            row = a * FREE + k if k < FREE else b * FREE + k - FREE
-                            first = r * jacobian[k]
-                            gradient[row] += first * distance[i, j]
+                            one = r * jacobian[k]
+                            gradient[a * FREE + k if k < FREE else b * FREE + k - FREE] += one * distance[i, j]
                             for m in range(2 * FREE):
-                                column = a * FREE + m if m < FREE else b * FREE + m - FREE
-                                information[row, column] += first * jacobian[m]
+                                block[k, m] += one * jacobian[m]
+            for k in range(2 * FREE):
+                row = a * FREE + k if k < FREE else b * FREE + k - FREE
+                for m in range(2 * FREE):
+                    information[row, a * FREE + m if m < FREE else b * FREE + m - FREE] += block[k, m]
     return cost, total
 
 
 @njit(cache=True, error_model="numpy")
-def _distance(one, two, rotation1, rotation2, position1, position2, focal1, focal2, jacobian, with_jacobian):
-    """Distance (px) of two blobs from showing one point (Sampson's), inf behind a camera; derivatives on request."""
-    x1, y1, x2, y2 = one[0], one[1], two[0], two[1]
-    ax = rotation1[0, 0] * x1 + rotation1[1, 0] * y1 + rotation1[2, 0]
-    ay = rotation1[0, 1] * x1 + rotation1[1, 1] * y1 + rotation1[2, 1]
-    az = rotation1[0, 2] * x1 + rotation1[1, 2] * y1 + rotation1[2, 2]
-    bx = rotation2[0, 0] * x2 + rotation2[1, 0] * y2 + rotation2[2, 0]
-    by = rotation2[0, 1] * x2 + rotation2[1, 1] * y2 + rotation2[2, 1]
-    bz = rotation2[0, 2] * x2 + rotation2[1, 2] * y2 + rotation2[2, 2]
+def _essential_matrix(rotation1, rotation2, position1, position2, essential):
+    """Fill in E: x1 E x2 = 0 for images x1, x2 (homogeneous, on the planes z = 1) of one point."""
     px, py, pz = position2[0] - position1[0], position2[1] - position1[1], position2[2] - position1[2]
-    # normals: n1 = d2 x b, n2 = b x d1; t = d1 . n1 = d2 . n2
+    for k in range(3):
+        dx, dy, dz = rotation2[k, 0], rotation2[k, 1], rotation2[k, 2]
+        nx, ny, nz = dy * pz - dz * py, dz * px - dx * pz, dx * py - dy * px
+        for m in range(3):
+            essential[m, k] = rotation1[m, 0] * nx + rotation1[m, 1] * ny + rotation1[m, 2] * nz
+
+
+@njit(cache=True, error_model="numpy")
+def _ray(rotation, blob):
+    """Direction of a blob in the rig's frame."""
+    return (
+        rotation[0, 0] * blob[0] + rotation[1, 0] * blob[1] + rotation[2, 0],
+        rotation[0, 1] * blob[0] + rotation[1, 1] * blob[1] + rotation[2, 1],
+        rotation[0, 2] * blob[0] + rotation[1, 2] * blob[1] + rotation[2, 2],
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _are_in_front(one, two, rotation1, rotation2, position1, position2):
+    """Tell whether two rays are nearest to each other in front of both cameras."""
+    ax, ay, az = _ray(rotation1, one)
+    bx, by, bz = _ray(rotation2, two)
+    px, py, pz = position2[0] - position1[0], position2[1] - position1[1], position2[2] - position1[2]
+    aa, bb, ab = ax * ax + ay * ay + az * az, bx * bx + by * by + bz * bz, ax * bx + ay * by + az * bz
+    pa, pb = px * ax + py * ay + pz * az, px * bx + py * by + pz * bz
+    return pa * bb - pb * ab > 0 and pa * ab - pb * aa > 0
+
+
+@njit(cache=True, error_model="numpy")
+def _distance_jacobian(one, two, rotation1, rotation2, position1, position2, focal1, focal2, jacobian):
+    """Fill in the derivatives of the distance (px) of two blobs from showing one point (Sampson's)."""
+    x1, y1, x2, y2 = one[0], one[1], two[0], two[1]
+    ax, ay, az = _ray(rotation1, one)
+    bx, by, bz = _ray(rotation2, two)
+    px, py, pz = position2[0] - position1[0], position2[1] - position1[1], position2[2] - position1[2]
+    # normals: n1 = d2 x b, n2 = b x d1
     n1x, n1y, n1z = by * pz - bz * py, bz * px - bx * pz, bx * py - by * px
     n2x, n2y, n2z = py * az - pz * ay, pz * ax - px * az, px * ay - py * ax
-    t = ax * n1x + ay * n1y + az * n1z
     q10 = rotation1[0, 0] * n1x + rotation1[0, 1] * n1y + rotation1[0, 2] * n1z
     q11 = rotation1[1, 0] * n1x + rotation1[1, 1] * n1y + rotation1[1, 2] * n1z
+    q12 = rotation1[2, 0] * n1x + rotation1[2, 1] * n1y + rotation1[2, 2] * n1z
     q20 = rotation2[0, 0] * n2x + rotation2[0, 1] * n2y + rotation2[0, 2] * n2z
     q21 = rotation2[1, 0] * n2x + rotation2[1, 1] * n2y + rotation2[1, 2] * n2z
+    q22 = rotation2[2, 0] * n2x + rotation2[2, 1] * n2y + rotation2[2, 2] * n2z
     own = (q10 / focal1[0]) ** 2 + (q11 / focal1[1]) ** 2
     spread = math.sqrt(own + (q20 / focal2[0]) ** 2 + (q21 / focal2[1]) ** 2)
-    if not spread > 0:
-        return np.inf
-    if not with_jacobian:
-        # In front of both cameras: along1 and along2 of the nearest points, up to a positive factor.
-        aa, bb, ab = ax * ax + ay * ay + az * az, bx * bx + by * by + bz * bz, ax * bx + ay * by + az * bz
-        pa, pb = px * ax + py * ay + pz * az, px * bx + py * by + pz * bz
-        if pa * bb - pb * ab <= 0 or pa * ab - pb * aa <= 0:
-            return np.inf
-        return t / spread
-    q12 = rotation1[2, 0] * n1x + rotation1[2, 1] * n1y + rotation1[2, 2] * n1z
-    q22 = rotation2[2, 0] * n2x + rotation2[2, 1] * n2y + rotation2[2, 2] * n2z
     cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx  # d1 x d2
     # rotations: -(m x q)
     jacobian[0], jacobian[1], jacobian[2] = q11 - y1 * q12, x1 * q12 - q10, y1 * q10 - x1 * q11
@@ -138,7 +172,6 @@ def _distance(one, two, rotation1, rotation2, position1, position2, focal1, foca
     jacobian[18], jacobian[19] = -q20 / focal2[0], -q21 / focal2[1]
     for k in range(2 * FREE):
         jacobian[k] /= spread
-    return t / spread
 
 
 @njit(cache=True, error_model="numpy")

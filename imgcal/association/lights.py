@@ -181,6 +181,7 @@ def align_rig(
     pairs = (counts.sum(1) ** 2 - (counts**2).sum(1)) // 2
     order = np.random.default_rng(seed).permutation(np.flatnonzero(pairs > 0))
     order = order[np.cumsum(pairs[order]) <= max(MOST_PAIRS, int(pairs[order[:1]].sum()))]
+    some = detections.select(blobs.row[np.isin(detections.snapshot[blobs.row], order)])  # sorted: sorting again is fast
     size, whitening = FREE * rig.num_cameras, std[:, :FREE].double()
     scale = np.ascontiguousarray(whitening.numpy())
     information, gradient = np.empty((size, size)), np.empty(size)
@@ -188,7 +189,7 @@ def align_rig(
     width = float(np.sqrt(2) * np.median(image_error(rig, std)))
     cost, weight = 0.0, 1.0
     for _ in range(STEPS):
-        there = sort_blobs(detections.select(np.isin(detections.snapshot, order)), now)
+        there = sort_blobs(some, now)
         focal, rotation, position = (
             np.ascontiguousarray(t.double().numpy())
             for t in (now.focal_length, now.cam_from_rig.rotation, now.positions)

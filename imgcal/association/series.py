@@ -39,6 +39,7 @@ class Associations:
 
     detections: Detections  # `fiducial` filled in, -1 = not used
     snapshots: tuple[SnapshotIdentity, ...]  # S
+    rig: CameraRig | None = None  # to which the poses belong; None = the factory rig
 
     def __repr__(self) -> str:
         """Summarize how much was decided, and how."""
@@ -325,7 +326,7 @@ def refuse_snapshots(labelled: Associations, rows: Sequence[int], reason: str) -
         snapshots[number] = replace(snapshots[number], status="refused", reason=reason, rig_from_object=None)
     detections = labelled.detections
     fiducial = np.where(np.isin(detections.snapshot, numbers), -1, detections.fiducial)
-    return Associations(replace(detections, fiducial=fiducial), tuple(snapshots))
+    return replace(labelled, detections=replace(detections, fiducial=fiducial), snapshots=tuple(snapshots))
 
 
 def _continue(before: RigidTransform, last: RigidTransform, points: Tensor) -> RigidTransform:

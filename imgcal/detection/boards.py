@@ -36,6 +36,8 @@ LEAST_ON_LAYOUT = 0.7
 """Smallest share of the markers that must agree with the layout."""
 CONTRAST = 0.25
 """Contrast relative to that inside the board, from which the pattern continues beyond the grid's edge."""
+ALTERNATING = 0.8
+"""Correlation of grey values with the colours of squares, from which the pattern continues beyond the grid's edge."""
 MOST_LOOKED = 8
 """Most frames that are examined to explain why a board was not found."""
 OTHER_SIZES = 2
@@ -287,17 +289,37 @@ def _grey_at(grey: NDArray[np.uint8], uv: Floats) -> Floats:
 def _continues(grey: NDArray[np.uint8], grid: Floats) -> bool:
     """Check whether the squares continue beyond a side of the grid: then the board is larger than expected."""
     for side in (grid, grid[::-1], grid.transpose(1, 0, 2), grid[:, ::-1].transpose(1, 0, 2)):
-        # Centres of the squares beyond the side and one row farther in: white paper, or squares of two colours.
-        first, second = (side[0, 1:] + side[0, :-1]) / 2, (side[1, 1:] + side[1, :-1]) / 2
-        inner = _grey_at(grey, (first + second) / 2)
-        outer = _grey_at(grey, first + 1.5 * (first - second))
-        inside, beyond = np.diff(inner), np.diff(outer)
-        contrast = max(float(np.abs(inside).mean()), 1.0)
-        if len(beyond) == 0 or not np.isfinite(beyond).all() or np.abs(beyond).mean() < CONTRAST * contrast:
+        rows, count = min(3, len(side)), side.shape[1] - 1
+        if count < 2:
             continue
-        if max((beyond * inside > 0).mean(), (beyond * inside < 0).mean()) > 0.8:
+        corners = np.stack(np.meshgrid(np.arange(count + 1.0), np.arange(float(rows))), -1).reshape(-1, 2)
+        matrix, _ = cv2.findHomography(corners, side[:rows].reshape(-1, 2))
+        # The last squares of the board lie beyond the side; the next ones would be these.
+        inner, beyond = (_grey_of_squares(grey, matrix, count, row) for row in (0.5, -1.5))
+        if not np.isfinite(beyond).all():
+            continue
+        sign = np.resize((1.0, -1.0), count)
+        sign -= sign.mean()
+        # Objects behind the board may be light and dark in turn, but they are not as even as squares.
+        contrast, usual = (abs(sign @ grey_values.mean(1)) / (count * sign.std()) for grey_values in (beyond, inner))
+        if contrast > max(CONTRAST * usual, ALTERNATING * beyond.std()):
             return True
     return False
+
+
+def _grey_of_squares(grey: NDArray[np.uint8], matrix: Any, count: int, row: float) -> Floats:
+    """Grey values at nine points of each square of a row: (count, 9); nan outside.
+
+    Args:
+        grey: the frame.
+        matrix: (3, 3) homography from columns and rows of corners to pixels.
+        count: number of squares, the first between corners 0 and 1.
+        row: of their centres.
+    """
+    around = np.stack(np.meshgrid((-0.25, 0.0, 0.25), (-0.25, 0.0, 0.25)), -1).reshape(-1, 2)
+    centres = np.column_stack((np.arange(count) + 0.5, np.full(count, row)))
+    points = (centres[:, None] + around).reshape(-1, 1, 2)
+    return _grey_at(grey, cv2.perspectiveTransform(points, matrix)[:, 0]).reshape(count, -1)
 
 
 _FINDERS: dict[str, Callable[[NDArray[np.uint8], Board], _Seen | None]] = {

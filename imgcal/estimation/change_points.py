@@ -60,8 +60,8 @@ class Blocks:
 
     camera: Array  # (S, V, K, K) information of the labels
     gradient: Array  # (S, V, K) with clipped residuals
-    coupling: Array  # (S, 6, K V) with the whitened pose
-    pull: Array  # (S, 6) gradient by the whitened pose
+    coupling: Array  # (S, P, K V) with the whitened pose: six values, three of a single point
+    pull: Array  # (S, P) gradient by the whitened pose
     prior: Array  # (V, K) offsets, which are the prior's gradient
 
     @cached_property
@@ -132,6 +132,8 @@ def linearize_snapshots(problem: Problem, state: State) -> Blocks:
     lower = torch.linalg.cholesky(full.pose[:, 0])
     coupling = torch.linalg.solve_triangular(lower, full.coupling[:, 0].flatten(1, 2).mT, upper=False)
     pull = torch.linalg.solve_triangular(lower, clipped.pose_gradient[:, 0, :, None], upper=False)[..., 0]
+    turned = (coupling != 0).any(2).any(0)  # cameras do not see a single point turn
+    coupling, pull = coupling[:, turned], pull[:, turned]
     # Every snapshot's equations contain the prior; it must count only once.
     gradient = clipped.camera_gradient - state.offset
     camera = full.camera - torch.eye(full.camera.shape[-1], dtype=lower.dtype)

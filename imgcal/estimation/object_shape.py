@@ -175,6 +175,8 @@ def scale_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Sca
     Returns:
         The evidence; None where rig and poses are undetermined.
     """
+    if not bool(problem.points.any()):  # one point has no scale
+        return ScaleEvidence((0.0, np.inf))
     found = direction_evidence(problem, solution, loss, problem.points[None])
     if found is None:
         return None

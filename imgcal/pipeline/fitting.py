@@ -160,7 +160,7 @@ def _fit_once(
     problem = make_problem(observations, rig, _adopt_tolerances(obj, latest), prior)
     guess = None if known.initializer is None else known.initializer.guess(observations, rig, obj)
     guess_used = guess is not None and _is_nearer(guess, Prediction(rig, arranged.poses), observations, obj)
-    first = Start(initial_state(problem, arranged.poses, None), options.identity_error)
+    first = Start(initial_state(problem, arranged.poses, labelled.rig), options.identity_error)
     if known.fits:
         first = replace(first, solution=known.fits[0], nearer=known.fits[-1].state)
     if guess is not None and guess_used:

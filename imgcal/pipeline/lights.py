@@ -168,7 +168,8 @@ def find_lights(
     if not len(found):
         raise RefusedError(NOTHING)
     blob = np.flatnonzero(~background)[found.row[found.row >= 0]]
-    return FoundLights(rows_of_lights(found, moving), detections, blob, background, agreement, starts)
+    labelled = replace(rows_of_lights(found, moving), rig=verified)
+    return FoundLights(labelled, detections, blob, background, agreement, starts)
 
 
 def rows_of_lights(lights: Lights, detections: Detections) -> Associations:

@@ -184,7 +184,7 @@ def _fit(arranged: LabelledCapture, rig: CameraRig, obj: CalibrationObject, opti
     observations = arranged.observations
     own, seen = observations.sigma.square(), observations.seen
     problem = make_problem(observations, rig, obj, None)
-    state, noise = initial_state(problem, arranged.poses, None), own + options.identity_error**2
+    state, noise = initial_state(problem, arranged.poses, arranged.labelled.rig), own + options.identity_error**2
     solutions: list[Solution] = []
     for _ in range(2):
         problem = replace(problem, root_weight=torch.where(seen, noise.rsqrt(), 0.0)[None])
@@ -230,7 +230,7 @@ def _label_again(
     taken = here & agreed[snapshot]
     fiducial, row = detections.fiducial.copy(), detections.snapshot.copy()
     fiducial[rows], row[rows] = np.where(taken, new, old), np.where(taken, snapshot, row[rows])
-    return Associations(replace(detections, fiducial=fiducial, snapshot=row), labelled.snapshots)
+    return replace(labelled, detections=replace(detections, fiducial=fiducial, snapshot=row))
 
 
 def _row_of(

@@ -90,8 +90,12 @@ def _are_equal(uv: NDArray[np.float64], camera: NDArray[np.int64], begins: NDArr
         return begins
     sizes = np.diff(np.append(begins, len(uv)))
     sums = np.column_stack((camera[begins], sizes, np.add.reduceat(uv, begins)))
-    _, inverse, counts = np.unique(sums, axis=0, return_inverse=True, return_counts=True)
-    return np.flatnonzero((counts[inverse.reshape(-1)] > 1) & (sizes >= LEAST_BLOBS))
+    order = np.lexsort(sums.T)
+    next_equal = (sums[order[1:]] == sums[order[:-1]]).all(1)
+    equal = np.zeros(len(sums), dtype=np.bool_)
+    equal[order[1:]] |= next_equal
+    equal[order[:-1]] |= next_equal
+    return np.flatnonzero(equal & (sizes >= LEAST_BLOBS))
 
 
 def name_repeats(labelled: Associations, repeats: Repeats) -> Associations:

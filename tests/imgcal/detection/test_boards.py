@@ -67,3 +67,19 @@ def test_says_why_a_board_is_not_found(kind, change, words):
     _, frames = seen(printed, rig)
     with pytest.raises(InputError, match=words):
         imgcal.detect(frames, board=replace(printed.board, **change))
+
+
+def test_clutter_behind_a_board_is_no_further_row_of_squares():
+    obj = imgcal.load_object("checkerboard")
+    columns, rows, size = obj.board.columns, obj.board.rows, 32
+    random = np.random.default_rng(3)
+    frame = np.kron(random.integers(30, 220, (4 * (rows + 6), 4 * (columns + 6))), np.ones((size // 4,) * 2))
+    for column in range(columns):  # light and dark in turn, where the next row of squares would be
+        at = 3 * size + column * size
+        frame[2 * size + 8 : 2 * size + 24, at + 8 : at + 24] = 60 + 100 * (column % 2)
+    margin = slice(3 * size - 12, (3 + rows) * size + 12), slice(3 * size - 12, (3 + columns) * size + 12)
+    frame[margin] = 255
+    squares = np.kron(np.add.outer(np.arange(rows), np.arange(columns)) % 2, np.ones((size, size)))
+    frame[3 * size : (3 + rows) * size, 3 * size : (3 + columns) * size] = 20 + 220 * squares
+    found = imgcal.detect({"camera": frame.astype(np.uint8)}, board=obj.board)
+    assert len(found.fiducial) == obj.num_fiducials

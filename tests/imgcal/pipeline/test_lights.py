@@ -155,3 +155,16 @@ def test_unknown_markers_beside_a_known_object_take_part() -> None:
     assert found.predicted_error.median_mm < 1.1 * alone.predicted_error.median_mm
     assert 0.9 < float(found.chi2_per_dof) < 1.1
     assert {row.part for row in rows.snapshots if row.status != "refused"} == {0, 1}
+
+
+def test_first_poses_belong_to_the_rig_of_the_labels(scene: Scene, result: imgcal.Calibration) -> None:
+    assert result.lights is not None
+    labelled = result.lights.labelled
+    assert labelled.rig is not None
+    blobs, last = labelled.detections, scene.factory.num_cameras - 1
+    rows = np.flatnonzero((blobs.camera == last) & (blobs.fiducial == 0))
+    poses = [labelled.snapshots[row].rig_from_object for row in blobs.snapshot[rows]]
+    points = torch.stack([pose.translation for pose in poses if pose is not None])
+    off = labelled.rig.project(points).uv[last] - torch.from_numpy(blobs.uv[rows])
+    assert float(off.norm(dim=-1).median()) < 1
+    assert float((scene.factory.project(points).uv[last] - torch.from_numpy(blobs.uv[rows])).norm(dim=-1).median()) > 5
