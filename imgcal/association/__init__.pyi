@@ -13,9 +13,9 @@ from .series import (
     associate,
     drop_snapshots,
     match_to_rig,
-    refuse_snapshots,
 )
 from .single_image_labels import is_small_planar, label_by_shape
+from .snapshot_poses import fit_snapshot_poses, refuse_unfit
 from .tracker import SnapshotIdentity, Tracker, to_observations
 
 __all__ = [
@@ -42,6 +42,7 @@ __all__ = [
     "drop_merged",
     "drop_snapshots",
     "find_merged",
+    "fit_snapshot_poses",
     "identify",
     "image_error",
     "is_small_planar",
@@ -56,7 +57,7 @@ __all__ = [
     "pattern_prior",
     "predicted_misses",
     "proposal_rows",
-    "refuse_snapshots",
+    "refuse_unfit",
     "relocalize",
     "to_observations",
     "track",

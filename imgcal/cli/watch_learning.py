@@ -59,6 +59,7 @@ GRACE = 6.0  # s in which a training has to stop after the watching process has 
 NEAR = 5.0  # px within which a claim is right
 TURNED_DEG, ASIDE = 1.0, 0.01  # errors of the pose that networks are given: degrees, and parts of the distance
 SIGMAS = 2.0  # by which an adapted network must be better
+LATEST = 3  # one of so many held-out snapshots, the latest, in whose light it must not be worse
 LESS_EXACT, EXACT = 1.25, 0.3  # its error: at most so many times the other's, unless it is so small (px)
 GROWTH = 1.5  # times the snapshots that had been taken at the last training, until the next
 
@@ -114,6 +115,8 @@ class Scores:
     def is_better(self, other: Scores) -> bool:
         """Tell whether this is better than `other` on the same snapshots by more than its uncertainty, and as exact.
 
+        The light may have changed since most snapshots were kept, so it must not be worse on the latest, either.
+
         Examples:
             >>> scores = lambda right: Scores(*(np.full(4, n) for n in (8, right, 8, 0.1)), np.full(4, True))
             >>> scores(8).is_better(scores(7)), scores(8).is_better(scores(8))
@@ -122,7 +125,9 @@ class Scores:
         gain = self.quality - other.quality
         sigma = gain.std(ddof=1) / np.sqrt(len(gain))
         exact = self.off < EXACT or not other.right.any() or self.off < LESS_EXACT * other.off
-        return bool(gain.mean() > SIGMAS * sigma and exact and self.decided.sum() >= other.decided.sum())
+        latest = gain[-max(len(gain) // LATEST, 1) :]
+        better = gain.mean() > SIGMAS * sigma and latest.mean() >= 0
+        return bool(better and exact and self.decided.sum() >= other.decided.sum())
 
 
 class Learner:

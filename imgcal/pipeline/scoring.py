@@ -14,11 +14,11 @@ from imgcal.association import (
     Progress,
     accepted_observations,
     associate,
-    refuse_snapshots,
+    fit_snapshot_poses,
+    refuse_unfit,
 )
 from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
-from imgcal.estimation import estimate
 from imgcal.pipeline.board_turns import settle_turns
 from imgcal.pipeline.lights import FoundLights, find_lights
 from imgcal.pipeline.recalibration import as_one, without_pattern
@@ -31,7 +31,6 @@ OUTLYING = 10.0
 ROUNDS = 5
 LEAST_POINTS, LEAST_OF_LIGHT = 6, 2
 """Minimum number of points in a snapshot for a pose; the same for one light."""
-NO_POSE = "no pose of the object fits what the cameras see"
 
 
 def rms_length(residual: Tensor, seen: Tensor) -> float | None:
@@ -136,40 +135,21 @@ def _fit_poses(labelled: Associations, rig: CameraRig, obj: CalibrationObject, o
     observations, poses = accepted_observations(labelled, rig, obj)
     if obj.unknown_markers:
         poses = None  # those are of the rig by which the markers were found
-    fixed = torch.zeros(rig.num_cameras, rig.num_parameters, dtype=rig.distortion.dtype)
     # What is reported is an RMS in pixels: centres count alike, however well each was measured.
     even = replace(observations, sigma=torch.full_like(observations.sigma, options.identity_error))
     least, solver = LEAST_POINTS, options.estimation
     if obj.pose_rank == 3:  # plain triangulation: a robust one has several minima where a rig is far off
         least, solver = LEAST_OF_LIGHT, replace(options.estimation, loss="squared")
-    even = replace(even, uv=even.uv[:, None], sigma=even.sigma[:, None], seen=even.seen[:, None])
-    poses, rigs = None if poses is None else poses.reshape(-1, 1), rig.expand(len(even.seen))
     for _ in range(ROUNDS):
-        # With a fixed rig, every snapshot is a problem of its own.
-        fit = estimate(even, rigs, obj.taken_as_exact(), poses, prior_std=fixed, options=solver)
-        if not bool(fit.converged.all()):
-            return _fit_poses(_drop_unfit(labelled, ~fit.converged), rig, obj, options)
-        poses = fit.rig_from_object
-        points = poses.apply(obj.points.to(rig.focal_length))[:, 0]
+        poses, fits = fit_snapshot_poses(even, rig, obj, poses, solver)
+        if not bool(fits.all()):
+            return _fit_poses(refuse_unfit(labelled, fits, "score"), rig, obj, options)
+        points = poses.apply(obj.points.to(rig.focal_length))
         residual = rig.expand(len(points)).project_values(points, obj.radius).uv - observations.uv
         scored = RigScore(labelled, torch.where(observations.seen[..., None], residual, 0.0), observations.seen)
         # Most fiducials determine the poses, too: outliers must not pull them.
         kept = observations.seen & ~scored.outliers
-        if bool((kept == even.seen[:, 0]).all()) or bool((kept.flatten(1).sum(1) < least).any()):
+        if bool((kept == even.seen).all()) or bool((kept.flatten(1).sum(1) < least).any()):
             break
-        even = replace(even, seen=kept[:, None])
+        even = replace(even, seen=kept)
     return scored
-
-
-def _drop_unfit(labelled: Associations, unfit: Tensor) -> Associations:
-    """Refuse the snapshots (U,) that no pose of the object fits.
-
-    Raises:
-        RefusedError: these are more than half of them.
-    """
-    count = int(unfit.sum())
-    if 2 * count > len(unfit):
-        raise RefusedError(
-            f"score: {NO_POSE} in {count} of {len(unfit)} snapshots: the rig or the object is not the one in the images"
-        )
-    return refuse_snapshots(labelled, unfit.nonzero().flatten().tolist(), NO_POSE)

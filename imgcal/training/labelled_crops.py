@@ -7,7 +7,7 @@ learns your own markers, lamps, lenses and walls.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -15,15 +15,24 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from imgcal.association import Associations, PipelineOptions, Progress, Sight, accepted_observations, associate
+from imgcal.association import (
+    Associations,
+    PipelineOptions,
+    Progress,
+    Sight,
+    accepted_observations,
+    associate,
+    fit_snapshot_poses,
+    refuse_unfit,
+)
 from imgcal.detection import DetectionOptions, Frame
 from imgcal.errors import RefusedError
-from imgcal.estimation import estimate
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.matching import measure_markers
 from imgcal.messages import plural
 from imgcal.networks import Expectation, Tiles, cut_crops, cut_patches
 from imgcal.training.frame_dataset import FrameDataset, PatchDataset
+from imgcal.training.usual_look import fit_to_light, usual_look
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 
 COPIES = 3
@@ -38,12 +47,8 @@ LARGEST_PATCH_SIGMA = 1.0
 """Pixels: where a projection is known less well, it says nothing of a marker's exact place."""
 LEAST_SEEN = 3
 """Markers that a crop must show."""
-ALIKE, LEAST_LIGHT = 0.5, 0.4
-"""Correlation with the usual look of the capture's markers, and part of their usual light, from which one is seen."""
 BRIGHTEST = 3
 """Crop pixels, each way, within which a marker is brightest."""
-SNAPSHOTS_LOOKED_AT = 20
-"""Snapshots that tell how markers usually look."""
 LARGEST_SIGMA = 1.0
 """Crop pixels: largest standard deviation of a projection that serves as a label."""
 FARTHEST = 4.0
@@ -85,16 +90,17 @@ def cut_labelled(
         Crops and patches of all snapshots that can be decided; `split` holds some of each out.
 
     Raises:
-        RefusedError: no snapshot can be decided, or no pose fits.
+        RefusedError: no snapshot can be decided, or no pose fits most of them.
     """
     rig, options = rig.to(torch.float64), options.of_object(obj)
     labelled = associate(detections, rig, obj, options, progress, sight)
-    observations, poses = fit_poses(labelled, rig, obj, options)
+    used, observations, poses = fit_poses(labelled, rig, obj, options)
+    observations, poses = fit_to_light(frames, used, rig, obj, (observations, poses), detection, options.estimation)
     generator = torch.Generator().manual_seed(seed)
-    numbers: Iterable[int] = range(len(labelled.used))
-    parts, patches, look = [], [], usual_look(frames, labelled.used, rig, obj, poses, detection)
-    for row in progress(numbers, len(labelled.used)) if progress else numbers:
-        snapshot = labelled.used[row]
+    numbers: Iterable[int] = range(len(used))
+    parts, patches, look = [], [], usual_look(frames, used, rig, obj, poses, detection)
+    for row in progress(numbers, len(used)) if progress else numbers:
+        snapshot = used[row]
         shown, pose = frames(snapshot), poses[row : row + 1]
         seen, sigma = find_visible(shown, rig, obj, pose, observations.of_snapshots([row]), detection)
         if look is not None:
@@ -111,18 +117,19 @@ def cut_labelled(
 
 def fit_poses(
     labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
-) -> tuple[Observations, RigidTransform]:
-    """Fit the object's pose in every conclusive snapshot, with a fixed rig: observations (S, C, N), poses (S,).
+) -> tuple[Sequence[int], Observations, RigidTransform]:
+    """Fit the object's pose in every conclusive snapshot, with a fixed rig; snapshots that no pose fits are left out.
+
+    Returns:
+        Numbers of the S snapshots, observations (S, C, N) and poses (S,).
 
     Raises:
-        RefusedError: no pose fits.
+        RefusedError: no pose fits most of them.
     """
-    observations, poses = accepted_observations(labelled, rig, obj)
-    fixed = torch.zeros(*rig.distortion.shape[:-1], rig.num_parameters, dtype=rig.distortion.dtype)
-    fit = estimate(observations, rig, obj.taken_as_exact(), poses, prior_std=fixed, options=options.estimation)
-    if not bool(fit.converged):
-        raise RefusedError("harvest: no pose of the object fits in at least one snapshot; check the rig and the object")
-    return observations, fit.rig_from_object
+    observations, start = accepted_observations(labelled, rig, obj)
+    poses, fits = fit_snapshot_poses(observations, rig, obj, start, options.estimation)
+    used = refuse_unfit(labelled, fits, "harvest").used
+    return used, observations.of_snapshots(fits), poses[fits]
 
 
 def find_visible(
@@ -184,69 +191,6 @@ def find_shown(
     return seen if look is None else seen | look.shows(frames, rig, Expectation.of(rig, obj, pose), detection)
 
 
-@dataclass(frozen=True)
-class Look:
-    """How the markers of a capture look, whatever their shape."""
-
-    patch: Tensor  # (24, 24) light of the usual marker, without its mean
-    light: float  # how strongly it shows: `_patches` of it
-
-    @torch.no_grad()
-    def shows(
-        self, frames: Mapping[str, Frame | None], rig: CameraRig, expected: Expectation, detection: DetectionOptions
-    ) -> Tensor:
-        """Tell which of the expected fiducials (1, C, N) look like the others: (C, N) bool."""
-        patches, light = _patches(frames, rig, expected, detection)
-        alike = (patches * self.patch).sum((-1, -2)) / (light * self.patch.norm()).clamp(min=1e-9)
-        return (alike > ALIKE) & (light > LEAST_LIGHT * self.light) & expected.visible[0]
-
-
-def usual_look(
-    frames: Callable[[int], Mapping[str, Frame | None]],
-    snapshots: Sequence[int],
-    rig: CameraRig,
-    obj: CalibrationObject,
-    poses: RigidTransform,
-    detection: DetectionOptions,
-) -> Look | None:
-    """Find out how most markers look, at their projections in some of the snapshots with poses (S,).
-
-    Returns:
-        None where they look like nothing that recurs.
-    """
-    every = max(len(snapshots) // SNAPSHOTS_LOOKED_AT, 1)
-    patches, light = [], []
-    for row in range(0, len(snapshots), every):
-        expected = Expectation.of(rig, obj, poses[row : row + 1])
-        own, strength = _patches(frames(snapshots[row]), rig, expected, detection)
-        kept = expected.visible[0] & (strength > 0)
-        patches.append(own[kept])
-        light.append(strength[kept])
-    all_patches, all_light = torch.cat(patches), torch.cat(light)
-    if not len(all_light):
-        return None
-    # The median pixel by pixel: a marker that is hidden, or another one beside it, does not show in it.
-    usual = (all_patches / all_light[:, None, None]).median(0).values
-    usual = usual - usual.mean()
-    alike = (all_patches * usual).sum((-1, -2)) / (all_light * usual.norm()).clamp(min=1e-9)
-    if float(alike.median()) < ALIKE:
-        return None
-    return Look(usual, float(all_light.median()))
-
-
-def _patches(
-    frames: Mapping[str, Frame | None], rig: CameraRig, expected: Expectation, detection: DetectionOptions
-) -> tuple[Tensor, Tensor]:
-    """Cut patches around expected fiducials (1, C, N): less their mean (C, N, 24, 24), and the norm of that (C, N)."""
-    radius = expected.radius[0].clamp(0.5, 64)
-    patches, _ = cut_patches(
-        frames, rig.camera_names, expected.uv[0], radius, inverted=detection.polarity == "dark"
-    )  # fmt: skip
-    patches = patches - patches.flatten(2).nanmean(-1)[..., None, None]
-    patches = patches.nan_to_num()
-    return patches, patches.flatten(2).norm(dim=-1)
-
-
 def _cut_patches(
     frames: Mapping[str, Frame | None],
     rig: CameraRig,
@@ -301,9 +245,9 @@ def split(crops: Part, snapshots: int, cameras: int) -> tuple[Part, Part]:
         train = ~held_out
     if not bool(train.any() and held_out.any()):
         raise RefusedError(
-            f"harvest: found {plural(int(train.sum()), 'training crop')} and "
-            f"{plural(int(held_out.sum()), 'held-out crop')} in {plural(snapshots, 'snapshot')} of "
-            f"{plural(cameras, 'camera')}, expected some of both: capture more snapshots"
+            f"harvest: {crops.NOUN}: found {int(train.sum()):,} for training and {int(held_out.sum()):,} held out in "
+            f"{plural(snapshots, 'snapshot')} of {plural(cameras, 'camera')}, expected some of both: "
+            "capture more snapshots"
         )
     return crops.select(train), crops.select(held_out)
 

@@ -201,27 +201,35 @@ def tables(found: dict[str, Any]) -> str:
     return markdown(["right % of visible / wrong % of claimed", *columns], lines)
 
 
-def main(runs: Path, steps: tuple[str, ...] = ("prepare", "train", "measure", "page"), cores: int = 1) -> None:
+def main(
+    runs: Path,
+    steps: tuple[str, ...] = ("prepare", "train", "measure", "page"),
+    cores: int = 1,
+    markers: tuple[str, ...] = MARKERS,
+) -> None:
     """Harvest, adapt, measure, and write the JSON and the table.
 
     Args:
         runs: folder of data sets and training runs.
         steps: prepare, train, measure, page.
         cores: processes at once.
+        markers: kinds of markers; the JSON keeps the rows of the others.
     """
     if "prepare" in steps:
-        prepare(runs)
+        prepare(runs, markers)
     if "train" in steps:
-        for arguments in trainings(runs):
+        for arguments in trainings(runs, markers):
             if not (Path(arguments[4]) / MODEL).is_file():
                 subprocess.run([sys.executable, "-m", "imgcal", "train", *arguments], check=True, env={**os.environ})
     if "measure" in steps:
-        todo = [(shape, name) for shape in MARKERS for name in methods(shape, runs)]
+        todo = [(shape, name) for shape in markers for name in methods(shape, runs)]
         with ProcessPoolExecutor(cores) as pool:
             results = list(pool.map(measured, *zip(*todo, strict=True), [runs] * len(todo)))
         found = {shape: {name: each for (of, name), each in zip(todo, results, strict=True) if of == shape}
-                 for shape in MARKERS}  # fmt: skip
-        write_json(JSON, surroundings() | {"snapshots": SNAPSHOTS, "markers": found})
+                 for shape in markers}  # fmt: skip
+        known = read_json(JSON)["markers"] if JSON.is_file() else {}
+        rows = {shape: (known | found)[shape] for shape in MARKERS if shape in known | found}
+        write_json(JSON, surroundings() | {"snapshots": SNAPSHOTS, "markers": rows})
     if "page" in steps:
         fill(PAGE, {"unlike markers": tables(read_json(JSON)["markers"])})
 

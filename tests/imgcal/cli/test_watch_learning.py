@@ -179,6 +179,18 @@ def test_a_gain_must_be_larger_than_its_uncertainty():
     assert not scores(8, 8, off=2.0).is_better(scores(6, 6, off=1.0))  # a measurer that learnt wrong places
     assert scores(8, 8, off=1.1).is_better(scores(6, 6, off=1.0))
     assert scores(8, 8, off=3.0).is_better(scores(0, 0, claimed=0))
+    # The light has changed: better before, worse now.
+    assert not scores(8, 8, 8, 8, 8, 6).is_better(scores(5, 6, 5, 6, 8, 8))
+    assert scores(8, 8, 8, 8, 7, 8).is_better(scores(5, 6, 5, 6, 7, 8))
+
+
+def test_snapshots_with_wrong_labels_teach_nothing_and_judge_nothing(moments, tmp_path, monkeypatch):
+    found, said, _ = learner(tmp_path, monkeypatch, running=SUBJECTS, trained={})
+    random = np.random.default_rng(0)
+    for moment in moments:
+        fiducial = random.permutation(OBJECT.num_fiducials)[moment.blobs.fiducial]
+        found.take(replace(moment, blobs=replace(moment.blobs, fiducial=fiducial)))
+    assert said == [] and not found._crops and not found._held_out
 
 
 def test_networks_are_asked_from_the_same_pose_nearby(moments, ruined):

@@ -1,6 +1,3 @@
-from dataclasses import replace
-
-import numpy as np
 import pytest
 import torch
 
@@ -10,6 +7,7 @@ from imgcal.io import load_object, read_rig
 from imgcal.pipeline import rms_length, score
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from tests.imgcal.lensed import KINDS, lensed
+from tests.imgcal.shuffled import shuffled
 
 
 def test_a_score_needs_no_prior(o10, asymmetric8):
@@ -32,16 +30,6 @@ def test_the_rms_is_of_lengths_and_of_what_was_seen():
     residual = torch.tensor([[3.0, 4.0], [0.0, 1.0], [100.0, 100.0]])
     assert rms_length(residual, torch.tensor([True, True, False])) == pytest.approx((26 / 2) ** 0.5)
     assert rms_length(residual, torch.zeros(3, dtype=torch.bool)) is None
-
-
-def shuffled(table, snapshots, seed=1):
-    """The table, with the labels of each camera shuffled in some snapshots."""
-    random, fiducial = np.random.default_rng(seed), table.fiducial.copy()
-    for s in snapshots:
-        for camera in range(len(table.camera_names)):
-            rows = np.flatnonzero((table.snapshot == s) & (table.camera == camera))
-            fiducial[rows] = random.permutation(fiducial[rows])
-    return replace(table, fiducial=fiducial)
 
 
 def test_a_snapshot_that_no_pose_fits_is_left_out_and_the_others_are_scored(o10):

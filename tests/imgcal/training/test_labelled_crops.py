@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -7,7 +8,9 @@ import torch
 import imgcal
 from imgcal.errors import RefusedError
 from imgcal.io import data_path, open_capture
+from imgcal.synthesis import simulate_truth, true_detections
 from imgcal.training import FrameDataset, cut_labelled, split
+from tests.imgcal.shuffled import shuffled
 
 
 def harvest(frames, detections, rig, obj) -> tuple[FrameDataset, FrameDataset]:
@@ -95,6 +98,41 @@ def test_markers_of_any_shape_are_seen_where_they_recur(sample) -> None:
         assert light.median() == pytest.approx(1.0, abs=0.2)
 
 
+def test_bars_are_learned_where_their_light_is(sample) -> None:
+    """A detector of spots finds an end of each bar, 7 to 20 pixels from its middle."""
+    frames, blobs, rig, obj = sample
+    random, table = np.random.default_rng(0), imgcal.score(blobs, rig, obj).labelled.detections
+    table = table.select(table.fiducial >= 0)
+    shown = {number: {name: np.full_like(frame, 20) for name, frame in each.items()} for number, each in frames.items()}
+    found = replace(table, uv=table.uv.copy())
+    for row, (place, size) in enumerate(zip(table.uv, table.radius, strict=True)):
+        frame = shown[int(table.snapshot[row])][rig.camera_names[table.camera[row]]]
+        angle = random.uniform(0, np.pi)
+        along = 2 * size * np.array([np.cos(angle), np.sin(angle)])
+        ends = np.rint(16 * np.stack((place - along, place + along))).astype(int).tolist()
+        cv2.line(frame, *ends, 150, max(int(size / 2), 2), cv2.LINE_AA, 4)
+        found.uv[row] += along * random.choice((-1, 1))
+    crops, patches = cut_labelled(shown.get, found, rig, obj)
+    assert crops.seen.sum() > 0.9 * crops.asked.sum()
+    assert len(patches) > 2 * len(table)
+    light = patches.light.float().clamp(min=0)
+    near = torch.arange(24) - 11.5
+    centre = torch.stack([(light.sum(axis) * near).sum(1) for axis in (1, 2)], 1) / light.sum((1, 2))[:, None]
+    assert (centre - patches.offset).norm(dim=1).median() < 0.3
+
+
+def test_a_snapshot_that_no_pose_fits_gives_no_crops_and_the_others_do(o10) -> None:
+    wand = imgcal.load_object("wand4")
+    truth = simulate_truth(o10, wand, 6, torch.Generator().manual_seed(0), None)
+    table = shuffled(true_detections(truth), [2])
+    frames = {name: np.zeros(size[::-1], dtype=np.uint8)
+              for name, size in zip(o10.camera_names, o10.image_size.tolist(), strict=True)}  # fmt: skip
+    for row in np.flatnonzero(table.fiducial >= 0):
+        cv2.circle(frames[o10.camera_names[table.camera[row]]], np.rint(table.uv[row]).astype(int).tolist(), 6, 200, -1)
+    crops, _ = cut_labelled(lambda _: frames, table, truth.rig, wand)
+    assert set(crops.snapshot.tolist()) == {0, 1, 3, 4, 5}
+
+
 def made(snapshots: int, cameras: int) -> FrameDataset:
     """Crops of every camera in every snapshot, with nothing in them."""
     snapshot, camera = (
@@ -119,7 +157,7 @@ def test_snapshots_that_are_held_out_have_no_neighbours_among_the_others(snapsho
 
 
 def test_a_single_camera_and_snapshot_cannot_be_split() -> None:
-    with pytest.raises(RefusedError, match="0 training crops and 1 held-out crop in 1 snapshot of 1 camera,"):
+    with pytest.raises(RefusedError, match="crops: found 0 for training and 1 held out in 1 snapshot of 1 camera,"):
         split(made(1, 1), 1, 1)
 
 
