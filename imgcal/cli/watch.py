@@ -210,6 +210,9 @@ class Watch(arguments.Watch):
             if self.input.startswith("lsl://"):
                 self._require("pylsl", "an address")
                 return LabStreaming(self.input)
+            if not self.input.startswith(("tcp://", "ipc://")):
+                known = "tcp://host:port, ipc://path, qtm://host or lsl://name"
+                raise InputError(f"{shorten(self.input)}: expected an address {known}")
             self._require("zmq", "an address")
             return ZeroMQ((self.input,))
         path = Path(self.input)
@@ -227,7 +230,7 @@ class Watch(arguments.Watch):
         self._check_options("a table of blobs")
         rate = USUAL_RATE if self.rate is None else self.rate
         if not 0 < rate < 1e6:
-            raise InputError(f"--rate: found {rate:g}, expected snapshots per second")
+            raise InputError(f"--rate: found {rate:g}, expected more than 0 and less than 1e6 snapshots per second")
         source = open_input(path, rig, labels)
         assert isinstance(source, Detections)  # folders are seen to above
         return BlobTable(source, rate)

@@ -174,6 +174,12 @@ def _check_header(path: Path, header: list[str], required: Sequence[str], option
     if not header:
         raise InputError(f"{path}: found an empty file, {expected}")
     known = (*required, *optional)
+    if len(header) == 1:
+        for separator, what in ((";", "semicolons"), ("\t", "tabs"), (" ", "spaces")):
+            if header[0].split(separator)[0].strip() in known and separator in header[0]:
+                raise InputError(f"{path}: found {what} between the columns, expected commas (and decimal points)")
+    if all(_is_float(name) for name in header):
+        raise InputError(f"{path}: found no header line; {expected}")
     for name in header:
         if name not in known:
             raise InputError(f"{path}: unknown column {shorten(name)!r}{nearest(name, known)}; {expected}")

@@ -162,7 +162,9 @@ def _for_what_comes_after(fit: Calibration, cameras: CameraRig, seconds: dict[st
     volume = fit.predicted_error.volume
     box = ConvexVolume.box(_corner(volume.low), _corner(volume.high))
     rig = replace(fit.rig, name=cameras.name, prior=None, volume=box)
-    return replace(fit, estimate=replace(fit.estimate, rig=rig), seconds=seconds, from_scratch=True)
+    estimate = replace(fit.estimate, rig=rig)
+    # The object's size is in the first rig's places, too: they cannot contradict it.
+    return replace(fit, estimate=estimate, seconds=seconds, from_scratch=True, scale_sigma=None)
 
 
 def _fit(
