@@ -108,7 +108,7 @@ class Watch(arguments.Watch):
         rate = source.rate if isinstance(source, BlobTable) else None
         goes_on = source.live and not self.keep_all  # what came since the last state is gone
         knows = goes_on or isinstance(source, Folder)  # a folder knows which files have been read
-        known = None if progress is None or knows else self._known(folder, progress, source)
+        known = None if progress is None or knows else self._find_progress(folder, progress, source)
         intake = SourceReader(source, rig, Timing(self.tolerance, self.patience), self.keep_all, known=known)
         hook = None if self.hook is None else Hook(self.hook)
         display = Display(Console(file=sys.stdout, soft_wrap=True), intake, hook)
@@ -188,7 +188,7 @@ class Watch(arguments.Watch):
         """Whether INPUT is another one than before; what a version noted that did not note it is taken for the same."""
         return progress is not None and progress.source not in (None, self._origin())
 
-    def _known(self, folder: Path, progress: Progress, source: Source) -> Known:
+    def _find_progress(self, folder: Path, progress: Progress, source: Source) -> Known:
         """How far an earlier run has worked on this recording, or that it was another one."""
         another = self._is_another(progress)
         rate = source.rate if isinstance(source, BlobTable) else None

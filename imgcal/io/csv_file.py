@@ -112,7 +112,7 @@ class _Text:
         self.path, self.content = path, content
 
     def __enter__(self) -> Iterator[list[str]]:
-        self.file = self._opened()
+        self.file = self._open_file()
         magic = self.file.read(2)
         self.file.seek(0)
         self.binary = gzip.GzipFile(fileobj=self.file) if magic == GZIP_MAGIC else self.file
@@ -121,7 +121,7 @@ class _Text:
         self.reader = csv.reader(self._lines(), strict=True)
         return filter(None, self.reader)
 
-    def _opened(self) -> BinaryIO:
+    def _open_file(self) -> BinaryIO:
         if self.content is not None:
             return io.BytesIO(self.content)
         check_regular(self.path)
