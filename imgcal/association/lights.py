@@ -80,7 +80,6 @@ def associate_lights(
     detections: Detections,
     rig: CameraRig,
     error: NDArray[np.float64],
-    least_odds: float = LEAST_ODDS,
     least_cameras: int = LEAST_CAMERAS,
 ) -> Lights:
     """Find the markers of each moment: blobs of at least three cameras that may show one point.
@@ -92,7 +91,6 @@ def associate_lights(
         rig: without batch axes, float64.
         error: (C,) px, standard deviation of errors of rig and blobs in each camera, see `image_error`; a more accurate
             rig allows denser markers.
-        least_odds: minimum log odds of a marker against false blobs.
         least_cameras: minimum number of cameras that agree on it; two rays may meet by chance.
 
     Returns:
@@ -117,7 +115,7 @@ def associate_lights(
     half = 0.5 * rig.image_size.double().numpy() / focal
     gate = np.asarray(error, dtype=np.float64) / focal.mean(1)
     count = find_all_lights(
-        blobs.xy, blobs.start, np.ascontiguousarray(rotation), np.ascontiguousarray(position), gate, half, least_odds,
+        blobs.xy, blobs.start, np.ascontiguousarray(rotation), np.ascontiguousarray(position), gate, half, LEAST_ODDS,
         least_cameras, chosen, point, odds, margin, moment,
     )  # fmt: skip
     chosen = chosen[:count]

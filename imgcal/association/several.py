@@ -92,7 +92,7 @@ class _Capture:
             found: list[Row] = []
             reason, name = NOT_TRIED, self.detections.snapshot_names[s]
             if self.coded[s]:
-                found, reason = self._given(s)
+                found, reason = self._accept_labels(s)
             else:
                 hopeful = [p for p, t in enumerate(self.trackers) if patience[p].tries(number, t.in_vain)]
                 if hopeful:
@@ -100,7 +100,7 @@ class _Capture:
             if len(found) > len(self.found[s]) or not self.reasons[s]:
                 self.found[s], self.reasons[s] = found, reason
 
-    def _given(self, s: int) -> tuple[list[Row], str]:
+    def _accept_labels(self, s: int) -> tuple[list[Row], str]:
         """Take a snapshot's given labels."""
         name, given, found, reason = self.detections.snapshot_names[s], self.detections.fiducial[self.rows[s]], [], ""
         for part, tracker in enumerate(self.trackers):
@@ -158,7 +158,7 @@ def place_objects(
     Returns:
         The accepted rows, and why others were not accepted.
     """
-    placed, reason = _placed(trackers, asked, blobs)
+    placed, reason = _place_objects(trackers, asked, blobs)
     found: list[Row] = []
     for part, identity in placed:
         tracker = trackers[part]
@@ -170,7 +170,7 @@ def place_objects(
     return sorted(found, key=lambda row: row[0].part), reason
 
 
-def _placed(
+def _place_objects(
     trackers: Sequence[Tracker], asked: Sequence[int], blobs: Detections
 ) -> tuple[list[tuple[int, Identity]], str]:
     """Place objects one by one, the most certain first; then remove those that are uncertain after all."""

@@ -147,7 +147,8 @@ def check_folder(path: Path) -> None:
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent
     if not existing.is_dir():
-        raise InputError(f"{path}: found a file at {existing}, expected a folder to write to")
+        found = "found a file" if existing == path else f"{existing} is a file"
+        raise InputError(f"{path}: {found}, expected a folder to write to")
     if not os.access(existing, os.W_OK):
         raise InputError(f"{path}: no permission to write to {existing}")
 

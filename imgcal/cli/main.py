@@ -198,7 +198,8 @@ def _strip_boxes(box: str, arguments: list[str]) -> str:
     problem, _, hint = text.partition("For full helptext, ")
     problem = problem.partition("Argument helptext:")[0].replace("__tyro-dummy-inner__.", "")
     command = re.search(r"imgcal[a-z ]* --help", hint)
-    return f"{_shorten(problem.strip(), arguments)}; see {command[0] if command else 'imgcal --help'}"
+    short = _shorten(problem.strip(), arguments)
+    return f"{short}{' See' if short.endswith('?') else '; see'} {command[0] if command else 'imgcal --help'}"
 
 
 def list_options(command: str) -> list[str]:
@@ -221,7 +222,13 @@ def _shorten(problem: str, arguments: list[str]) -> str:
         words, near = unknown[1].split(", "), re.search(r"--[\w.-]+", unknown[2] or "")
         options = [word for word in words if word.startswith("-")]
         if not options:
-            return f"unexpected argument `{quote(' '.join(words))}`"
+            word, _, kinds = " ".join(words).partition(" Available subcommands: ")
+            if not kinds:
+                return f"unexpected argument `{quote(word)}`"
+            close = difflib.get_close_matches(word, kinds.split(), 1)
+            return f"unknown `imgcal {command} {quote(word)}`" + (
+                f"; did you mean `{close[0]}`?" if close else f", expected {_one_of(kinds.split())}"
+            )
         option = options[0].split()[0]
         close = [near[0]] if near else difflib.get_close_matches(option.partition("=")[0], list_options(command), 1)
         return f"unknown option `{shorten(option)}`" + (f"; did you mean `{close[0]}`?" if close else "")
@@ -238,7 +245,8 @@ def _shorten(problem: str, arguments: list[str]) -> str:
         known = sorted(words, key=lambda word: (word.isdigit() and int(word), word))
         close = difflib.get_close_matches(choice[1], known, 1)
         hint = f"; did you mean {close[0]}?" if close else ""
-        return f"{choice[2]}: found {shorten(choice[1])}, expected {_one_of(known)}{hint}"
+        option = f"{choice[2]}: " if choice[2].startswith("-") else ""
+        return f"{option}found {shorten(choice[1])}, expected {_one_of(known)}{hint}"
     if group := re.match(r"Expected one of \{(.*)\}", problem):
         return f"expected {_one_of(group[1].split(', '))} after `imgcal {command}`"
     if short := re.search(r"Missing value for argument '(\S+)'\. Expected (\d+) values", problem):

@@ -175,8 +175,8 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "per_camera": per_camera,
         "per_snapshot": counts_by_snapshot(calibration),
         "object": _object_summary(calibration),
-        "object_displaced": [_named(calibration.obj, offset.fiducial) for offset in calibration.displaced],
-        "object_lost": [_named(calibration.obj, fiducial) for fiducial in calibration.lost],
+        "object_displaced": [_fiducial_name(calibration.obj, offset.fiducial) for offset in calibration.displaced],
+        "object_lost": [_fiducial_name(calibration.obj, fiducial) for fiducial in calibration.lost],
         "object_scale_sigma": calibration.scale_sigma,
         "object_bent_sigma": calibration.bent_sigma,
         "board_bend": None if calibration.bend is None else vars(calibration.bend) | {"note": str(calibration.bend)},
@@ -200,7 +200,7 @@ def _lights_summary(calibration: Calibration) -> dict[str, Any] | None:
     return {
         "markers": len(calibration.labelled.used),  # one at each moment
         "background_blobs": dict(zip(names, lights.background_of.tolist(), strict=True)),
-        "blobs_left_over": dict(zip(names, lights.left_over_of.tolist(), strict=True)),
+        "blobs_left_over": dict(zip(names, lights.left_over.tolist(), strict=True)),
         "held_out": {
             name: {"predicted": predicted, "found": round(found, 4), "beside": round(beside, 4)}
             for name, predicted, found, beside in zip(
@@ -235,7 +235,7 @@ def _object_summary(calibration: Calibration) -> list[dict[str, Any]]:
     ]
 
 
-def _named(obj: CalibrationObject, fiducial: int) -> int | str:
+def _fiducial_name(obj: CalibrationObject, fiducial: int) -> int | str:
     """Name a fiducial by its row; with several objects, by the object and its row there."""
     if not obj.parts:
         return fiducial

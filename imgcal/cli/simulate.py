@@ -142,6 +142,8 @@ class Simulate(arguments.Simulate):
         if self.kappa is not None and kind != "relative":
             raise InputError(f"--kappa: found {self.kappa:g} with --drift {kind}, expected --drift relative")
         kappa = 0.025 if self.kappa is None else self.kappa
+        if not 0 <= kappa < 1:
+            raise InputError(f"--kappa: found {kappa:g}, expected 0 or more, and less than 1")
         kinds: dict[str, Drift | None] = {"physical": self.physical, "none": None}
         return kinds[kind] if kind in kinds else RelativeDrift(kappa, kappa)
 

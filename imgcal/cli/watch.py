@@ -108,7 +108,7 @@ class Watch(arguments.Watch):
         rate = source.rate if isinstance(source, BlobTable) else None
         goes_on = source.live and not self.keep_all  # what came since the last state is gone
         knows = goes_on or isinstance(source, Folder)  # a folder knows which files have been read
-        known = None if progress is None or knows else self._known(folder, progress, source)
+        known = None if progress is None or knows else self._find_progress(folder, progress, source)
         intake = SourceReader(source, rig, Timing(self.tolerance, self.patience), self.keep_all, known=known)
         hook = None if self.hook is None else Hook(self.hook)
         display = Display(Console(file=sys.stdout, soft_wrap=True), intake, hook)
@@ -188,7 +188,7 @@ class Watch(arguments.Watch):
         """Whether INPUT is another one than before; what a version noted that did not note it is taken for the same."""
         return progress is not None and progress.source not in (None, self._origin())
 
-    def _known(self, folder: Path, progress: Progress, source: Source) -> Known:
+    def _find_progress(self, folder: Path, progress: Progress, source: Source) -> Known:
         """How far an earlier run has worked on this recording, or that it was another one."""
         another = self._is_another(progress)
         rate = source.rate if isinstance(source, BlobTable) else None
@@ -210,6 +210,9 @@ class Watch(arguments.Watch):
             if self.input.startswith("lsl://"):
                 self._require("pylsl", "an address")
                 return LabStreaming(self.input)
+            if not self.input.startswith(("tcp://", "ipc://")):
+                known = "tcp://host:port, ipc://path, qtm://host or lsl://name"
+                raise InputError(f"{shorten(self.input)}: expected an address {known}")
             self._require("zmq", "an address")
             return ZeroMQ((self.input,))
         path = Path(self.input)
@@ -227,7 +230,7 @@ class Watch(arguments.Watch):
         self._check_options("a table of blobs")
         rate = USUAL_RATE if self.rate is None else self.rate
         if not 0 < rate < 1e6:
-            raise InputError(f"--rate: found {rate:g}, expected snapshots per second")
+            raise InputError(f"--rate: found {rate:g}, expected more than 0 and less than 1e6 snapshots per second")
         source = open_input(path, rig, labels)
         assert isinstance(source, Detections)  # folders are seen to above
         return BlobTable(source, rate)

@@ -27,6 +27,8 @@ from imgcal.types import CalibrationObject, CameraRig, Observations
 from renderers.compiling import njit
 
 STARTS = 8
+ITERATIONS = 10
+"""Maximum number of Gauss-Newton steps on the rotation."""
 LEAST_TURN = 1e-9
 """Radians: a smaller step means that the rotation has converged."""
 
@@ -41,16 +43,13 @@ class _QuadraticForm:
     translation_constant: Tensor  # (P, 3)
 
 
-def initial_pose(
-    observations: Observations, rig: CameraRig, obj: CalibrationObject, iterations: int = 10
-) -> RigidTransform:
+def initial_pose(observations: Observations, rig: CameraRig, obj: CalibrationObject) -> RigidTransform:
     """Estimate the object's pose with a fixed rig.
 
     Args:
         observations: (*B, S, C, N); each snapshot must determine the object's pose.
         rig: (*B) or without batch axes.
         obj: N fiducials, planar or not.
-        iterations: Gauss-Newton steps on the rotation.
 
     Returns:
         (*B, S) rig_from_object with the smallest object-space error among those in front of the cameras. Meant as a
@@ -81,7 +80,7 @@ def initial_pose(
     promising = _cost(form, starts.expand(len(rays), -1, -1, -1)).topk(STARTS, largest=False).indices
     minimized = _minimize_cpu if plain else _minimize_on_rotations
     # A single light has no rotation.
-    rotation = minimized(form, starts[promising], iterations if bool(centred.any()) else 0)  # (P, M, 3, 3)
+    rotation = minimized(form, starts[promising], ITERATIONS if bool(centred.any()) else 0)  # (P, M, 3, 3)
 
     entries, cost = rotation.flatten(-2), _cost(form, rotation)
     translation = form.translation_constant[:, None] - entries @ form.translation_slope.mT

@@ -92,7 +92,7 @@ def tree(pairs: Sequence[Pair], cameras: int) -> tuple[list[list[int]], list[tup
     return groups, [chained.get(camera, (np.eye(3), np.zeros(3))) for camera in range(cameras)]
 
 
-def rigid_motion(source: Floats, destination: Floats, weight: Floats | None = None) -> tuple[Floats, Floats]:
+def rigid_motion(source: Floats, destination: Floats) -> tuple[Floats, Floats]:
     """Least-squares rotations (*B, 3, 3) and translations (*B, 3) that align points (*B, M, 3) with others.
 
     Source: Kabsch 1976.
@@ -102,10 +102,8 @@ def rigid_motion(source: Floats, destination: Floats, weight: Floats | None = No
         >>> bool(np.allclose(rotation, np.eye(3)) and np.allclose(translation, [1, 2, 3]))
         True
     """
-    share = np.ones(source.shape[:-1]) if weight is None else weight
-    share = (share / share.sum(-1, keepdims=True))[..., None]
-    middle, target = (share * source).sum(-2, keepdims=True), (share * destination).sum(-2, keepdims=True)
-    u, _, vh = np.linalg.svd(np.swapaxes(share * (destination - target), -1, -2) @ (source - middle))
+    middle, target = source.mean(-2, keepdims=True), destination.mean(-2, keepdims=True)
+    u, _, vh = np.linalg.svd(np.swapaxes(destination - target, -1, -2) @ (source - middle))
     sign = np.ones(u.shape[:-1])
     sign[..., 2] = np.linalg.det(u @ vh)
     rotation = (u * sign[..., None, :]) @ vh

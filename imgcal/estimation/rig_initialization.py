@@ -30,8 +30,6 @@ ROUGH_SIGMA = 3.0
 """Pixels: standard deviation of an observation while the lens is wrong."""
 FINE_SIGMA = 0.5
 """Pixels: standard deviation of an observation in the final fit."""
-OUTLYING_SPREADS = 6.0
-"""Multiple of the residuals' robust spread beyond which labels are excluded."""
 CAPPED = 30.0
 """Pixels at which reprojection errors are clipped when poses are compared."""
 K3 = 14
@@ -51,14 +49,13 @@ class ColdStart:
     spread: float  # px, robust spread of the residuals
 
 
-def cold_start(observations: Observations, cameras: CameraRig, obj: CalibrationObject, seed: int = 0) -> ColdStart:
+def cold_start(observations: Observations, cameras: CameraRig, obj: CalibrationObject) -> ColdStart:
     """Estimate the cameras' poses and lenses, starting only from rough focal lengths.
 
     Args:
         observations: (S, C, N); some labels may be wrong.
         cameras: image sizes, lenses as far as they are known, and a prior that says how far; poses are ignored.
         obj: the calibration object.
-        seed: seed of the random choices.
 
     Raises:
         RefusedError: cameras share no snapshots with the others, or the fit does not converge.
@@ -78,7 +75,7 @@ def cold_start(observations: Observations, cameras: CameraRig, obj: CalibrationO
     cameras = replace(cameras.to(torch.float64), cam_from_rig=nowhere)
     cam_from_object, known = single_camera_poses(observations, cameras, obj)
     require_connected([c for c in range(cameras.num_cameras) if not known[:, c].any()], cameras)
-    pairs = relate(cam_from_object, known, obj.points.double().numpy(), np.random.default_rng(seed))
+    pairs = relate(cam_from_object, known, obj.points.double().numpy(), np.random.default_rng(0))
     groups, chained = tree(pairs, cameras.num_cameras)
     require_connected([camera for group in groups[1:] for camera in group], cameras)
     rig = replace(cameras, cam_from_rig=as_transforms(chained))

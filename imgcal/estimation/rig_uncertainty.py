@@ -2,7 +2,7 @@
 
 A motion of the whole rig changes no image and does not count. The errors are those that remain after the rigid motion
 that minimizes them over a set of points, the working volume. To first order this is a projection of the parameters'
-covariance, see `aligned_covariance`; docs/method.md has the equations.
+covariance, P S P^T with P = I - G (G^T H G)^-1 G^T H; docs/method.md has the equations.
 """
 
 from __future__ import annotations
@@ -166,23 +166,6 @@ def _weight(error: Tensor, valid: Tensor) -> Tensor:
     median = error[valid].median()
     weight = torch.where(error > median, median / error, 1.0).square()
     return torch.where(valid, weight, 0.0)
-
-
-def aligned_covariance(covariance: Tensor, motion: Tensor, metric: Tensor) -> Tensor:
-    """Project a covariance onto the complement of the rigid motions in a metric.
-
-    Args:
-        covariance: (K, K) of all parameters.
-        motion: (K, 6) derivative of the parameters with respect to a rigid motion of all cameras.
-        metric: (K, K) matrix of the squared error that the motion minimizes.
-
-    Returns:
-        (K, K), P covariance P^T with P = I - G (G^T H G)^-1 G^T H.
-
-    Raises:
-        RefusedError: the metric does not determine the motion.
-    """
-    return _remove_motion(covariance, motion, _best_motion(motion, metric @ motion))
 
 
 def _remove_motion(covariance: Tensor, motion: Tensor, best: Tensor) -> Tensor:

@@ -27,7 +27,6 @@ class FleetCount:
     read: int = 0  # rows of the manifest that came back
     known: int = 0  # of these done before, unchanged
     status: Counter[str] = field(default_factory=Counter)  # of the others
-    work_seconds: float = 0.0  # of all processes together
 
 
 def recalibrate_fleet(
@@ -69,7 +68,6 @@ def recalibrate_fleet(
             count.read += len(rows)
             count.known += len(rows) - len(fresh)
             count.status.update(row["status"] for row in fresh)
-            count.work_seconds += sum(row["seconds"] for row in fresh)
             writer.add(fresh)
             if writer.waiting >= ROWS or time.monotonic() - flushed > SECONDS:
                 writer.flush()

@@ -187,11 +187,10 @@ def _instead(source: Source) -> str:
         return "this is a transforms.json of nerfstudio: convert its COLMAP model instead"
     if any(path.suffix == ".cal" for path in source.files):
         return "this looks like a Motive .cal, which is binary and not documented: export .mcal (Motive 3.2 or newer)"
-    titles = "; ".join(dict.fromkeys(one.title for one in FORMATS))
     found = (
         f"found {source.describe()}" if not source.alone else f"found none of the keys of a calibration{_keys(values)}"
     )
-    return f"{found}, expected `format: imgcal-rig/1` or one of: {titles}"
+    return f"{found}, expected a rig file (`format: imgcal-rig/1`), or another tool's: {', '.join(BY_NAME)}"
 
 
 def _keys(values: dict[str, object]) -> str:

@@ -73,12 +73,12 @@ def write_into(
     old = read_foreign_rig(original, name, original_rig)
     title = find_format(old.format).title
     try:
-        return _written(rig, old, original, now, unit, limit, original_rig)
+        return _write_back(rig, old, original, now, unit, limit, original_rig)
     except FormatError as error:
         raise InputError(f"{where}: this is {with_article(title)}: {error}") from error
 
 
-def _written(
+def _write_back(
     rig: ForeignRig,
     old: ForeignRig,
     original: Sequence[Path],

@@ -112,7 +112,7 @@ class _Text:
         self.path, self.content = path, content
 
     def __enter__(self) -> Iterator[list[str]]:
-        self.file = self._opened()
+        self.file = self._open_file()
         magic = self.file.read(2)
         self.file.seek(0)
         self.binary = gzip.GzipFile(fileobj=self.file) if magic == GZIP_MAGIC else self.file
@@ -121,7 +121,7 @@ class _Text:
         self.reader = csv.reader(self._lines(), strict=True)
         return filter(None, self.reader)
 
-    def _opened(self) -> BinaryIO:
+    def _open_file(self) -> BinaryIO:
         if self.content is not None:
             return io.BytesIO(self.content)
         check_regular(self.path)
@@ -174,6 +174,12 @@ def _check_header(path: Path, header: list[str], required: Sequence[str], option
     if not header:
         raise InputError(f"{path}: found an empty file, {expected}")
     known = (*required, *optional)
+    if len(header) == 1:
+        for separator, what in ((";", "semicolons"), ("\t", "tabs"), (" ", "spaces")):
+            if header[0].split(separator)[0].strip() in known and separator in header[0]:
+                raise InputError(f"{path}: found {what} between the columns, expected commas (and decimal points)")
+    if all(_is_float(name) for name in header):
+        raise InputError(f"{path}: found no header line; {expected}")
     for name in header:
         if name not in known:
             raise InputError(f"{path}: unknown column {shorten(name)!r}{nearest(name, known)}; {expected}")

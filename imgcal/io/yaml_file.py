@@ -294,7 +294,9 @@ def _check_format(content: bytes, where: str, file_format: str) -> dict[str, Any
             f"{where}: found {looks_like(text)}, expected a file that starts with `format: {file_format}`"
         ) from None
     if not isinstance(values, dict):
-        raise InputError(f"{where}: found {_what(values)}, expected a mapping that starts with `format: {file_format}`")
+        raise InputError(
+            f"{where}: found {_describe(values)}, expected a mapping that starts with `format: {file_format}`"
+        )
     if values.get("format") != file_format:
         found = f"`format: {reprlib.repr(values['format'])}`" if "format" in values else "no key `format`"
         instead = INSTEAD.get((file_format, str(values.get("format"))), "")
@@ -353,5 +355,5 @@ def _parse(content: bytes, where: str, mapping_tags: frozenset[str] = frozenset(
         raise InputError(f"{where}: not a YAML text file: {str(error).splitlines()[0]}") from error
 
 
-def _what(content: Any) -> str:
+def _describe(content: Any) -> str:
     return "an empty file" if content is None else f"{type(content).__name__} {reprlib.repr(content)}"

@@ -67,10 +67,10 @@ def parse_address(text: str | None) -> Address:
         (Address(host='0.0.0.0', port=9000), '127.0.0.1', True)
     """
     given = text or ""
-    match = re.fullmatch(r"(?:(?P<only>\d{1,5})|(?P<host>\[[0-9a-fA-F:.]+\]|[\w.-]*)(?::(?P<port>\d{1,5}))?)", given)
+    match = re.fullmatch(r"(?:(?P<only>\d+)|(?P<host>\[[0-9a-fA-F:.]+\]|[\w.-]*)(?::(?P<port>\d{1,5}))?)", given)
     port = int((match["only"] or match["port"] or PORT) if match else PORT)
     if match is None or port > 65535:
-        raise InputError(f"address: found {shorten(given)!r}, expected HOST:PORT, such as 127.0.0.1:{PORT}")
+        raise InputError(f"address: found {shorten(given)!r}, expected [HOST:]PORT, such as 127.0.0.1:{PORT}")
     return Address((match["host"] or THIS_MACHINE).strip("[]"), port)
 
 

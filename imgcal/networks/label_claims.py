@@ -26,7 +26,6 @@ class Claims:
     place: Tensor  # (P, N, 2) crop pixels
     sigma: Tensor  # (P, N) crop pixels, standard deviation per axis
     probability: Tensor  # (P, N) that the fiducial is there; 0 for invalid queries
-    runner_up: Tensor  # (P, N) probability of the best other place
 
 
 def claim(evidence: Evidence, asked: Tensor) -> Claims:
@@ -59,9 +58,8 @@ def claim(evidence: Evidence, asked: Tensor) -> Claims:
     # With two confident rivals, transport converges slowly: normalize shares that still exceed one.
     shares = shares / shares.sum(1, keepdim=True).clamp(min=1)
     share, best = shares.max(-1)
-    rest = shares.scatter(2, best[..., None], 0.0).amax(-1)
     chosen = place.gather(1, best[..., None].expand(*best.shape, 2))
-    return Claims(chosen, log_sigma.gather(1, best).exp(), share * asked, rest * asked)
+    return Claims(chosen, log_sigma.gather(1, best).exp(), share * asked)
 
 
 def _local_mass(evidence: Evidence) -> Tensor:

@@ -33,11 +33,11 @@ from imgcal.pipeline.board_turns import require_one_turn
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.lights_from_scratch import calibrate_lights_from_scratch, place_by_stick
 from imgcal.pipeline.recalibration import (
+    as_unknown_marker,
     fit_with_timing,
     label_again,
     late_cameras,
     require_same_moments,
-    without_pattern,
 )
 from imgcal.pipeline.repeats import drop_repeats, name_repeats
 from imgcal.pipeline.sources import Frames, find_blobs
@@ -154,7 +154,7 @@ def _marker_alone(detections: Detections, obj: CalibrationObject) -> tuple[Detec
     if labelled.any():
         detections = detections.select(labelled)
         detections = replace(detections, fiducial=np.full(len(detections), -1))
-    return detections, without_pattern(obj, detections)
+    return detections, as_unknown_marker(obj, detections)
 
 
 def _for_what_comes_after(fit: Calibration, cameras: CameraRig, seconds: dict[str, float]) -> Calibration:
@@ -162,7 +162,9 @@ def _for_what_comes_after(fit: Calibration, cameras: CameraRig, seconds: dict[st
     volume = fit.predicted_error.volume
     box = ConvexVolume.box(_corner(volume.low), _corner(volume.high))
     rig = replace(fit.rig, name=cameras.name, prior=None, volume=box)
-    return replace(fit, estimate=replace(fit.estimate, rig=rig), seconds=seconds, from_scratch=True)
+    estimate = replace(fit.estimate, rig=rig)
+    # The object's size is in the first rig's places, too: they cannot contradict it.
+    return replace(fit, estimate=estimate, seconds=seconds, from_scratch=True, scale_sigma=None)
 
 
 def _fit(

@@ -91,12 +91,12 @@ class LearnedProposer:
             return replace(near, otherwise=lambda: replace(finder.propose(snapshot), found_by=finder.name))
         found = finder.propose(snapshot)
         if found.rig_from_object is None:
-            return near or self._at_origin(snapshot) or Proposal.decline(snapshot, found.reason)
+            return near or self._search_origin(snapshot) or Proposal.decline(snapshot, found.reason)
         there = self._around(replace(snapshot, candidates=(found.rig_from_object,)))
         best = there if near is None or len(there.detections) > len(near.detections) else near
         return replace(best, otherwise=lambda: replace(found, found_by=finder.name))
 
-    def _at_origin(self, snapshot: Snapshot) -> Proposal | None:
+    def _search_origin(self, snapshot: Snapshot) -> Proposal | None:
         """Search at the rig's origin, the usual place, for an object of many small markers: the finder cannot find
         these.
 
@@ -213,7 +213,7 @@ class _View:
         rig, window = self.snapshot.rig, self.network.config.close_window
         steps = self.ask(rig, pose).displacements(STEPS)
         looks = [self.ask(rig, pose, window, aside) for aside in steps]
-        found = torch.stack([look.found_in_camera for look in looks])
+        found = torch.stack([look.found_by_camera for look in looks])
         best, cameras = found.argmax(0), torch.arange(rig.num_cameras)
         claimed = [self.observations(look) for look in looks]
         uv, seen = torch.cat([each.uv for each in claimed]), torch.cat([each.seen for each in claimed])  # (K, C, N)
@@ -280,7 +280,7 @@ class _View:
         """Measurements (C, N, 2), sigmas and validity (C, N); in the last round, the more accurate source of each."""
         if self.measurer is None:
             return self._fit(uv, radius, seen)
-        read = self._by_network(uv, radius)
+        read = self._measure_by_network(uv, radius)
         if not last:
             return read
         place, sigma, good = self._fit(uv, radius, seen)
@@ -288,7 +288,7 @@ class _View:
         place, sigma = torch.where(better[..., None], read[0], place), torch.where(better, read[1], sigma)
         return place, sigma, read[2] | good
 
-    def _by_network(self, uv: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _measure_by_network(self, uv: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The same by the measurer."""
         assert self.measurer is not None
         names, shape = self.snapshot.rig.camera_names, radius.shape

@@ -59,8 +59,6 @@ LEAST_SHARE = 0.25
 """Minimum share of a camera's predicted markers with a blob in place, corrected for chance."""
 LEAST_NEAR = 0.8
 """Minimum share, among blobs near predicted markers, of those in place; corrected for chance."""
-SAME_RIG = 1.0
-"""px: median distance of images up to which two rigs are one."""
 LEAST_MARGIN = 5.0
 """Log odds of a marker beside known objects against the best other one that takes one of its blobs."""
 MOST_TESTED = 40
@@ -116,7 +114,7 @@ class FoundLights:
         return self._count(self.background)
 
     @property
-    def left_over_of(self) -> NDArray[np.int64]:
+    def left_over(self) -> NDArray[np.int64]:
         """Number of blobs of each camera that move and are in no marker: (C,)."""
         free = self.detections.usable & ~self.background
         free[self.blob] = False

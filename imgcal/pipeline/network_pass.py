@@ -33,7 +33,7 @@ class NetworkPass:
         return (self.claims.probability.view(self.asked.shape) * self.tiles.counts).sum((1, 2))
 
     @cached_property
-    def found_in_camera(self) -> Tensor:
+    def found_by_camera(self) -> Tensor:
         """Expected number of visible fiducials in each camera at the only pose: (C,)."""
         return self.tiles.sum_by_camera(self.claims.probability, self.rig.num_cameras)
 

@@ -91,7 +91,7 @@ def calibrate(
     blobs = settle_turns(find_blobs(source, rig, obj, detection, measurer), rig, obj)
     detections, repeats = drop_repeats(blobs)
     found = time.perf_counter()
-    obj = without_pattern(obj, detections)
+    obj = as_unknown_marker(obj, detections)
     if obj.unknown_markers and detector != "classical":
         raise InputError(f"detector {detector}: found unknown markers, expected an object with a pattern to look for")
     sight = make_sight(detector, source, detection, measurer)
@@ -115,7 +115,7 @@ def calibrate(
                 with contextlib.suppress(RefusedError):
                     fit = fit_steady(lit, given, rig, obj, options)
     except RefusedError as error:
-        if sight is not None and labelled is not None and sight.where_blobs_fail and _used_blobs(labelled):
+        if sight is not None and labelled is not None and sight.where_blobs_fail and _rests_on_blobs(labelled):
             # Blobs gave a pose, but the calibration failed.
             with contextlib.suppress(RefusedError):
                 sight = replace(sight, where_blobs_fail=False)
@@ -159,7 +159,7 @@ def _calibrate_lights(
     return replace(fit, lights=lights, seconds=seconds, repeats=repeats)
 
 
-def without_pattern(obj: CalibrationObject, detections: Detections) -> CalibrationObject:
+def as_unknown_marker(obj: CalibrationObject, detections: Detections) -> CalibrationObject:
     """Take an object of one marker for an unknown marker, unless labels say which blobs are it."""
     is_one = obj.pose_rank == 3 and not obj.parts and not (detections.fiducial >= 0).any()
     return replace(obj.about_centroid(obj.name), unknown_markers=True) if is_one else obj
@@ -220,7 +220,7 @@ def fit_with_timing(
     return fit
 
 
-def _used_blobs(labelled: Associations) -> bool:
+def _rests_on_blobs(labelled: Associations) -> bool:
     """Tell whether some snapshot was identified from blobs alone, without a look at its frames."""
     snapshots = (labelled.snapshots[number] for number in labelled.used)
     return any(snapshot.found_by == "classical" and snapshot.status != "coded" for snapshot in snapshots)
@@ -284,7 +284,7 @@ def late_cameras(
         asked = {c: where.get(rig.camera_names[c], moments[row]) for c, row in asked.items()}
         counts_of_parts = np.bincount(labelled.part_of_rows, minlength=len(obj.parts))
         counts_of_parts[len(obj.parts) - obj.has_lights :] = 0
-        detections, obj = _of_part(detections, obj, int(counts_of_parts.argmax()))
+        detections, obj = _select_part(detections, obj, int(counts_of_parts.argmax()))
 
     def others(blobs: Detections) -> tuple[list[int], RigidTransform]:
         fit = fit_labelled(associate(blobs, rig, obj, options), rig, obj, replace(options, blind_cameras=True))
@@ -294,7 +294,7 @@ def late_cameras(
     return tuple(late for late in found if late is not None)
 
 
-def _of_part(detections: Detections, obj: CalibrationObject, part: int) -> tuple[Detections, CalibrationObject]:
+def _select_part(detections: Detections, obj: CalibrationObject, part: int) -> tuple[Detections, CalibrationObject]:
     """Keep the labels of one of several objects: the rest is clutter."""
     first = int(np.searchsorted(obj.part_of, part))
     own = (detections.fiducial >= 0) & (obj.part_of[detections.fiducial] == part)

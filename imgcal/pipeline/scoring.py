@@ -21,7 +21,7 @@ from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.pipeline.board_turns import settle_turns
 from imgcal.pipeline.lights import FoundLights, find_lights
-from imgcal.pipeline.recalibration import as_one, without_pattern
+from imgcal.pipeline.recalibration import as_one, as_unknown_marker
 from imgcal.pipeline.sources import Frames, find_blobs
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections
@@ -116,7 +116,7 @@ def score(
     obj = as_one(obj)
     rig, options = rig.to(torch.float64), options.of_object(obj)
     detections = settle_turns(find_blobs(source, rig, obj, detection), rig, obj)
-    obj = without_pattern(obj, detections)
+    obj = as_unknown_marker(obj, detections)
     if obj.unknown_markers:
         with require_solvable():
             lights = find_lights(detections, rig, obj, options)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 DOTS_PER_PATH = 200
+LONGEST_NAME = 16  # characters
 """Dots of one path do not add up where they overlap; many short paths do, and show density."""
 
 
@@ -132,9 +133,9 @@ def pixels(value: float) -> str:
     return f"{value:.{digits}f}" if value >= 0.01 or value == 0 else f"{value:.2g}"
 
 
-def shorten_name(name: str, length: int = 16) -> str:
+def shorten_name(name: str) -> str:
     """Cut a long name for a narrow place."""
-    return name if len(name) <= length else name[: length - 1] + "\N{HORIZONTAL ELLIPSIS}"
+    return name if len(name) <= LONGEST_NAME else name[: LONGEST_NAME - 1] + "\N{HORIZONTAL ELLIPSIS}"
 
 
 def _decades(low: float, high: float) -> list[float]:

@@ -1,5 +1,5 @@
 from .arrangements import arrange_positions, arrange_rig, look_at
-from .boards import Print, render_board, simulate_board
+from .boards import render_board, simulate_board
 from .captures import (
     FrameModel,
     Frames,
@@ -53,7 +53,6 @@ __all__ = [
     "Patches",
     "PhysicalDrift",
     "PoseRange",
-    "Print",
     "RelativeDrift",
     "Scenes",
     "Shape",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import torch
@@ -31,17 +29,10 @@ DOT = 0.3
 """Radius of circles, of the distance between neighbours."""
 TEXELS = 60
 """Of a square's side, in OpenCV's picture of a ChArUco board."""
-
-
-@dataclass(frozen=True)
-class Print:
-    """Grey values and sharpness of images of a board."""
-
-    black: float = 35.0
-    white: float = 205.0
-    background: float = 70.0
-    blur: float = 0.7  # px, of the lens
-    noise: float = 2.0  # grey levels, one standard deviation
+BLACK, WHITE, BACKGROUND = 35.0, 205.0, 70.0
+"""Grey values of the print and of what is behind it."""
+BLUR, NOISE = 0.7, 2.0
+"""Standard deviations: of the lens blur, px, and of the noise, grey levels."""
 
 
 def simulate_board(
@@ -111,9 +102,7 @@ def _facing(away: Floats, right: Floats) -> Floats:
     return np.stack((x, np.cross(z, x), z), axis=1)
 
 
-def render_board(
-    board: Board, rig: CameraRig, rig_from_object: RigidTransform, generator: torch.Generator, ink: Print = Print()
-) -> Frames:
+def render_board(board: Board, rig: CameraRig, rig_from_object: RigidTransform, generator: torch.Generator) -> Frames:
     """Render a board into all cameras, each lens as it is, averaging over some rays to a pixel.
 
     Args:
@@ -121,7 +110,6 @@ def render_board(
         rig: without batch axes.
         rig_from_object: of one pose, without batch axes.
         generator: of the noise.
-        ink: grey values.
 
     Returns:
         Camera name -> (H, W) uint8.
@@ -133,7 +121,7 @@ def render_board(
     for camera, name in enumerate(rig.camera_names):
         single = rig.select([camera])
         width, height = (int(size) for size in rig.image_size[camera])
-        image = np.full((height, width), ink.background)
+        image = np.full((height, width), BACKGROUND)
         cam_from_object = single.cam_from_rig[0] @ rig_from_object
         seen = single.project(rig_from_object.apply(torch.from_numpy(outline)))
         ahead = (cam_from_object.apply(torch.from_numpy(outline))[:, 2] > 1).all()
@@ -145,12 +133,10 @@ def render_board(
             first = np.clip(np.floor(uv.min(0)) - 2, 0, (width, height)).astype(int)
             last = np.clip(np.ceil(uv.max(0)) + 3, 0, (width, height)).astype(int)
             if (last > first).all():
-                image[first[1] : last[1], first[0] : last[0]] = _window(
-                    board, single, cam_from_object, first, last, ink
-                )
-        image = cv2.GaussianBlur(image, (0, 0), ink.blur)
+                image[first[1] : last[1], first[0] : last[0]] = _window(board, single, cam_from_object, first, last)
+        image = cv2.GaussianBlur(image, (0, 0), BLUR)
         noise = torch.randn(image.shape, generator=generator, dtype=torch.float32).numpy()
-        frames[name] = np.clip(np.rint(image + ink.noise * noise), 0, 255).astype(np.uint8)
+        frames[name] = np.clip(np.rint(image + NOISE * noise), 0, 255).astype(np.uint8)
     return frames
 
 
@@ -160,7 +146,6 @@ def _window(
     cam_from_object: RigidTransform,
     first: NDArray[np.int_],
     last: NDArray[np.int_],
-    ink: Print,
 ) -> Floats:
     """Grey values (H, W) of the pixels from `first` to `last` (excluded)."""
     columns, rows = last - first
@@ -175,7 +160,7 @@ def _window(
     low, high = _sheet(board)
     sheet = ((place >= low) & (place <= high)).all(1)
     white = is_white(board, place) != board.inverted
-    value = np.where(sheet, np.where(white, ink.white, ink.black), ink.background)
+    value = np.where(sheet, np.where(white, WHITE, BLACK), BACKGROUND)
     return value.reshape(rows, FINER, columns, FINER).mean((1, 3))
 
 

@@ -111,7 +111,7 @@ def simulate_shots(
     rig, difficulty = truth.rig, model.difficulty
     each = list(zip(truth.parts, obj.parts, strict=True)) if truth.parts else [(truth, obj)]
     for pose in range(len(truth.uv)):
-        markers = _joined([_markers(one, part, model, pose, generator) for one, part in each])
+        markers = _join([_markers(one, part, model, pose, generator) for one, part in each])
         sensor, clutter = model.sensor, model.clutter
         if difficulty is not None:
             markers = difficulty.disguise(markers, generator)
@@ -155,7 +155,7 @@ def _markers(truth: Truth, obj: CalibrationObject, model: FrameModel, pose: int,
     )
 
 
-def _joined(parts: Sequence[Spots]) -> Spots:
+def _join(parts: Sequence[Spots]) -> Spots:
     """Markers of several objects."""
     if len(parts) == 1:
         return parts[0]

@@ -136,7 +136,7 @@ def _photograph(place: Tensor, radius: Tensor, draw: Draw) -> tuple[Tensor, Tens
         torch.where(draw.unit(*batch, false, 1) < 0.5, velocity[:, :, None], 0.0).expand(*batch, false, 2),
         torch.full((*batch, false), 9.0, device=place.device),
     )
-    light = _add_spots(_joined(markers, strays), blur, draw) + _background(batch, draw)
+    light = _add_spots(_join(markers, strays), blur, draw) + _background(batch, draw)
     light = light.clamp(max=draw.between(0.7, 3.0, *batch)[..., None, None])
     noise = draw.between(math.log(0.0015), math.log(0.22), *batch).exp()
     shot = draw.often(0.5, 1.0, *batch)[..., None, None] * light.clamp(min=0)
@@ -232,7 +232,7 @@ class _Spots:
     cut: Tensor  # (B, C, M) radii from the middle to the edge behind which the spot is hidden
 
 
-def _joined(*parts: _Spots) -> _Spots:
+def _join(*parts: _Spots) -> _Spots:
     return _Spots(*(torch.cat([getattr(part, name) for part in parts], dim=2) for name in _Spots.__dataclass_fields__))
 
 

@@ -135,9 +135,8 @@ def draw_levels(
     return torch.cat([images for images, _ in parts]), Views(uv, seen)
 
 
-def object_to(
-    obj: CalibrationObject, device: torch.device | str, dtype: torch.dtype = torch.float32
-) -> CalibrationObject:
-    """Move an object to a device and floating-point type."""
-    radius = None if obj.radius is None else obj.radius.to(device, dtype)
-    return replace(obj, points=obj.points.to(device, dtype), colours=obj.colours.to(device, dtype), radius=radius)
+def object_to(obj: CalibrationObject, device: torch.device | str) -> CalibrationObject:
+    """Move an object to a device, in float32."""
+    radius = None if obj.radius is None else obj.radius.to(device, torch.float32)
+    points, colours = obj.points.to(device, torch.float32), obj.colours.to(device, torch.float32)
+    return replace(obj, points=points, colours=colours, radius=radius)

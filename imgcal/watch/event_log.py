@@ -31,7 +31,7 @@ class EventLog:
         self._descriptor: int | None = None  # None = closed
         try:
             self._cut()
-            self._descriptor = self._opened()
+            self._descriptor = self._open_file()
         except OSError as error:
             raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
 
@@ -70,7 +70,7 @@ class EventLog:
         aside = self.path.with_name(f"{self.path.stem}.1{self.path.suffix}")
         os.replace(self.path, aside)
         try:
-            new = self._opened()
+            new = self._open_file()
         except OSError:
             with contextlib.suppress(OSError):
                 os.replace(aside, self.path)
@@ -85,7 +85,7 @@ class EventLog:
             descriptor, self._descriptor = self._descriptor, None
             os.close(descriptor)
 
-    def _opened(self) -> int:
+    def _open_file(self) -> int:
         # Without it, Windows would convert line ends.
         return os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o644)
 

@@ -130,14 +130,14 @@ class SourceReader:
         with self._changed:
             return self._ended and not self._snapshots
 
-    def wait_until_open(self, timeout: float = LONGEST_OPENING) -> SourceReader:
-        """Wait until the source has been opened, at most `timeout` seconds; return `self`.
+    def wait_until_open(self) -> SourceReader:
+        """Wait until the source has been opened, at most `LONGEST_OPENING` seconds; return `self`.
 
         Raises:
             InputError: the source cannot be opened.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._begun or self._ended, timeout)
+            self._changed.wait_for(lambda: self._begun or self._ended, LONGEST_OPENING)
             if self._error is not None and not self._begun:
                 raise self._error
         return self

@@ -73,7 +73,9 @@ class ZeroMQ:
         for address in self.addresses:
             found = ADDRESS.fullmatch(address)
             if found is None or int(found[1] or 0) >= 2**16:  # ZeroMQ takes the port modulo 65536
-                raise InputError(f"{shorten(address)}: expected an address tcp://host:port or ipc://path")
+                raise InputError(
+                    f"{shorten(address)}: expected an address tcp://host:port (at most 65535) or ipc://path"
+                )
             try:
                 socket.connect(address)
             except zmq.ZMQError as error:

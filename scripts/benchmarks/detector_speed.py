@@ -45,7 +45,7 @@ STAGES: Mapping[str, tuple[tuple[Any, str], ...]] = {
     "poses": ((matched_filter.View, "known"),),
     "encoder": ((learned_proposer._View, "of"),),
     "looks": ((learned_proposer._View, "look"),),
-    "measurer": ((learned_proposer._View, "_by_network"),),
+    "measurer": ((learned_proposer._View, "_measure_by_network"),),
     "marker fits": ((refinement, "_measured"), (learned_proposer._View, "_fitted")),
     "rig fits": ((refinement, "_fit"), (learned_proposer._View, "fit")),
 }

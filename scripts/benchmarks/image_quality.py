@@ -280,11 +280,6 @@ PARTS: dict[str, Callable[[Options], dict[str, Any]]] = {
 }
 QUIET = ("hour", "object put down", "demo", "frames", "stream, every frame", "stream, every third frame")
 """Parts without a fault."""
-IN_TIME = {
-    "covered": 5.0, "half covered": 60.0, "fiducials missing": 120.0, "blobs half as bright": 30.0,
-    "slowly dirty": SLOW, "defocused": 30.0,
-}  # fmt: skip
-"""Seconds within which the faults of the other parts must be reported."""
 
 
 def captures() -> Path:

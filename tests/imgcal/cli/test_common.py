@@ -102,6 +102,6 @@ def test_a_file_in_the_place_of_a_folder_is_refused(tmp_path: Path) -> None:
     check_folder(tmp_path / "not" / "yet" / "there")
     assert not (tmp_path / "not").exists()
     (tmp_path / "file").touch()
-    for path in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(InputError, match=f"found a file at {tmp_path / 'file'}"):
+    for path, expected in ((tmp_path / "file", "found a file"), (tmp_path / "file" / "below", "file is a file")):
+        with pytest.raises(InputError, match=f"{expected}, expected a folder to write to"):
             check_folder(path)

@@ -22,7 +22,7 @@ def test_the_address_is_printed_and_an_interruption_ends_it(monkeypatch, capsys)
     [
         (["dead"], "found dead, expected live"),
         (["live", "--rate", "0"], "--rate: found 0.0"),
-        (["live", "--serve", "a:b:c"], "expected HOST:PORT"),
+        (["live", "--serve", "a:b:c"], "expected [HOST:]PORT"),
         (["live", "--serve", "0.0.0.0:0", "--token", "short"], "expected 16 to 128"),
         (["live", "--serve", "192.0.2.1:80"], "192.0.2.1:80"),
         (["live", "--rig", "absent"], "absent"),

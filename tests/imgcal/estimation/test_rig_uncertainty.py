@@ -3,7 +3,7 @@ import torch
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import RigUncertainty, pixel_jacobian, rigid_motion, uncertainty_over
-from imgcal.estimation.rig_uncertainty import ROUNDS, aligned_covariance
+from imgcal.estimation.rig_uncertainty import ROUNDS, _best_motion
 from imgcal.evaluation.true_error import true_error
 from imgcal.geometry import RigidTransform
 
@@ -105,6 +105,12 @@ def test_noise_of_the_pixels_adds_to_triangulated_points(rig, points):
     rows = -pixel_jacobian(rig, points[:1])[:, 0, :, 3:6].flatten(0, 1)
     scatter = 0.5 * torch.linalg.pinv(rows).square().sum().sqrt()
     assert (with_noise.square() - alone.square()).sqrt()[0] == pytest.approx(float(scatter))
+
+
+def aligned_covariance(covariance, motion, metric):
+    """Project a covariance (K, K) onto the complement of the rigid motions (K, 6) in a metric (K, K), in full size."""
+    keep = torch.eye(len(covariance), dtype=F64) - motion @ _best_motion(motion, metric @ motion)
+    return keep @ covariance @ keep.mT
 
 
 def test_points_of_one_camera_have_no_place(rig, points):

@@ -80,7 +80,7 @@ def test_formats_by_name() -> None:
     [
         (
             {"a__yaml": "a: 1\n"},
-            r"found none of the keys of a calibration \(its keys: a\), expected `format: imgcal-rig/1`",
+            r"found none of the keys of a calibration \(its keys: a\), expected a rig file",
         ),
         ({"a__yaml": ""}, "found none of the keys"),
         ({"a__yaml": "a: [\n"}, "not valid YAML"),

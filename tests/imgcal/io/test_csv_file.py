@@ -55,6 +55,20 @@ def test_spreadsheets_put_a_mark_before_the_header_and_columns_in_any_order(tmp_
     assert chunk.columns == {"n": ("4",), "x": ("1.5",)}
 
 
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("x;n\n1,5;2\n", "found semicolons between the columns, expected commas"),
+        ("x\tn\n1\t2\n", "found tabs between the columns"),
+        ("1.5,2\n3,4\n", "found no header line; expected the columns x,n"),
+    ],
+)
+def test_another_separator_and_a_missing_header_are_named(text: str, expected: str, tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(InputError, match=expected):
+        list(read_chunks(tmp_path / "t.csv", ["x", "n"], []))
+
+
 @pytest.mark.parametrize("row", [0, 4, CHUNK - 1, CHUNK + 3])
 def test_a_bad_value_is_told_with_its_line(row: int, tmp_path: Path) -> None:
     for cell, message in (("word", "x: found 'word'"), ("1e9", "x: found 1e9"), ("nan", "x: found nan")):

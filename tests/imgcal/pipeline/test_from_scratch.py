@@ -48,6 +48,7 @@ def test_from_scratch_is_as_good_as_from_the_factory():
     assert (by_labels.identity, by_blobs.identity) == ("coded", "unique")
     for found in (by_labels, by_blobs):
         assert found.from_scratch and found.rig.prior is None
+        assert found.scale.noticed_from is None  # the rig's size is the object's
         assert found.predicted_error.median_mm < 1.25 * factory.predicted_error.median_mm
         assert error(found.rig, truth) < 3 * error(factory.rig, truth) + 0.5
         assert torch.equal(found.rig.cam_from_rig.rotation[0], torch.eye(3).double())

@@ -62,7 +62,7 @@ def test_where_the_long_file_cannot_be_put_aside_nothing_is_lost_nor_written_els
         raise OSError("no such luck")
 
     with monkeypatch.context() as broken, open(tmp_path / "others", "wb") as others:
-        broken.setattr(os, "replace", refuse) if fails == "replace" else broken.setattr(log, "_opened", refuse)
+        broken.setattr(os, "replace", refuse) if fails == "replace" else broken.setattr(log, "_open_file", refuse)
         for number in (3, 4):
             with pytest.raises(OSError, match="no such luck"):
                 log.append(event(number, message="x" * 100))
