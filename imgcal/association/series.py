@@ -233,7 +233,7 @@ class _Series:
         """Pose of the object if it moves on; None where motion predicts the last snapshot no better than rest."""
         before = (self.results.get(i) for i in range(s - 3, s))
         first, second, third = (None if result is None else result[0].rig_from_object for result in before)
-        if first is None or second is None or third is None:
+        if first is None or second is None or third is None or self.tracker.obj.pose_rank < 6:
             return None
         points = self.tracker.obj.points.to(third.rotation)
 

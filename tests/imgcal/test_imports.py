@@ -29,7 +29,7 @@ for code in sys.argv[2:]:
         os._exit(0)
     assert os.waitpid(child, 0)[1] == 0, code
 """
-OF_OTHER_COMMANDS = {"timm", "tensorboard", "accelerate", "matplotlib"}
+OF_OTHER_COMMANDS = {"timm", "tensorboard", "accelerate", "matplotlib", "kornia"}
 
 
 def imported_by(*codes: str, first: str = "pass") -> list[set[str]]:
