@@ -83,6 +83,7 @@ class Places:
     state: State
     camera: tuple[int, ...]  # (V,) camera of the rig
     first: tuple[int, ...]  # (V,) row of the place's first snapshot
+    moment: NDArray[np.int64]  # (S,) snapshot of each row, ascending: several objects or markers have a row each
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
@@ -111,7 +112,7 @@ class Places:
         start = replace(state, offset=state.offset[:, copies])
         solution = minimize(parted, start, options)
         camera, first = (*self.camera, self.camera[step.camera]), (*self.first, step.row)
-        return Places(parted, solution.state, camera, first)
+        return Places(parted, solution.state, camera, first, self.moment)
 
     def camera_places(self, camera: int) -> list[int]:
         """Indices of a camera's places, in temporal order."""
@@ -152,7 +153,8 @@ class Places:
         """Longest transient error of a camera, in successive snapshots; 0 = errors are not correlated.
 
         The duration follows from the common shift of all labels of an image. All cameras together count as well, so
-        that a camera with few labels is treated like the others.
+        that a camera with few labels is treated like the others. The position of each unknown marker adapts to an error
+        of the whole image, so that correlation does not show: errors of several markers are taken to last.
         """
         shifts = self._shifts()
         own = float(correlation_time(shifts[:, [camera]])[0])
@@ -160,16 +162,19 @@ class Places:
         spread = np.sqrt(np.nansum(np.square(shifts), axis=(0, 2)) / np.maximum(2 * known, 1))
         whitened = shifts / np.maximum(spread, 1e-12)[:, None]
         time = max(own, float(correlation_time(whitened[:, None])[0]))
-        return 0 if time <= 1 else max(math.ceil(EPISODE * time), LEAST_EPISODE)
+        lasting = time > 1 or len(np.unique(self.moment)) < len(self.moment)
+        return max(math.ceil(EPISODE * time), LEAST_EPISODE) if lasting else 0
 
     def _shifts(self) -> Array:
-        """Weighted mean residual of each camera of the rig: (S, C, 2) px, NaN where there are too few labels."""
+        """Weighted mean residual of each camera of the rig: (M, C, 2) px, NaN where there are too few labels."""
         weight = self.problem.root_weight[0].square().numpy()  # (S, V, N)
         residual = equations_at(self.problem, self.state, NamedLoss("squared")).residual[0].numpy()
-        mean = np.einsum("svn,svin->svi", weight, residual) / np.maximum(weight.sum(-1), 1e-30)[..., None]
+        rows = np.flatnonzero(np.diff(self.moment, prepend=-1))  # first of each snapshot
+        total, count = (np.add.reduceat(part, rows) for part in (weight.sum(-1), (weight > 0).sum(-1)))
+        mean = np.add.reduceat(np.einsum("svn,svin->svi", weight, residual), rows) / np.maximum(total, 1e-30)[..., None]
         shifts = np.full((len(mean), max(self.camera) + 1, 2), np.nan)
         for place, camera in enumerate(self.camera):
-            known = (weight[:, place] > 0).sum(-1) >= LEAST_LABELS
+            known = count[:, place] >= LEAST_LABELS
             shifts[known, camera] = mean[known, place]
         return shifts
 
@@ -233,10 +238,17 @@ class Change:
         return kind, length, float(direction @ (alone * scale * scale[:, None]) @ direction) ** 0.5
 
 
-def longest_episode(problem: Problem, state: State, camera: int) -> int:
-    """Longest transient error of a camera, in successive snapshots; 0 = errors are not correlated."""
+def longest_episode(problem: Problem, state: State, camera: int, moment: NDArray[np.int64]) -> int:
+    """Longest transient error of a camera, in successive snapshots; 0 = errors are not correlated.
+
+    Args:
+        problem: one rig, with all labels.
+        state: the estimate.
+        camera: index of the camera.
+        moment: (S,) snapshot of each row, ascending.
+    """
     cameras = problem.uv.shape[2]
-    return Places(problem, state, tuple(range(cameras)), (0,) * cameras).episode(camera)
+    return Places(problem, state, tuple(range(cameras)), (0,) * cameras, moment).episode(camera)
 
 
 def find_moves(
@@ -249,14 +261,15 @@ def find_moves(
         problem: one rig of C cameras, with all labels, outliers included.
         state: the estimate.
         camera_names: C.
-        snapshot_names: S, in temporal order.
+        snapshot_names: S, in temporal order; rows with the same name belong to one snapshot.
         options: how to estimate.
 
     Returns:
         In temporal order. Where two cameras explain a motion equally well, both are named: "cam01 or cam02".
     """
     cameras = len(camera_names)
-    places = still = Places(problem, state, tuple(range(cameras)), (0,) * cameras)
+    moment = np.cumsum([0, *(one != two for one, two in pairwise(snapshot_names))])
+    places = still = Places(problem, state, tuple(range(cameras)), (0,) * cameras, moment)
     noise, doubts = 1.0, {}
     left_out: set[int] = set()
     for _ in range(3 * cameras):
@@ -326,11 +339,13 @@ def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: fl
     shown = np.flatnonzero(places.seen[:, camera])
     saved = divided.costs(camera) - divided.costs(new)
     for rows, gain in ((shown[shown < row], -saved), (shown[shown >= row], saved)):
-        if len(rows) <= length:
+        moments, number = np.unique(places.moment[rows], return_inverse=True)
+        if len(moments) <= length:
             return False
-        for dropped, enough in ((length, least), (len(rows) // 2, least_significant(1, PERSISTENT))):
-            first = int(np.convolve(gain[rows], np.ones(dropped), "valid").argmax())
-            rest = places.drop_labels(camera, rows[first : first + dropped])
+        gained = np.bincount(number, gain[rows])
+        for dropped, enough in ((length, least), (len(moments) // 2, least_significant(1, PERSISTENT))):
+            first = int(np.convolve(gained, np.ones(dropped), "valid").argmax())
+            rest = places.drop_labels(camera, rows[(number >= first) & (number < first + dropped)])
             if rest.blocks.statistics([camera], np.array([row]))[0, 0] < enough * noise:
                 return False
     return True

@@ -77,13 +77,13 @@ def steady_part(
         first = max(names.index(move.snapshot) for move in found if move.snapshot is not None)
         explained = _are_explained(found, detections, first, rig, obj, options)
         if not (options.after_last_move and explained):
-            raise MovedError(moved, total - first, total, explained, labelled.detections)
+            raise MovedError(moved, len(set(names[first:])), len(set(names)), explained, labelled.detections)
         part = associate(detections.of_snapshots(first, total), rig, obj, options)
         found = list_moves(part, rig, obj, options)
         if not found:
             return SteadyPart(arrange_labels(_prepend_earlier(part, labelled, names[first]), rig, obj), tuple(moved))
         moved += found
-    raise MovedError(moved, total - first, total, labelled=labelled.detections)
+    raise MovedError(moved, len(set(names[first:])), len(set(names)), labelled=labelled.detections)
 
 
 def _are_explained(
@@ -250,7 +250,7 @@ def _find_gone(fit: _Fit, labelled: Associations, rig: CameraRig, known: set[str
     The probability that a moment separates the agreeing from the disagreeing snapshots so cleanly follows from random
     order. Where errors are correlated, more snapshots are needed than a transient error lasts.
     """
-    counts = fit.tally
+    counts, moments = fit.tally, labelled.moments[labelled.used]
     moves = []
     agrees, differs = counts.kept > counts.unexplained, counts.unexplained > counts.kept
     differs &= 2 * counts.unexplained >= counts.expected
@@ -261,7 +261,7 @@ def _find_gone(fit: _Fit, labelled: Associations, rig: CameraRig, known: set[str
         total, count = len(rows), int(wrong.sum())
         if name in known or not LEAST_SNAPSHOTS <= count <= total - LEAST_SNAPSHOTS:
             continue
-        least = max(LEAST_SNAPSHOTS, longest_episode(fit.problem, fit.state, camera) + 1)
+        least = max(LEAST_SNAPSHOTS, longest_episode(fit.problem, fit.state, camera, moments) + 1)
         if total < 2 * least:
             continue
         place = np.arange(least, total - least + 1)

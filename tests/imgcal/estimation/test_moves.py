@@ -24,7 +24,7 @@ def bumped():
     truth = faults.changed_from(truth, wand, CAMERA, FIRST, lambda r: faults.turned(r, CAMERA, 0.1))
     observations, _ = accepted_observations(associate(faults.blobs(truth, 1, labelled=True), rig, wand), rig, wand)
     fit = estimate(observations, rig, wand)
-    return Places(fit.problem, fit.solution.state, tuple(range(10)), (0,) * 10), rig
+    return Places(fit.problem, fit.solution.state, tuple(range(10)), (0,) * 10, np.arange(len(fit.problem.uv[0]))), rig
 
 
 def test_a_second_place_takes_the_labels_from_its_snapshot_on(bumped):
@@ -67,7 +67,7 @@ def stepping(first: int, size: float) -> tuple[Places, Places, float]:
     observations, _ = accepted_observations(associate(faults.blobs(truth, 1, labelled=True), rig, wand), rig, wand)
     sigma = torch.full_like(observations.sigma, 0.06)
     fit = estimate(replace(observations, uv=lasting(observations.uv, size), sigma=sigma), rig, wand)
-    places = Places(fit.problem, fit.solution.state, tuple(range(10)), (0,) * 10)
+    places = Places(fit.problem, fit.solution.state, tuple(range(10)), (0,) * 10, np.arange(len(fit.problem.uv[0])))
     statistic = float(places.blocks.statistics([CAMERA], np.array([first]))[0, 0])
     return places, places.divide(Step(CAMERA, first, statistic, np.zeros(10)), OPTIONS), statistic
 
@@ -97,7 +97,7 @@ def test_an_error_that_ends_is_no_step_however_much_of_it_remains_without_an_epi
     off = torch.tensor([0.11, 0.55, 0.32, 0.17, 0.33, 0.42, 0.18], dtype=uv.dtype)  # px, recorded in a room
     uv[first : first + len(off), CAMERA] += off[:, None, None]
     fit = estimate(replace(observations, uv=uv, sigma=torch.full_like(observations.sigma, 0.06)), rig, wand)
-    places = Places(fit.problem, fit.solution.state, tuple(range(10)), (0,) * 10)
+    places = Places(fit.problem, fit.solution.state, tuple(range(10)), (0,) * 10, np.arange(len(fit.problem.uv[0])))
     statistic = float(places.blocks.statistics([CAMERA], np.array([first]))[0, 0])
     divided = places.divide(Step(CAMERA, first, statistic, np.zeros(10)), OPTIONS)
     noise = dispersion(divided.blocks, divided.seen)

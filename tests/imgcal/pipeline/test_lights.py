@@ -168,3 +168,18 @@ def test_first_poses_belong_to_the_rig_of_the_labels(scene: Scene, result: imgca
     off = labelled.rig.project(points).uv[last] - torch.from_numpy(blobs.uv[rows])
     assert float(off.norm(dim=-1).median()) < 1
     assert float((scene.factory.project(points).uv[last] - torch.from_numpy(blobs.uv[rows])).norm(dim=-1).median()) > 5
+
+
+def shifted(scene: Scene, camera: int, moments: range) -> imgcal.Detections:
+    """Shift the blobs of one camera by half a pixel in some moments."""
+    rows = (scene.detections.camera == camera) & np.isin(scene.detections.snapshot, moments)
+    return replace(scene.detections, uv=scene.detections.uv + np.where(rows[:, None], (0.4, -0.3), 0.0))
+
+
+def test_an_error_that_ends_is_no_motion() -> None:
+    scene = simulate(markers=5, moments=60, drift=0.3, seed=4)
+    found = imgcal.calibrate(shifted(scene, 4, range(56, 59)), scene.factory, LIGHTS)
+    assert found.moved == ()
+    assert triangulation_error(found.rig, scene) < 1
+    with pytest.raises(RefusedError, match=r"cam05 moved before snapshot 000(39|40|41).* all 60 snapshots"):
+        imgcal.calibrate(shifted(scene, 4, range(40, 60)), scene.factory, LIGHTS)
