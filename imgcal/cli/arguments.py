@@ -529,8 +529,9 @@ class Fleet:
     MANIFEST is a CSV or Parquet file with a column `capture` (folder or table of blobs: a path relative to the
     manifest, or a URL), and optionally `rig`, `object`, `device`, `time`, `hours` since the factory calibration, and
     other columns of numbers such as `temperature`. OUT/results is a Parquet dataset with a row per capture,
-    including those that are refused, damaged, hang or crash. A rerun does what is missing or has changed. OUT/prior.yaml
-    is the drift prior learned from the fleet, for rig files; OUT/report.html shows it, and the outlier cameras.
+    including those that are refused, damaged, hang or crash. A rerun does what is missing or has changed.
+    OUT/prior.yaml is the drift prior learned from the fleet, for rig files; OUT/report.html shows it, and the outlier
+    cameras.
 
     For example:
         imgcal fleet captures.csv --rig rig.yaml --object object.csv --out fleet
