@@ -39,6 +39,13 @@ def list_names(names: Iterable[str]) -> str:
     return f"{', '.join(shown[: MOST_QUOTED // 50])}, ... ({len(whole)} in all)"
 
 
+def name_cameras(names: Iterable[str]) -> str:
+    """Name cameras in a sentence: `camera a`, `cameras a, b`."""
+    whole = list(names)
+    shown = ", ".join(shorten(name) for name in whole[:8]) + (f", ... ({len(whole)})" if len(whole) > 8 else "")
+    return f"camera{'s' if len(whole) > 1 else ''} {shown}"
+
+
 def one_line(message: str) -> str:
     """Make a message safe for one line of a terminal: no line breaks, no control characters, limited length."""
     text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in " ".join(message.split()))

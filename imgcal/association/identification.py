@@ -166,7 +166,7 @@ def relocalize(
 def _relocalize(scene: Scene, options: IdentityOptions) -> Identity:
     obj = scene.obj
     if obj.pose_rank == 3:
-        return _refuse(scene, "a single marker has no pattern: beside snapshots with labels, others say nothing")
+        return _refuse(scene, "a single marker has no pattern: beside labelled snapshots, unlabelled ones are not used")
     if obj.pose_rank == 5:
         sticks = fit_sticks(scene, options.seed)
         if sticks is None:
@@ -262,7 +262,7 @@ def _too_little(name: str, fitted: float, certain_share: float, least: float) ->
     if fitted >= least:
         return (
             f"the best fit explains {100 * fitted:.0f} % of the visible markers, but labels are certain of only "
-            f"{100 * certain_share:.0f} %, expected {100 * least:.0f} %: too few blobs, or too many that are not "
+            f"{100 * certain_share:.0f} % ({100 * least:.0f} % needed): too few blobs, or too many that are not "
             "fiducials; show more of the object, to more cameras"
         )
     return (

@@ -128,7 +128,7 @@ def judge(
     given = found.labels >= 0
     agreed = given & (found.labels == proposed)
     if agreed.sum() < LEAST_AGREEMENT * given.sum():
-        reason = f"labels: blobs agree with {agreed.sum()} of {given.sum()} that the images propose"
+        reason = f"labels: blobs agree with {agreed.sum()} of the {given.sum()} that the images propose"
         return replace(refused, reason=reason), blobs
     labels = np.where(agreed | (proposed < 0), found.labels, -1)
     return replace(found, labels=labels, margin=min(found.margin, proposal.margin)), blobs

@@ -401,8 +401,8 @@ class Harvest:
     out: Path  #: folder to write
     snapshots: str | None = None  #: A:B, numbers in file order from 0, without B; default: all
     detector: str = "auto"  #: what finds the object where blobs decide nothing: auto, both, or classical (nothing)
-    size: int = 96  #: pixels, width and height of a crop; what the network takes
-    seed: int = 0  #: of the random places of crops
+    size: int = 96  #: pixels, width and height of a crop, as the network expects it
+    seed: int = 0  #: seed of the random places of crops
     videos_differ: bool = False  #: accept videos whose lengths or time stamps differ; match frames by number
     detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
 
@@ -528,9 +528,10 @@ class Fleet:
 
     MANIFEST is a CSV or Parquet file with a column `capture` (folder or table of blobs: a path relative to the
     manifest, or a URL), and optionally `rig`, `object`, `device`, `time`, `hours` since the factory calibration, and
-    other columns of numbers such as `temperature`. OUT/results is a Parquet dataset with a row per capture, also for
-    those that were refused, are damaged, hang or crash. A rerun does what is missing or has changed. OUT/prior.yaml is
-    the drift prior learned from the fleet, for rig files; OUT/report.html shows it, and the outlier cameras.
+    other columns of numbers such as `temperature`. OUT/results is a Parquet dataset with a row per capture,
+    including those that are refused, damaged, hang or crash. A rerun does what is missing or has changed.
+    OUT/prior.yaml is the drift prior learned from the fleet, for rig files; OUT/report.html shows it, and the outlier
+    cameras.
 
     For example:
         imgcal fleet captures.csv --rig rig.yaml --object object.csv --out fleet
@@ -567,7 +568,7 @@ class Demo:
     what: Annotated[Literal["live"], tyro.conf.Positional]  #: the live page
     rig: str = "O10"  #: rig: a file, or the name of a shipped one (O10, O6, U7, T4, room10)
     object: str = "asymmetric8"  #: object: a file, or the name of a shipped one
-    serve: str | None = None  #: HOST:PORT to listen on; default: 127.0.0.1:8765, for this machine only
+    serve: str | None = None  #: [HOST:]PORT to listen on; default: 127.0.0.1:8765, for this machine only
     token: str | None = None  #: token that other machines need to open the page; default: a new one
     rate: float = 15.0  #: snapshots per second
 

@@ -288,7 +288,7 @@ def _verdict(error: BaseException, given: list[str]) -> tuple[int, str]:
     ours = [frame for frame in traceback.extract_tb(error.__traceback__) if "imgcal" in Path(frame.filename).parts]
     place = f" ({Path(ours[-1].filename).name}:{ours[-1].lineno})" if ours else ""
     what = quote(f"{type(error).__name__}: {error}")
-    return UNUSABLE, f"internal error{place}: {what}; this is a fault of imgcal; {DEBUG} shows where"
+    return UNUSABLE, f"internal error{place}: {what}; this is a bug in imgcal; {DEBUG} shows where"
 
 
 def run() -> None:

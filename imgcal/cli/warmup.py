@@ -18,8 +18,8 @@ class Warmup(arguments.Warmup):
     def run(self) -> None:
         """Compile, and say where it is kept."""
         started = time.perf_counter()
-        with announce_compilation("compiling, which takes a while") as compiled:
+        with announce_compilation("compiling for this machine, which takes a few minutes") as compiled:
             warm_up(self.all_lenses)
-        what = f"{plural(len(compiled), 'function')} compiled" if compiled else "all was compiled already"
+        what = f"{plural(len(compiled), 'function')} compiled" if compiled else "everything was already compiled"
         where = cache_folder() or "where Python keeps the compiled files of imgcal"
         print(f"{what} in {time.perf_counter() - started:.1f} s, kept in {where}", file=sys.stderr)

@@ -77,7 +77,7 @@ class Display:
         if state is not None and state.refused is not None:
             parts.append("not learning now")
         parts.append(f"{plural(tally.snapshots, 'snapshot')}, {self._rate:.3g}/s")
-        return " | ".join([*parts, *self._counts(), *self._clocks(), *self._trembling(), *self._unsynchronized()])
+        return " | ".join([*parts, *self._counts(), *self._clocks(), *self._shaking(), *self._unsynchronized()])
 
     def result(self, rig: Path) -> str:
         """Say in one line what came of it, and what did not: `rig` is the file."""
@@ -122,13 +122,13 @@ class Display:
                 found.append(f"{name} exposes {1e3 * (offset - stamped):+.1f} ms off its time stamps")
         return found
 
-    def _trembling(self) -> list[str]:
-        """Name the cameras that tremble."""
+    def _shaking(self) -> list[str]:
+        """Name the cameras that shake."""
         state = self._tally.latest
         if state is None:
             return []
         names = zip(state.factory.camera_names, state.shake.tolist(), strict=True)
-        return [f"{name} trembles by {size:.2g} px" for name, size in names if size > 0]
+        return [f"{name} shakes by {size:.2g} px" for name, size in names if size > 0]
 
     def _print(self, text: str) -> None:
         self._console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -9,7 +9,8 @@ import numpy as np
 
 from imgcal.formats.foreign_rig import FormatError
 from imgcal.formats.lens import Array
-from imgcal.formats.values import name_cameras, nearest_rotation
+from imgcal.formats.values import nearest_rotation
+from imgcal.messages import name_cameras
 
 Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,) of destination_from_source
 IDENTITY: Pose = (np.eye(3), np.zeros(3))

@@ -16,8 +16,8 @@ from imgcal.formats import places
 from imgcal.formats.chains import IDENTITY, Pose, compose, inverse
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.lens import Array, Lens
-from imgcal.formats.values import name_cameras, quaternion_from_rotation, rotation_from_quaternion
-from imgcal.messages import shorten
+from imgcal.formats.values import quaternion_from_rotation, rotation_from_quaternion
+from imgcal.messages import name_cameras, shorten
 
 HALF = 0.5
 MODELS = (

@@ -15,10 +15,9 @@ from imgcal.formats.fitting import Fit, Holds, fit_lens
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig
 from imgcal.formats.lens import Lens
 from imgcal.formats.limits import LIMIT
-from imgcal.formats.values import name_cameras
 from imgcal.geometry import LENS_MODELS, RigidTransform, lens_label, lens_width
 from imgcal.io import RigCovariance
-from imgcal.messages import plural, shorten
+from imgcal.messages import name_cameras, plural, shorten
 from imgcal.types import CameraRig, check_rig
 
 BROWN, RATIONAL, FISHEYE = "brown_conrady", "rational", "equidistant"

@@ -16,13 +16,13 @@ from imgcal.formats.values import (
     camera_matrix,
     coefficients,
     image_size,
-    name_cameras,
     number,
     numbers,
     rotation,
     text,
     vector_from_rotation,
 )
+from imgcal.messages import name_cameras
 
 TITLE = "EasyMocap intri.yml and extri.yml"
 

@@ -98,5 +98,5 @@ def _convert_lenses(
 ) -> CameraRig:
     """Express a rig in our lens models, with its image sizes filled in."""
     sizes = image_size if isinstance(image_size, Mapping) else {} if image_size is None else {"": image_size}
-    held = fit_to_target(fill_image_sizes(rig, str(path), sizes), NATIVE, "a rig of ours", fit_limit)
+    held = fit_to_target(fill_image_sizes(rig, str(path), sizes), NATIVE, "an imgcal rig", fit_limit)
     return to_camera_rig(held.rig, io.title_from_name(path if path.is_file() else path.resolve()))

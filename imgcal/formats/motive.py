@@ -16,7 +16,8 @@ from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, P
 from imgcal.formats.format import Format
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
-from imgcal.formats.values import attribute, focal_length, image_size, name_cameras, nearest_rotation, number
+from imgcal.formats.values import attribute, focal_length, image_size, nearest_rotation, number
+from imgcal.messages import name_cameras
 
 TITLE = "OptiTrack Motive calibration (.mcal)"
 COEFFICIENTS = ("k1", "k2", "TangentialX", "TangentialY", "k3")  # in OpenCV's order

@@ -23,11 +23,11 @@ from imgcal.formats.values import (
     coefficients,
     image_size,
     mapping,
-    name_cameras,
     numbers,
     rotation,
     text,
 )
+from imgcal.messages import name_cameras
 
 TITLE = "multical calibration.json"
 MODELS = {"standard": (0, 4, 5), "rational": (5, 8), "thin_prism": (5, 8, 12), "tilted": (5, 8, 12, 14)}

@@ -16,7 +16,8 @@ from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
 from imgcal.formats.format import Format
 from imgcal.formats.lens import Array, Lens
 from imgcal.formats.source import Source
-from imgcal.formats.values import attribute, focal_length, name_cameras, nearest_rotation, number
+from imgcal.formats.values import attribute, focal_length, nearest_rotation, number
+from imgcal.messages import name_cameras
 
 TITLE = "Qualisys calibration"
 FRACTION = 64.0

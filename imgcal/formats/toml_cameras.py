@@ -27,14 +27,13 @@ from imgcal.formats.values import (
     camera_matrix,
     coefficients,
     image_size,
-    name_cameras,
     number,
     numbers,
     rotation,
     text,
     vector_from_rotation,
 )
-from imgcal.messages import list_names
+from imgcal.messages import list_names, name_cameras
 
 Table = dict[str, Any]
 WORLD = ("world_position", "world_orientation")  # what FreeMoCap adds to a pose

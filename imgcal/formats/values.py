@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from imgcal.formats.documents import Element
 from imgcal.formats.foreign_rig import FormatError
 from imgcal.formats.lens import Array
-from imgcal.messages import shorten
 from imgcal.types import limits
 
 LARGEST = 1e12
@@ -165,9 +164,3 @@ def text(value: Any, what: str) -> str:
     if isinstance(value, bool) or not isinstance(value, str | int | float):
         raise FormatError(f"{what}: found {reprlib.repr(value)}, expected text")
     return str(value)
-
-
-def name_cameras(names: Sequence[str]) -> str:
-    """Name cameras in a sentence: `camera a`, `cameras a, b`."""
-    shown = ", ".join(shorten(name) for name in names[:8]) + (f", ... ({len(names)})" if len(names) > 8 else "")
-    return f"camera{'s' if len(names) > 1 else ''} {shown}"

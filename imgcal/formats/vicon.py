@@ -21,11 +21,11 @@ from imgcal.formats.values import (
     attribute,
     focal_length,
     image_size,
-    name_cameras,
     number,
     numbers,
     rotation_from_quaternion,
 )
+from imgcal.messages import name_cameras
 
 TITLE = "Vicon calibration (.xcp)"
 

@@ -17,9 +17,8 @@ from imgcal.formats.limits import LIMIT
 from imgcal.formats.patching import Change, TextFile, patch_bytes
 from imgcal.formats.registry import find_format, is_foreign, read_back, read_foreign_rig
 from imgcal.formats.source import SUFFIXES, Source
-from imgcal.formats.values import name_cameras
 from imgcal.io import read_bytes
-from imgcal.messages import with_article
+from imgcal.messages import name_cameras, with_article
 
 DIGITS = (0, 9, 12, 17)  # tried in this order: those of the file first
 ROUNDING = 1e-3  # px that the digits of a file may cost: a hundredth of how well markers are measured

@@ -61,7 +61,7 @@ def convert_rig(
         RefusedError: a lens cannot be expressed within `limit`.
     """
     if to == OURS:
-        held = fit_to_target(rig, NATIVE, "a rig file of ours", limit)
+        held = fit_to_target(rig, NATIVE, "an imgcal rig file", limit)
         made = to_camera_rig(held.rig, name)
         if hold_distortion:
             made = replace(made, prior=replace(made.prior or RigPrior(), distortion=HELD_DISTORTION))
@@ -112,7 +112,7 @@ def _compare(rig: ForeignRig, held: Held, back: ForeignRig, files: Files, notes:
     exact, _ = worst_difference(held.rig, back)
     between, points = worst_difference(rig, back)
     if not exact <= MOST_PX:
-        raise RuntimeError(f"what was written is read back {exact:.3g} px off")
+        raise RuntimeError(f"the written file, read back, is {exact:.3g} px off")
     notes += [fit_note(camera, fit) for camera, fit in zip(rig.cameras, held.fits, strict=True) if not fit.exact]
     return Written(files, tuple(notes), exact, between, points)
 

@@ -118,7 +118,7 @@ class Application:
         if path == "/favicon.ico":
             return 204, "image/x-icon", b"", {}
         if path not in ("/rig.yaml", "/report.html"):
-            return _refusal_answer(Refusal(404, "there is nothing of that name"))
+            return _refusal_answer(Refusal(404, "not found"))
         if not self._downloads.try_take():
             return _refusal_answer(Refusal(429, "too many downloads at once"))
         if path == "/report.html":
@@ -178,7 +178,7 @@ class Application:
     async def _stream(self, receive: Receive, send: Send) -> None:
         """Send what is new, for as long as the viewer takes it."""
         if len(self.viewers) >= MOST_VIEWERS:
-            await _answer(send, _refusal_answer(Refusal(503, f"{MOST_VIEWERS} viewers are here already")))
+            await _answer(send, _refusal_answer(Refusal(503, f"{MOST_VIEWERS} viewers are connected already")))
             return
         viewer = Viewer()
         viewer.add(self.board.everything())

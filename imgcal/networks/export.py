@@ -166,7 +166,7 @@ def _points(path: Path, network: Network, count: int) -> Program:
     uv = uv + 3 * torch.randn(count, *uv.shape, generator=generator)
     inputs = {
         "uv": f"float32 ({count}, {cameras}, {fiducials}, 2): pixels, {rig.name}'s cameras, {obj.name}'s fiducials",
-        "seen": f"bool ({count}, {cameras}, {fiducials}): of those that are not, uv means nothing",
+        "seen": f"bool ({count}, {cameras}, {fiducials}): where false, uv is ignored",
     }
     lens = rig.distortion.shape[-1]
     outputs = {

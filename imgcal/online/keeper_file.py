@@ -87,7 +87,7 @@ def read_state(path: str | Path) -> tuple[dict[str, Any], StateReader]:
     found = values.get("format") if isinstance(values, dict) else None
     if found != FORMAT and isinstance(found, str) and found.startswith(FORMAT[: FORMAT.index("/") + 1]):
         raise InputError(
-            f"{path}: State files from {'earlier' if found < FORMAT else 'later'} versions cannot be resumed: found "
+            f"{path}: state files from {'earlier' if found < FORMAT else 'later'} versions cannot be resumed: found "
             f'{shorten(found)}, expected {FORMAT}; the file holds the last rig as "rig"'
         )
     if found != FORMAT:

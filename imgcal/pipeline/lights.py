@@ -30,7 +30,7 @@ from imgcal.association import (
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, EstimationOptions, estimate, robust_std
 from imgcal.geometry import RigidTransform
-from imgcal.messages import list_names
+from imgcal.messages import name_cameras
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
 
 HELD_OUT = 4
@@ -328,14 +328,14 @@ def _why(agreement: Agreement | None, rig: CameraRig) -> str:
     unjudged = [rig.camera_names[c] for c in np.flatnonzero(~agreement.judged)]
     if unjudged and not (agreement.judged & ~agreement.agrees).any():
         return (
-            f"unknown markers: camera {list_names(unjudged)}: in the held-out snapshots, the other "
+            f"unknown markers: {name_cameras(unjudged)}: in the held-out snapshots, the other "
             "cameras find "
             f"too few markers in its view to judge it by (expected {LEAST_PREDICTED}): capture more, or leave it out"
         )
     bad = np.flatnonzero(agreement.judged & ~agreement.agrees)
     worst = int(bad[np.argmin(agreement.found[bad])])
     return (
-        f"unknown markers: camera {list_names([rig.camera_names[c] for c in bad])}: of {agreement.predicted[worst]} "
+        f"unknown markers: {name_cameras(rig.camera_names[c] for c in bad)}: of {agreement.predicted[worst]} "
         f"markers that the other cameras find in view of {rig.camera_names[worst]}, in held-out snapshots, "
         f"{100 * max(agreement.found[worst], 0):.0f} % have a blob in their place and "
         f"{100 * max(agreement.near_misses[worst], 0):.0f} % one beside it: which blobs belong together cannot be "

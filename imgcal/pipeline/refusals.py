@@ -12,6 +12,7 @@ from torch import Tensor
 from imgcal.association import PipelineOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate
+from imgcal.messages import name_cameras
 from imgcal.pipeline.label_counts import LabelCounts
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
@@ -28,7 +29,7 @@ def require_cameras(seen: NDArray[np.bool_], rig: CameraRig, options: PipelineOp
     blind = [rig.camera_names[i] for i in np.flatnonzero(~seen.any(axis=(0, 2)))]
     if blind and (not options.blind_cameras or len(blind) == rig.num_cameras):
         raise RefusedError(
-            f"camera {', '.join(blind)}: found no fiducial in any snapshot, expected some; it cannot be calibrated",
+            f"{name_cameras(blind)}: found no fiducial in any snapshot, expected some to calibrate from",
             python="rig.select leaves a camera out, PipelineOptions(blind_cameras=True) keeps its factory values",
             command="--without leaves a camera out, --blind-cameras keeps its factory values",
         )
@@ -48,14 +49,14 @@ def require_views(counts: LabelCounts, rig: CameraRig, least_share: float = LEAS
     bad = (kept <= least_share * (kept + unexplained)) & (unexplained >= LEAST_SIGHT * np.maximum(expected, 1))
     if bad.any():
         camera = int(np.argmax(np.where(bad, unexplained, -1)))
-        which = ", ".join(rig.camera_names[i] for i in np.flatnonzero(bad))
+        which = [rig.camera_names[i] for i in np.flatnonzero(bad)]
         raise RefusedError(
-            f"camera {which}: the other cameras put {expected[camera]} fiducials into the image of "
+            f"{name_cameras(which)}: the other cameras put {expected[camera]} fiducials into the image of "
             f"{rig.camera_names[camera]}, found {kept[camera]} there, and {unexplained[camera]} blobs that belong to "
             "nothing: the image may be mirrored or turned, its frames may be of another camera or moment, or its pose "
             "or lens may differ from the rig file",
             python="correct this, or leave the camera out of the rig (rig.select) and of the detections",
-            command=f"correct this, or leave out what is wrong: --without {which.replace(',', '')}",
+            command=f"correct this, or leave out what is wrong: --without {' '.join(which)}",
         )
 
 
@@ -135,7 +136,7 @@ def require_most_labels(labels: NDArray[np.bool_], kept: NDArray[np.bool_], rig:
     if bad:
         which = [rig.camera_names[i] for i in bad]
         raise RefusedError(
-            f"estimation: camera {', '.join(which)}: {before[bad[0]] - after[bad[0]]} of {before[bad[0]]} labels in "
+            f"estimation: {name_cameras(which)}: {before[bad[0]] - after[bad[0]]} of {before[bad[0]]} labels in "
             f"{which[0]} do not fit what the other cameras see: its frames may be of another moment, or its labels of "
             "other fiducials",
             python="correct this, or leave the camera out of the rig (rig.select) and of the detections",
@@ -145,7 +146,7 @@ def require_most_labels(labels: NDArray[np.bool_], kept: NDArray[np.bool_], rig:
     bad = np.flatnonzero((before >= 6) & (after < 0.5 * before)).tolist()
     if bad:
         raise RefusedError(
-            f"estimation: fiducial {', '.join(map(str, bad))} (row of the object file): "
+            f"estimation: fiducial{'s' if len(bad) > 1 else ''} {', '.join(map(str, bad))} (row of the object file): "
             f"{before[bad[0]] - after[bad[0]]} of {before[bad[0]]} labels of fiducial {bad[0]} do not fit: it "
             "has moved on the object, or labels are swapped",
             python="measure it again, or leave it out of the object",

@@ -69,10 +69,10 @@ class Scale:
         added = [f"{self.px_per_percent:.2g} px"]
         if self.mm_per_percent:
             added.insert(0, f"{self.mm_per_percent:.2g} mm")
-        words = f"scale rests on the object file alone: 1 % object error adds {', '.join(added)} to this"
+        words = f"scale rests on the object file alone: 1 % error in it adds {', '.join(added)} to this"
         if self.noticed_from is None:
-            return f"{words}, and no such error can be noticed"
-        return f"{words}, and is noticed from {100 * self.noticed_from:.2g} % on"
+            return f"{words}; such an error cannot be noticed"
+        return f"{words}; errors above {100 * self.noticed_from:.2g} % would be noticed"
 
     @property
     def values(self) -> dict[str, Any]:

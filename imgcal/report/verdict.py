@@ -206,7 +206,7 @@ def _figures(content: ReportContent) -> tuple[KeyFigure, ...]:
     note = "RMS, before → after" if before else "RMS"
     figures = [
         KeyFigure(f"{before}{pixels(content.rms_after)} px", "reprojection error", note),
-        KeyFigure(f"{content.chi2_per_dof:.2f}", "chi² per dof", "1: as the noise says"),
+        KeyFigure(f"{content.chi2_per_dof:.2f}", "chi² per dof", "1: as expected from the noise"),
         KeyFigure(f"{used} / {total}", "snapshots used"),
         KeyFigure(f"{group_digits(int(content.used.sum()))} / {group_digits(len(content.detections))}", "blobs used"),
     ]

@@ -6,7 +6,18 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.messages import LONGEST, MOST_QUOTED, brief_repr, list_names, one_line, plural, quote, shorten, with_article
+from imgcal.messages import (
+    LONGEST,
+    MOST_QUOTED,
+    brief_repr,
+    list_names,
+    name_cameras,
+    one_line,
+    plural,
+    quote,
+    shorten,
+    with_article,
+)
 
 
 @pytest.mark.parametrize("length", [0, 1, 40, 41, 10_000])
@@ -61,3 +72,8 @@ def test_a_dataclass_of_tensors_shows_shapes() -> None:
 
     found = repr(Seen(torch.zeros(4, 0, 2), np.zeros(3, np.int64), ("a", "b", "c", "d", "e")))
     assert found == "Seen(uv=float32(4, 0, 2), camera=int64(3,), names=('a', ..., 'e': 5), more=1.5)"
+
+
+def test_cameras_in_a_sentence() -> None:
+    assert name_cameras(["a"]) == "camera a"
+    assert name_cameras([str(n) for n in range(9)]) == "cameras 0, 1, 2, 3, 4, 5, 6, 7, ... (9)"

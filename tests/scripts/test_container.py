@@ -138,7 +138,7 @@ def test_the_image_is_built_keeps_what_it_compiles_and_its_page_answers(capfd, m
     with steps.build() as image:
         told = capfd.readouterr()
         assert "RUN imgcal warmup" in told.out
-        assert "imgcal: compiling, which takes a while" in told.err.splitlines()
+        assert "imgcal: compiling for this machine, which takes a few minutes" in told.err.splitlines()
         assert re.search(rf"\d+ functions compiled in .* s, kept in {image.root}/var/cache/imgcal\n", told.err)
         (packages,) = image.root.glob("opt/imgcal/lib/python*/site-packages")
         for package in ("imgcal", "renderers"):

@@ -306,7 +306,7 @@ def test_the_state_of_another_version_is_told_and_nothing_is_lost(blobs, tmp_pat
     assert watch(tmp_path / "blobs.csv", out) == 2
     error = capsys.readouterr().err
     assert (
-        "State files from earlier versions cannot be resumed" in error
+        "state files from earlier versions cannot be resumed" in error
         and error.endswith("; --fresh starts over\n")
         and error.count("\n") == 1
     )

@@ -69,11 +69,11 @@ def test_cameras_whose_stamps_go_with_no_other_are_named(monkeypatch):
         assert "| 3 jumps of all clocks |" in shown.line() and shown.line().endswith(f"| {said}")
 
 
-def test_a_camera_that_trembles_is_named(monkeypatch):
+def test_a_camera_that_shakes_is_named(monkeypatch):
     shown, _, tally = display(monkeypatch, False)
     tally.latest = replace(some_state(), shake=np.array([0.0, 0.1532, 0.0, 0.0]))
     with shown.show_tally(tally):
-        assert shown.line().endswith("| cam02 trembles by 0.15 px")
+        assert shown.line().endswith("| cam02 shakes by 0.15 px")
 
 
 def test_a_clock_that_is_off_is_named(monkeypatch):

@@ -73,11 +73,6 @@ def test_coefficients_are_as_many_as_some_model_has() -> None:
         values.coefficients([1, 2, 3], "d")
 
 
-def test_cameras_in_a_sentence() -> None:
-    assert values.name_cameras(["a"]) == "camera a"
-    assert values.name_cameras([str(n) for n in range(9)]) == "cameras 0, 1, 2, 3, 4, 5, 6, 7, ... (9)"
-
-
 def test_a_scale_of_a_camera_matrix_that_nothing_can_be_divided_by_is_refused_without_a_warning() -> None:
     with pytest.raises(FormatError, match="expected a camera matrix"):
         values.camera_matrix([[900, 0, 640], [0, 905, 400], [0, 0, 1e-310]], "K")

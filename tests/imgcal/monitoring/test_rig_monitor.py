@@ -235,7 +235,7 @@ def test_two_cameras_are_followed_for_as_long_as_drift_is_learnt() -> None:
 
 
 def test_a_bump_of_which_it_cannot_be_told_yet_is_not_learnt_as_drift() -> None:
-    """One snapshot a second of cameras that tremble: the question is open when a stretch of drift ends."""
+    """One snapshot a second of cameras that shake: the question is open when a stretch of drift ends."""
     rig, obj, bump = (
         imgcal.load_rig("T4"),
         imgcal.load_object("asymmetric8"),

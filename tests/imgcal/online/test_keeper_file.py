@@ -154,7 +154,7 @@ def test_the_state_of_another_version_is_refused_with_what_can_be_done(saved, tm
     path, content = tmp_path / "state.json", json.loads(saved[0].read_text())
     content["format"] = f"imgcal-keeper/{version}"
     path.write_text(json.dumps(content))
-    with pytest.raises(InputError, match=f"State files from {age} versions cannot be resumed") as told:
+    with pytest.raises(InputError, match=f"state files from {age} versions cannot be resumed") as told:
         RigKeeper.restore(path)
     assert "\n" not in str(told.value)
 

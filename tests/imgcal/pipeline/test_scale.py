@@ -28,7 +28,7 @@ def test_an_object_that_is_one_percent_larger_adds_what_is_said(rig_name: str) -
     assert found.scale.px_per_percent == pytest.approx(float(px[px.isfinite()].median()), rel=0.25)
     assert found.scale.mm_per_percent == pytest.approx(float(mm[mm.isfinite()].median()), rel=0.25)
     assert found.scale.px_per_percent > 10 * found.predicted_error.median_px
-    assert f"1 % object error adds {found.scale.mm_per_percent:.2g} mm" in str(found.scale)
+    assert f"1 % error in it adds {found.scale.mm_per_percent:.2g} mm" in str(found.scale)
     assert predicted_error(found).median_px == found.predicted_error.median_px
 
 
