@@ -39,14 +39,14 @@ BLOBS, REST, IDENTITY = "blobs", "rest", "identity"
 STAGES: Mapping[str, tuple[tuple[Any, str], ...]] = {
     "maps": (
         (matched_filter, "surprise_maps"),
-        (matched_filter.Maps, "pooled"),
-        (matched_filter.Maps, "dilated"),
+        (matched_filter.Maps, "pool"),
+        (matched_filter.Maps, "dilate"),
     ),
-    "poses": ((matched_filter.View, "known"),),
+    "poses": ((matched_filter.View, "search_known"),),
     "encoder": ((learned_proposer._View, "of"),),
-    "looks": ((learned_proposer._View, "look"),),
+    "looks": ((learned_proposer._View, "ask"),),
     "measurer": ((learned_proposer._View, "_measure_by_network"),),
-    "marker fits": ((refinement, "_measured"), (learned_proposer._View, "_fitted")),
+    "marker fits": ((refinement, "_measure"), (learned_proposer._View, "_fit")),
     "rig fits": ((refinement, "_fit"), (learned_proposer._View, "fit")),
 }
 """Functions that are timed, by stage and owner; none of them calls another."""

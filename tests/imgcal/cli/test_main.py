@@ -25,7 +25,7 @@ def failing(error):
         def run(self):
             raise error
 
-    return lambda arguments: Failing()
+    return lambda arguments, stack: Failing()
 
 
 @pytest.mark.parametrize(
