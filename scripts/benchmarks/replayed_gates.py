@@ -25,7 +25,7 @@ from scripts.benchmarks import real_stream, replayed_noise, replayed_stream
 from scripts.benchmarks.followed_streams import SURELY, distance
 from scripts.benchmarks.real_stream import LIMIT, QUIET, RATE, SEEN, judge, plain, start
 from scripts.benchmarks.replayed_noise import recorded_residuals, recorded_series, statistics
-from scripts.benchmarks.replayed_stream import PLACES, TEACHING, ReplayedStream, calibrated_stream
+from scripts.benchmarks.replayed_stream import PLACES, TEACHING, calibrated_stream
 from scripts.benchmarks.rig_streams import Bump
 from scripts.benchmarks.wand_recording import calibrated
 from scripts.output import ROOT, WORK, command, markdown, surroundings, write_json
@@ -92,6 +92,9 @@ def run(item: Item) -> dict[str, Any]:
             if len(seeing) >= AFTER:
                 break
     chi2s = np.array([c for look in looks for c in look])
+    with start(calibration) as keeper:
+        assert stream.place is not None
+        at_first = distance(keeper.belief, stream.place.truth)
     found = {
         **said,
         "snapshots": number + 1 - TEACHING,
@@ -102,7 +105,8 @@ def run(item: Item) -> dict[str, Any]:
         "beyond_3_sigma": int((chi2s > SURELY).sum()),
         "lost": sum(event["event"] == "camera_lost" for event in events),
         "calibration_rms_px": float(calibration.rms),
-        "calibration_nees": _calibration_nees(calibration, stream),
+        "calibration_nees": float(at_first.mean() / VALUES),
+        "calibration_beyond_3_sigma": float((at_first > SURELY).double().mean()),
         "s_to_calibrate": taught,
         "cpu_s": time.process_time() - began,
     }
@@ -113,13 +117,6 @@ def run(item: Item) -> dict[str, Any]:
         return {**found, **judge(events, name, bumps[0].kind, bumps[0].snapshot, seeing, LIMIT)}
     false = [event for event in events if event["event"] not in QUIET]
     return {**found, "false": len(false), "events": false}
-
-
-def _calibration_nees(calibration: Any, stream: ReplayedStream) -> float:
-    """Chi-squared per value of the calibration that the keeper starts from, median over the cameras."""
-    assert stream.place is not None
-    with start(calibration) as keeper:
-        return float(distance(keeper.belief, stream.place.truth).median() / VALUES)
 
 
 def items(snapshots: int = LONG, bumped: int | None = None) -> Iterator[Item]:
@@ -153,7 +150,12 @@ def summarize(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "looks": looks,
         "nees": sum(r["nees"] * r["looks"] for r in quiet if r["looks"]) / looks if looks else None,
         "nees_median": float(np.median([row["nees_median"] for row in quiet if row["looks"]])) if looks else None,
+        "nees_deviation": _deviation([row["nees"] for row in quiet if row["looks"]]),
         "beyond_3_sigma": sum(row["beyond_3_sigma"] for row in quiet) / looks if looks else None,
+        "calibrations": len(done),
+        "calibration_nees": _mean([row["calibration_nees"] for row in done]),
+        "calibration_nees_deviation": _deviation([row["calibration_nees"] for row in done]),
+        "calibration_beyond_3_sigma": _mean([row["calibration_beyond_3_sigma"] for row in done]),
         "bumps": len(bumps),
         "in_time": len(delays),
         "right": sum(row["in_time"] and row["right_kind"] and not row["others_blamed"] for row in bumps),
@@ -211,6 +213,15 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
             ["recorded / replayed", "spread px", "shared shift px", "if independent", *lags], noise
         ),
     }
+
+
+def _mean(values: list[float]) -> float | None:
+    return float(np.mean(values)) if values else None
+
+
+def _deviation(values: list[float]) -> float | None:
+    """Standard deviation of the mean of independent values."""
+    return float(np.std(values, ddof=1) / len(values) ** 0.5) if len(values) > 1 else None
 
 
 def _figure(value: float | None, form: str) -> str:
