@@ -28,7 +28,7 @@ class Display:
     """Shows the progress; with `rich` in a terminal."""
 
     def __init__(self, console: Console, intake: SourceReader, hook: Hook | None = None) -> None:
-        """Prepare; nothing is shown before `of`."""
+        """Prepare; nothing is shown before `show_tally`."""
         self._console, self._intake, self._hook, self._tally = console, intake, hook, Tally()
         self._live: Live | None = None
         self._drawn = self._said = -SAID_EVERY
