@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from imgcal.online.events import Event
 from imgcal.online.keeper_memory import KeeperMemory
-from imgcal.online.rig_state import CameraHealth
+from imgcal.online.rig_state import CALIBRATED, CameraHealth
 
 VAIN = 2
 """Successive snapshots that do not fit in most cameras; a single one may just have wrong labels."""
@@ -18,6 +18,7 @@ SAID: Mapping[CameraHealth, tuple[str, str]] = {
     "dirty": ("is dirty", "are dirty"),
     "defocused": ("is out of focus", "are out of focus"),
     "unseen": ("has not seen the object yet", "have not seen the object yet"),
+    "hidden": ("does not see the object", "do not see the object"),
 }
 """The words for one camera, and for several."""
 
@@ -25,7 +26,7 @@ SAID: Mapping[CameraHealth, tuple[str, str]] = {
 def camera_health(memory: KeeperMemory) -> dict[str, CameraHealth]:
     """The health of each camera, by name."""
     found: dict[str, CameraHealth] = {}
-    doubted = {*memory.sightings.doubtful_cameras, *memory.monitor.quarantine.cameras, *memory.monitor.undecided}
+    doubted = {*memory.sightings.astray, *memory.monitor.quarantine.cameras, *memory.monitor.undecided}
     if memory.in_vain >= VAIN:
         doubted |= set(range(memory.prior.num_cameras))  # it is unknown which of them have moved
     for camera, name in enumerate(memory.prior.camera_names):
@@ -38,7 +39,8 @@ def camera_health(memory: KeeperMemory) -> dict[str, CameraHealth]:
         elif camera in memory.off or camera in doubted:
             found[name] = "doubtful"
         else:
-            found[name] = memory.told_health.get(camera, "ok")
+            hidden = camera in memory.sightings.hidden_cameras
+            found[name] = memory.told_health.get(camera, "hidden" if hidden else "ok")
     return found
 
 
@@ -61,6 +63,8 @@ def describe_health(health: Mapping[str, CameraHealth], learnt: int) -> str:
     Examples:
         >>> describe_health({"cam01": "ok", "cam02": "lost", "cam03": "lost"}, 9)
         'cam02, cam03 are lost'
+        >>> describe_health({"cam01": "ok", "cam02": "hidden"}, 9)
+        'all 2 cameras are calibrated; cam02 does not see the object'
     """
     if not learnt:
         return "the object has not been seen yet"
@@ -69,4 +73,6 @@ def describe_health(health: Mapping[str, CameraHealth], learnt: int) -> str:
         names = [name for name, found in health.items() if found == state]
         if names:
             parts.append(f"{', '.join(names)} {words[len(names) > 1]}")
-    return "; ".join(parts) if parts else f"all {len(health)} cameras are calibrated"
+    if not set(health.values()) - CALIBRATED:
+        parts.insert(0, f"all {len(health)} cameras are calibrated")
+    return "; ".join(parts)

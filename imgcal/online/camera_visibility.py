@@ -16,8 +16,8 @@ LEAST_EXPECTED = 3
 """Number of fiducials that should be in view before their absence counts."""
 MARGIN = 0.05
 """Margin at the image border, as a share of the image size, in which a fiducial may be out of view."""
-DOUBTED = 3
-"""Successive snapshots in which a camera sees nothing of what it should see until it is in doubt."""
+HIDDEN_SNAPSHOTS = 3
+"""Successive snapshots in which a camera sees nothing of what it should see until the object is hidden from it."""
 ASTRAY_SNAPSHOTS, ASTRAY_SECONDS = 2, 0.4
 """Snapshots and seconds for which a camera must see a possible object in the wrong place until it counts as lost. Hands
 and passers-by last less. The camera is in doubt at once."""
@@ -61,10 +61,9 @@ class CameraVisibility:
     astray: dict[int, tuple[float, int, float]] = field(default_factory=dict)  # start, number of snapshots, latest
 
     @property
-    def doubtful_cameras(self) -> frozenset[int]:
-        """Cameras that may have moved."""
-        missing = (camera for camera, (_, times) in self.missing.items() if times >= DOUBTED)
-        return frozenset((*self.astray, *missing))
+    def hidden_cameras(self) -> frozenset[int]:
+        """Cameras that see nothing of the object, which should be in view: mostly, something hides it."""
+        return frozenset(camera for camera, (_, times) in self.missing.items() if times >= HIDDEN_SNAPSHOTS)
 
     def observe(self, rig: CameraRig, look: VisibleObject) -> list[Event]:
         """Return which cameras are lost or back with this snapshot."""

@@ -14,7 +14,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.medians import median, median_of_known
 from imgcal.monitoring import ClockSlip, MeasurementUpdate
 from imgcal.online.events import Event
-from imgcal.online.rig_state import RigState
+from imgcal.online.rig_state import UNTRUSTED, RigState
 
 # Residuals that count.
 MEMORY_SECONDS = 5.0
@@ -154,8 +154,8 @@ class ClockOffsets:
         sigma[at] = blobs.sigma[rows]
         with np.errstate(invalid="ignore"):
             good = np.isfinite(velocity).all(-1) & (np.linalg.norm(residual, axis=-1) < MOST_PIXELS)
-        # Leave out cameras in doubt: their residuals have other causes than a small delay.
-        good &= np.array([state.cameras.get(name) != "doubtful" for name in state.factory.camera_names])[:, None]
+        # Leave out untrusted cameras: their residuals have other causes than a small delay.
+        good &= np.array([state.cameras.get(name) not in UNTRUSTED for name in state.factory.camera_names])[:, None]
         good &= ~self._reset_changed(velocity, residual, sigma, good)[:, None]
         weight = np.where(good, 1 / np.square(sigma), 0.0)
         motion, residual = np.where(good[..., None], velocity, 0.0), np.where(good[..., None], residual, 0.0)

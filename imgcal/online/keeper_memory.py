@@ -24,7 +24,7 @@ from imgcal.online.light_tracks import LightTracks
 from imgcal.online.noise_level import NoiseLevel
 from imgcal.online.object_checks import ObjectChecks
 from imgcal.online.relearning import Relearning
-from imgcal.online.rig_state import CameraHealth
+from imgcal.online.rig_state import ImageHealth
 from imgcal.online.state_document import NOT_SAVED, StateReader
 from imgcal.types import (
     CalibrationObject,
@@ -73,7 +73,7 @@ class KeeperMemory:
     usual: deque[float] = field(default_factory=lambda: deque(maxlen=64))  # px
     off: dict[int, float] = field(default_factory=dict)  # camera that did not fit last -> since when
     in_vain: int = 0  # successive snapshots that fit in no camera
-    told_health: dict[int, CameraHealth] = field(default_factory=dict)  # as reported by tests
+    told_health: dict[int, ImageHealth] = field(default_factory=dict)  # as reported by tests
     pending: list[Event] = field(default_factory=list)
     time: float = 0.0
 

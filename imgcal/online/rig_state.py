@@ -19,8 +19,12 @@ from imgcal.online.light_points import FoundLights, LightPoints, light_points
 from imgcal.online.object_pose import ObjectPose, object_pose
 from imgcal.types import CameraRig, Detections
 
-CameraHealth = Literal["ok", "doubtful", "relearning", "blind", "dirty", "defocused", "lost", "unseen"]
-UNTRUSTED: frozenset[CameraHealth] = frozenset({"doubtful", "lost"})
+ImageHealth = Literal["blind", "dirty", "defocused"]
+"""Health of a camera according to tests of its images."""
+CameraHealth = Literal["ok", "hidden", "doubtful", "relearning", "lost", "unseen", ImageHealth]
+CALIBRATED: frozenset[CameraHealth] = frozenset({"ok", "hidden"})
+"""Health of cameras whose values hold, as far as is known."""
+UNTRUSTED: frozenset[CameraHealth] = frozenset({"hidden", "doubtful", "lost"})
 """Cameras with this health do not count for the object's pose."""
 
 
@@ -28,10 +32,11 @@ UNTRUSTED: frozenset[CameraHealth] = frozenset({"doubtful", "lost"})
 class RigState:
     """A rig that is kept calibrated, after a snapshot.
 
-    Health of a camera: `ok`, its values hold; `doubtful`, its last snapshots do not fit, and it is undecided whether it
-    moved; `relearning`, it has moved, and is not known as well yet as before; `lost`, it sends nothing, or its blobs
-    cannot be labelled, so its values may no longer hold; `unseen`, it has not seen the object yet and has the factory's
-    values. The other values come from tests of the images.
+    Health of a camera: `ok`, its values hold; `hidden`, it does not see the object, which should be in view, and keeps
+    its values; `doubtful`, its last snapshots do not fit, and it is undecided whether it moved; `relearning`, it has
+    moved, and is not known as well yet as before; `lost`, it sends nothing, or its blobs cannot be labelled, so its
+    values may no longer hold; `unseen`, it has not seen the object yet and has the factory's values. The other values
+    come from tests of the images.
 
     Examples:
         >>> import torch, imgcal
@@ -67,6 +72,11 @@ class RigState:
     def rig(self) -> CameraRig:
         """The rig as currently estimated."""
         return self.belief.rig
+
+    @property
+    def uncalibrated(self) -> tuple[str, ...]:
+        """Cameras whose values may not hold."""
+        return tuple(name for name, health in self.cameras.items() if health not in CALIBRATED)
 
     @cached_property
     def object_pose(self) -> ObjectPose | None:

@@ -130,5 +130,6 @@ def _search(memory: KeeperMemory, checked: Checked) -> Labelled:
     there = memory.surroundings
     if there is None:
         return Labelled(checked, frozenset())
-    doubted = memory.sightings.doubtful_cameras | memory.sightings.lost.keys()
+    seen = memory.sightings
+    doubted = seen.hidden_cameras | seen.astray.keys() | seen.lost.keys()
     return Labelled(*memory.search.label_lost_cameras(checked, there, memory.time, memory.count - 1, doubted))

@@ -46,7 +46,7 @@ class PoseRecord:
     def of(cls, state: RigState) -> PoseRecord:
         """Make the record from the state after a snapshot."""
         pose, lights = state.object_pose, state.light_points
-        not_ok = sum(health != "ok" for health in state.cameras.values())
+        not_ok = len(state.uncalibrated)
         if lights is not None and len(lights):
             status: PoseStatus = "degraded" if not_ok else "ok"
             return cls(state.time, state.snapshot, None, status, state.sentence, not_ok, lights)

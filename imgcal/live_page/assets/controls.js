@@ -19,7 +19,7 @@ function startControls() {
   $("acknowledge").addEventListener("click", () => { const event = openEvent(); if (event) command("acknowledge", { event: event.number }); });
   const dialog = $("confirm");
   $("factory").addEventListener("click", () => {
-    const changed = page.state ? page.hello.cameras.filter((_, i) => page.state.health[i] !== "ok").length : 0;
+    const changed = page.state ? page.hello.cameras.filter((_, i) => !["ok", "hidden"].includes(page.state.health[i])).length : 0;
     say($("confirm-text"), `From now on, changes of ${page.hello.rig} are measured against the rig as it is calibrated now.` + (changed ? ` ${changed} of ${plural(page.hello.cameras.length, "camera")} ${changed === 1 ? "needs" : "need"} attention first.` : ""));
     dialog.showModal();
     $("confirm-no").focus();

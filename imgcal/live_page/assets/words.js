@@ -5,6 +5,7 @@ const page = { hello: null, layout: null, state: null, history: null, events: []
 const HEALTH = {
   ok: ["good", "calibrated"], doubtful: ["caution", "in doubt"], relearning: ["caution", "recalibrating"], dirty: ["caution", "dirty"], defocused: ["caution", "out of focus"],
   blind: ["bad", "sees nothing"], lost: ["bad", "lost"], unseen: ["none", "not seen the object yet"],
+  hidden: ["none", "does not see the object"],
 };
 const ORDER = ["none", "good", "caution", "bad"];
 

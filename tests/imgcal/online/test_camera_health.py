@@ -2,6 +2,7 @@
 
 from imgcal.online import Event
 from imgcal.online.camera_health import VAIN, camera_health, describe_health, take_health
+from imgcal.online.camera_visibility import HIDDEN_SNAPSHOTS
 from tests.imgcal.online.memories import Remembered
 
 
@@ -23,6 +24,9 @@ def test_the_worst_is_said_of_a_camera() -> None:
     memory.relearning.events.clear()
     take_health(memory, Event(0.0, 2, "clean", "cam02"))
     assert camera_health(memory)["cam02"] == "ok"
+    memory.sightings.missing[1] = 0.0, HIDDEN_SNAPSHOTS
+    assert camera_health(memory)["cam02"] == "hidden"
+    memory.sightings.missing.clear()
     memory.in_vain = VAIN
     assert camera_health(memory) == {**dict.fromkeys(("cam01", "cam02", "cam03"), "doubtful"), "cam04": "unseen"}
 
@@ -30,4 +34,6 @@ def test_the_worst_is_said_of_a_camera() -> None:
 def test_the_rig_is_said_in_a_sentence() -> None:
     assert describe_health({"a": "ok"}, 0) == "the object has not been seen yet"
     assert describe_health({"a": "ok", "b": "ok"}, 5) == "all 2 cameras are calibrated"
+    assert describe_health({"a": "ok", "b": "hidden"}, 5) == "all 2 cameras are calibrated; b does not see the object"
+    assert describe_health({"a": "dirty", "b": "hidden"}, 5) == "a is dirty; b does not see the object"
     assert describe_health({"a": "dirty", "b": "relearning"}, 5) == "b moved and is being recalibrated; a is dirty"

@@ -39,8 +39,8 @@ def test_a_camera_that_misses_the_object_for_seconds_is_lost_and_one_that_is_cov
 def test_a_camera_that_is_astray_or_silent_is_lost() -> None:
     sightings = CameraVisibility(("a", "b", "c", "d"))
     assert kinds(sightings, [look(0.0, [0, 1, 3], astray=frozenset({2}))]) == []  # it may be garbage ...
-    assert sightings.doubtful_cameras == {2}
-    assert kinds(sightings, [look(0.1, [0, 1, 2, 3])]) == [] and not sightings.doubtful_cameras  # ... as it was
+    assert sightings.astray.keys() == {2}
+    assert kinds(sightings, [look(0.1, [0, 1, 2, 3])]) == [] and not sightings.astray  # ... as it was
     astray = [look(0.2 + s / 10, [0, 1, 2, 3], astray=frozenset({2})) for s in range(6)]  # a label by chance is none
     assert kinds(sightings, astray) == [("camera_lost", "c", 0.2)]
     given = [look(1 + s / 10, [0, 1, 3], silent=frozenset({1})) for s in range(7)]
@@ -57,7 +57,7 @@ def test_what_is_in_a_wrong_place_for_a_moment_only_is_no_loss_however_often() -
         rest = [look(start + s / 60, [0, 1, 3]) for s in range(3, 60)]
         for given in rest:
             given.predicted[2] = np.nan  # then the object is out of this camera's view
-        assert kinds(sightings, [*odd, *rest]) == [] and sightings.doubtful_cameras == {2}
+        assert kinds(sightings, [*odd, *rest]) == [] and sightings.astray.keys() == {2}
     slow = CameraVisibility(("a", "b", "c", "d"))
     looks = [
         look(float(s), [0, 1, 2, 3] if s < 5 else [0, 1, 3], astray=frozenset({2} if s > 4 else ())) for s in range(7)
@@ -85,17 +85,17 @@ def test_a_camera_is_silent_by_its_own_measure() -> None:
     assert kinds(sightings, again) == [("camera_lost", "c", pytest.approx(1.1))]
 
 
-def test_a_camera_that_suddenly_sees_nothing_is_in_doubt_before_it_is_lost() -> None:
+def test_the_object_is_hidden_from_a_camera_that_suddenly_sees_nothing_before_it_is_lost() -> None:
     sightings = CameraVisibility(("a", "b", "c", "d"))
-    doubted = []
+    hidden = []
     for s in range(4):
         assert kinds(sightings, [look(s / 60, [0, 1, 2])]) == []
-        doubted.append(sightings.doubtful_cameras == {3})
-    assert doubted == [False, False, True, True]
+        hidden.append(sightings.hidden_cameras == {3})
+    assert hidden == [False, False, True, True]
     one = look(0.08, [0, 1, 2, 3])
     one = replace(one, blobs=one.blobs.select(np.arange(10)))
-    assert kinds(sightings, [one]) == [] and sightings.doubtful_cameras == {3}  # a label may come by chance
-    assert kinds(sightings, [look(0.1, [0, 1, 2, 3])]) == [] and not sightings.doubtful_cameras
+    assert kinds(sightings, [one]) == [] and sightings.hidden_cameras == {3}  # a label may come by chance
+    assert kinds(sightings, [look(0.1, [0, 1, 2, 3])]) == [] and not sightings.hidden_cameras
 
 
 def test_a_camera_that_cannot_see_the_object_misses_nothing() -> None:

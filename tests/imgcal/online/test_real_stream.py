@@ -53,11 +53,13 @@ def test_a_rig_that_stands_still_raises_no_alarm_and_a_turned_camera_is_reported
     with imgcal.RigKeeper(start, obj) as keeper:
         assert torch.equal(keeper.belief.rig.focal_length, start.focal_length)
         assert float(keeper.belief.std()[:, 6].max()) < 5.0  # px; the factory's prior: 30
-        loud = []
+        loud, doubts = [], 0
         for number, snapshot in frames(blobs, 2400, 2900):
             state = keeper.update(snapshot, number / RATE)
+            doubts += "doubtful" in state.cameras.values()
             loud += [(number, event.kind, event.camera) for event in state.events if event.kind not in QUIET]
         assert not loud
+        assert doubts < 125  # in nine of ten snapshots the wand is hidden from some camera, which is no doubt
         assert float((state.rig.focal_length - start.focal_length).abs().max()) < 3.0
         reported = []
         for number, snapshot in frames(blobs, 2900, 3100):
