@@ -234,15 +234,15 @@ class RigMonitor:
                 found = self._diagnose_quarantine(found)
         return replace(found, unsynchronized=quarantine.report_unsynchronized())
 
-    def _shows_move(self, case: Case) -> bool:
-        """Tell whether a suspected camera's image is shifted by clearly more than persistent errors."""
-        least = self.noise.least_shifts
+    def _shifted_cameras(self, case: Case) -> tuple[int, ...]:
+        """Suspected cameras whose images are shifted by clearly more than persistent errors."""
+        found, least = [], self.noise.least_shifts
         for camera in case.cameras:
             seen = [one for one in case.latest if bool(one[0].seen[0, camera].any())]
             shifts = [_shift(case.before, snapshot, camera) for snapshot in seen]
             if shifts and sorted(shifts)[len(shifts) // 2] >= least[camera]:
-                return True
-        return False
+                found.append(camera)
+        return tuple(found)
 
     def _diagnose_quarantine(self, found: MonitorUpdate) -> MonitorUpdate:
         """Diagnose the cameras in quarantine, and relearn them if they have moved.
@@ -264,9 +264,9 @@ class RigMonitor:
             # settled.
             quiet = verdict.explained[Steady.name]
             return MonitorUpdate(self._restart(quiet.before, quiet.snapshots, case.pauses[-case.count :]))
-        if verdict.best.name == Moved.name and self._shows_move(case):
+        if verdict.best.name == Moved.name and (moved := self._shifted_cameras(case)):
             decided = self._decide_kinds(last=True)
-            anew = self._learn_moved(case, dict.fromkeys(case.cameras), JUMPS[-1], sum(case.pauses[-case.count :]))
+            anew = self._learn_moved(case, dict.fromkeys(moved), JUMPS[-1], sum(case.pauses[-case.count :]))
             return replace(anew, changes=(*found.changes, *decided, *anew.changes))
         if verdict.best.name == LensMisfit.name:
             best = verdict.best

@@ -258,3 +258,19 @@ def test_a_camera_that_was_held_and_surely_stands_still_is_learnt_from_what_it_s
         held = (2,) if number == 30 else ()
         monitor.update(seen.of_snapshots([number]), poses[number : number + 1], 1 / 60, moved=held)
     assert not monitor.quarantine.cameras and learnt == [1]
+
+
+def test_of_two_cameras_in_quarantine_only_the_one_whose_image_is_shifted_has_moved() -> None:
+    """The labels of camera 2 do not fit for one snapshot, and fit again when the case is decided."""
+    bump = Bump(60, 1, "rotation", math.radians(0.1))
+    made = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 4, Conditions(labelled=True), bumps=[bump])
+    poses = made.poses_at(torch.arange(120, dtype=torch.float64) / 60)
+    seen, _ = made.labelled(0, 120)
+    monitor, told = RigMonitor(RigFilter(made.factory, made.obj)), []
+    monitor.noise.usual = 2.0  # errors last, as on real streams
+    monitor.noise.time = torch.full((4,), 2.0, dtype=torch.float64)
+    for number in range(120):
+        off = (1, 2) if number == 60 else ()
+        told += monitor.update(seen.of_snapshots([number]), poses[number : number + 1], 1 / 60, moved=off).changes
+    assert {change.camera for change in told} == {1}
+    assert not monitor.quarantine.cameras
