@@ -29,6 +29,7 @@ from imgcal.monitoring.drift_pace import DriftLearning, DriftPaces
 from imgcal.monitoring.explanations import Diagnosis, Moved, Steady, Verdict, doubtful_cameras, weigh
 from imgcal.monitoring.lens_misfit import LensMisfit
 from imgcal.monitoring.lens_warming import Warmed
+from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.noise_correlation import NoiseCorrelation
 from imgcal.monitoring.object_change import MISFIT_LEAD, Misfit, ObjectChanged, has_never_fitted
 from imgcal.monitoring.pending_change import Change, PendingChange, free_cameras
@@ -49,6 +50,9 @@ UNDECIDED_SNAPSHOTS = 16
 """Snapshots for which a camera stays in doubt that seemed to have moved without a decision."""
 NEW_SHARE = 0.25
 """Share of the snapshots since a change that must be new before an undecided camera is weighed again."""
+WRONG_LABEL, LEAST_BEFORE = 10.0, 2
+"""Standard deviations beyond which a label is wrong, and fewest snapshots of a camera before its change: where hardly
+anything is known yet, wrong labels in its first snapshots, for example of half-hidden markers, look like a move."""
 SETTLED_SNAPSHOTS, LEAST_AGAIN = 16, 8
 """A second move of a camera within so many snapshots is doubted, and so many snapshots are needed to decide: a late
 camera seems to have moved in any two successive snapshots, but not in eight."""
@@ -384,7 +388,8 @@ class RigMonitor:
     ) -> MonitorUpdate:
         """Learn a case's latest snapshots again, with cameras that moved before them.
 
-        If hardly anything was known before, only the factory calibration is kept from that time.
+        If hardly anything was known before, only the factory calibration is kept from that time, and a camera that saw
+        too little then, or whose labels did not fit, has not moved.
 
         Args:
             case: the snapshots and the belief before them.
@@ -397,6 +402,9 @@ class RigMonitor:
             RefusedError: see `absorb`; the monitor is unchanged.
         """
         forget, nan, horizon = self._is_new(case.count), math.nan, self.filter.horizon
+        if forget and horizon is None and not self.filter.calibrated:
+            misfit = _misfit_cameras(case)
+            free = {camera: kind for camera, kind in free.items() if camera not in misfit}
         early = self._moved_early | free.keys()
         before = self._anywhere(early) if forget else free_cameras(case.before, free, jump)
         result = self._restart(before, case.latest, case.pauses[-case.count :])
@@ -541,6 +549,22 @@ class RigMonitor:
         if not self.open:
             self._pending = None
         return decided
+
+
+def _misfit_cameras(case: Case) -> set[int]:
+    """Cameras that saw too little before a case's latest snapshots, or had wrong labels in at least half of the others.
+
+    Raises:
+        RefusedError: see `absorb`.
+    """
+    earlier = case.snapshots[: -case.count]
+    if not earlier:
+        return set()
+    observations, poses = stack_snapshots(earlier)
+    off = absorb(case.before, observations, poses, case.options).residual.norm(dim=-1)  # (S, C, N)
+    wrong = (observations.seen & (off > WRONG_LABEL * observations.sigma)).any(-1).sum(0)
+    seeing = observations.seen.any(-1).sum(0)
+    return set(torch.nonzero((seeing < LEAST_BEFORE) | (2 * wrong >= seeing)).flatten().tolist())
 
 
 def _shift(belief: RigBelief, snapshot: Snapshot, camera: int) -> float:
