@@ -62,7 +62,7 @@ def test_planar_object_is_fine(tmp_path: Path) -> None:
         ("x,y,z\n", "found 0 points, expected 1 to 1000"),
         ("x,y\n0,0\n", "found no column z"),
         ("x,y,z,raduis\n0,0,0,1\n", "unknown column 'raduis', nearest: radius"),
-        ("x;y;z\n0;0;0\n", "unknown column 'x;y;z'"),
+        ("x;y;z\n0;0;0\n", "found semicolons between the columns, expected commas"),
         ("x,y,z,z\n0,0,0,0\n", "column z more than once"),
         (GOOD + "a,0,0\n", "line 6: x: found 'a', expected a finite coordinate"),
         (GOOD + "\n\n0,nan,7\n", "line 8: y: found nan"),
