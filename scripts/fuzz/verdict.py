@@ -15,7 +15,7 @@ from pathlib import Path
 
 import torch
 
-from imgcal.cli.compiling import HINT
+from imgcal.cli.compiling import HINT, WAIT
 from imgcal.cli.main import main
 from imgcal.errors import InputError
 from imgcal.io import read_rig
@@ -50,7 +50,8 @@ def judge(case: Case, code: object, error: str, before: set[Path]) -> str:
         return f"exit code {code}"
     if NOISE.search(error):
         return f"noise on standard error: {error[-2000:]}"
-    lines = [line for line in error.splitlines() if line.startswith("imgcal: ") and HINT not in line]
+    notices = tuple(f"imgcal: {notice}" for notice in (HINT, WAIT))
+    lines = [line for line in error.splitlines() if line.startswith("imgcal: ") and not line.startswith(notices)]
     if len(lines) != (code != 0):
         return f"{len(lines)} lines with exit code {code}: {error[-2000:]!r}"
     if lines and (not error.endswith(lines[0] + "\n") or len(lines[0]) > LONGEST):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from imgcal.cli.compiling import WAIT
 from scripts.fuzz import cases, verdict
 from scripts.fuzz.__main__ import MOST_MEMORY
 from scripts.fuzz.cases import Case, case, prepare
@@ -78,6 +79,7 @@ def says(code: int, *lines: str, written: str = ""):
         (says(2, "libpng error: x", "imgcal: x"), "noise"),
         (says(0, "imgcal: x"), "1 lines"),
         (says(0), "cannot be read"),
+        (says(0, f"imgcal: {WAIT}"), "cannot be read"),  # a notice
         (says(2, "imgcal: x", written="beside"), "left behind"),
         (says(2, "imgcal: x", written="out/result.json"), "but written"),
         (says(3, "imgcal: x", written="out/result.json"), "status"),
