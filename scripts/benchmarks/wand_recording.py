@@ -58,10 +58,11 @@ class Arrangement:
         """Tell whether the followed frames are played backwards."""
         return _ranges(self.follow)[0].step < 0
 
-    @property
+    @cached_property
     def followed(self) -> list[int]:
         """Followed frames in the order of play, numbered so that they ascend: from the end if played backwards."""
-        return sorted(FRAMES - 1 - n if self.backwards else n for part in _ranges(self.follow) for n in part)
+        backwards = self.backwards
+        return sorted(FRAMES - 1 - n if backwards else n for part in _ranges(self.follow) for n in part)
 
 
 def _ranges(text: str) -> list[range]:
