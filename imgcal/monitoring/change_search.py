@@ -33,7 +33,7 @@ NEARBY_SNAPSHOTS = 4
 """Half width, in snapshots, of the search for the first snapshot after a change."""
 
 EPISODE_STEPS = 4
-"""Steps, for each length of an episode, by which it is moved over the snapshots to be left out."""
+"""Positions tried per length of an episode when an episode is left out."""
 
 FIT_CHI2_PER_DOF = 4.0
 """Largest chi-squared per degree of freedom of a snapshot that fits, where it would otherwise be refused."""
@@ -101,7 +101,8 @@ def changed_cameras(
 ) -> tuple[dict[int, str | None], dict[int, float]]:
     """Free the cameras that have changed, most likely first, until the later snapshots are explained.
 
-    All but the first camera, which the alarm has tested, must have changed without the episode that supports it most.
+    Beside another changed camera, a camera must have changed without the episode that supports it most, too; the alarm
+    has tested the first one.
 
     Args:
         recent: the latest snapshots.
@@ -132,6 +133,7 @@ def changed_cameras(
             passing.add(camera)
             continue
         free[camera], evidence[camera] = None, others[camera]
+        passing.clear()
     return free, evidence
 
 

@@ -222,7 +222,7 @@ class RecentSnapshots:
         Args:
             age: number of snapshots.
             aged: allow for all drift since then at once.
-            without: some successive ones of them to leave out, counted from the first.
+            without: range of these snapshots to leave out, counted from the first.
 
         Raises:
             RefusedError: nothing is known about the rig.

@@ -552,7 +552,7 @@ class RigMonitor:
 
 
 def _misfit_cameras(case: Case) -> set[int]:
-    """Cameras that saw too little before a case's latest snapshots, or had wrong labels in at least half of the others.
+    """Cameras that saw too little before a case's latest snapshots, or had wrong labels in half of the earlier ones.
 
     Raises:
         RefusedError: see `absorb`.

@@ -21,10 +21,9 @@ LEAST_DRIFT = {"rotation": math.radians(0.05), "position": 0.5, "focal_length": 
 """Drift (rad, mm, pixels) that is reported if significant."""
 DRIFT_SIGMAS = 5.0
 """Significance of the drift, in standard deviations of the values at the start of the measurement."""
-LEAST_SEEN = 0.5
-"""Shift of the labels' places by the change of all values of a camera, relative to that by the drift alone. A drift
-shifts them; values that change together so that they hardly move are being learnt better, such as a focal length and a
-distortion where the lens had shown few labels."""
+LEAST_SHIFT_RATIO = 0.5
+"""Least ratio of two shifts of the labels: by the changes of all values of a camera, and by the drift alone. Values
+that change together so that the labels hardly move, such as a focal length and a distortion, are being learnt."""
 HOW = {
     "rotation": "has slowly turned by",
     "position": "has slowly shifted by",
@@ -82,22 +81,22 @@ class DriftWatch:
     def _largest(
         self, camera: int, change: Tensor, std: Tensor, points: Callable[[int], Tensor]
     ) -> tuple[ChangeKind, float] | None:
-        """Most significant kind of change and its size, or None if none is worth a report."""
+        """Most significant kind of change that moves the labels and its size, or None if none is worth a report."""
         assert self.reference is not None
-        best: tuple[float, ChangeKind, float] | None = None
+        found: list[tuple[float, ChangeKind, float]] = []
         for kind, part in CHANGES.items():
             size = float(change[part].norm())
             least = max(LEAST_DRIFT[kind], DRIFT_SIGMAS * float(std[part].max()))
-            if size >= least and (best is None or size / least > best[0]):
-                best = size / least, kind, size  # type: ignore[assignment]
-        if best is None:
-            return None
-        alone = torch.zeros_like(change)
-        alone[CHANGES[best[1]]] = change[CHANGES[best[1]]]
-        together, by_itself = _image_shifts(
-            self.reference.select([camera]), torch.stack((change, alone)), points(camera)
-        )
-        return best[1:] if together > LEAST_SEEN * by_itself else None
+            if size >= least:
+                found.append((size / least, kind, size))  # type: ignore[arg-type]
+        for _, kind, size in sorted(found, reverse=True):
+            alone = torch.zeros_like(change)
+            alone[CHANGES[kind]] = change[CHANGES[kind]]
+            steps = torch.stack((change, alone))
+            together, by_itself = _image_shifts(self.reference.select([camera]), steps, points(camera))
+            if together > LEAST_SHIFT_RATIO * by_itself:
+                return kind, size
+        return None
 
     def _event(self, camera: int, kind: ChangeKind, size: float, std: Tensor, time: float, number: int) -> Event:
         name = self.names[camera]

@@ -71,8 +71,9 @@ def test_what_is_not_known_any_more_has_not_drifted() -> None:
 def test_values_that_change_without_moving_the_image_do_not_drift() -> None:
     """A principal point makes up for a longer focal length where the camera sees the object: both are being learnt."""
     rig, obj = imgcal.load_rig("U7").to(torch.float64), imgcal.load_object("asymmetric8")
-    belief = RigBelief.of_prior(rig, obj, torch.full((7, 15), 0.01, dtype=torch.float64))
-    step = torch.zeros(7, 15, dtype=torch.float64)
+    std = torch.full((7, 15), 0.01, dtype=torch.float64)
+    std[:, :3] = 1e-5
+    belief, step = RigBelief.of_prior(rig, obj, std), torch.zeros(7, 15, dtype=torch.float64)
     step[3, 6:8] = 2.0
 
     before_camera = torch.tensor([[[200.0, 10.0, 1000.0], [200.0, -10.0, 1000.0]]], dtype=torch.float64)
@@ -89,6 +90,8 @@ def test_values_that_change_without_moving_the_image_do_not_drift() -> None:
     assert drifts(lambda camera: seen[:0]) == []  # it has seen nothing lately
     step[3, 8] = -0.4  # a fifth of the focal length's change
     assert drifts() == []
+    step[3, 6:9], step[3, 1] = torch.tensor([60.0, 60.0, -12.0]), math.radians(0.1)
+    assert drifts() == [("cam04", "rotation")]  # which does move the image
 
 
 def test_cameras_are_replaced() -> None:
