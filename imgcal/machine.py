@@ -20,16 +20,17 @@ def usable_cores() -> int:
 
 @contextlib.contextmanager
 def without_garbage_collection() -> Iterator[None]:
-    """Pause the garbage collector, and leave out of later collections what is there by then.
+    """Pause the garbage collector during imports, and exempt what they load from later collections.
 
-    For imports: the modules of a command stay until it ends, and looking for garbage among them takes a fifth of the
-    time that it takes to import them.
+    The modules of a command stay until it ends, and looking for garbage among them takes a fifth of the time that it
+    takes to import them. A process exempts once: a later exemption would keep garbage of the meantime for good.
     """
     enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        gc.freeze()
+        if not gc.get_freeze_count():
+            gc.freeze()
         if enabled:
             gc.enable()

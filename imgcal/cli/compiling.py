@@ -15,17 +15,20 @@ from imgcal.machine import usable_cores
 HINT = "compiling for this machine: 10 to 60 s, once; `imgcal warmup` compiles everything ahead of time"
 WAIT = "waiting for another process that compiles for this machine"
 HELP = """
+import os, sys, threading
+threading.Thread(target=lambda: (sys.stdin.read(), os._exit(1)), daemon=True).start()  # ends with its parent
 from imgcal.machine import without_garbage_collection
 with without_garbage_collection():
     from imgcal.online import warm_up_fits
 warm_up_fits()
 """
 NEEDED_LAST = "levenberg_marquardt_cpu.*"  # files of the cache that show that there is nothing to help with
+_helpers: list[subprocess.Popen[bytes]] = []  # running processes that compile for this one
 
 
 @contextlib.contextmanager
 def announce_compilation(hint: str = HINT) -> Iterator[list[object]]:
-    """Print a notice on standard error when the first function is compiled, here or in another process.
+    """Print one notice on standard error when the first function is compiled, here or in another process.
 
     Args:
         hint: what to say.
@@ -41,22 +44,24 @@ def announce_compilation(hint: str = HINT) -> Iterator[list[object]]:
 
     from renderers.compiling import WAITING
 
+    said: list[str] = []
+
+    def say(notice: str) -> None:
+        if not said:
+            print(f"imgcal: {notice}", file=sys.stderr, flush=True)
+        said.append(notice)
+
     class Told(event.Listener):
         def on_start(self, happening: event.Event) -> None:
-            if not compiled:
-                print(f"imgcal: {hint}", file=sys.stderr, flush=True)
+            say(hint)
             compiled.append(happening.data)
 
         def on_end(self, happening: event.Event) -> None:
             pass
 
     class Waiting(event.Listener):
-        told = False
-
         def on_start(self, happening: event.Event) -> None:
-            if not self.told and not compiled:
-                print(f"imgcal: {WAIT}", file=sys.stderr, flush=True)
-            self.told = True
+            say(hint if _helpers else WAIT)
 
         def on_end(self, happening: event.Event) -> None:
             pass
@@ -81,12 +86,14 @@ def help_to_compile() -> Iterator[None]:
     if is_useful():
         with contextlib.suppress(OSError):  # alone, then
             helper = start_helper()
+            _helpers.append(helper)
     try:
         yield
     finally:
         if helper is not None:
-            helper.terminate()
-            helper.wait()
+            _helpers.remove(helper)
+            with helper:
+                helper.terminate()
 
 
 def is_useful() -> bool:
@@ -111,7 +118,5 @@ def start_helper() -> subprocess.Popen[bytes]:
     # Not from the current folder, which anybody may have filled.
     path = os.pathsep.join(filter(None, (str(Path(imgcal.__file__).parents[1]), os.environ.get("PYTHONPATH"))))
     environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-    nothing = subprocess.DEVNULL
-    return subprocess.Popen(
-        [sys.executable, "-P", "-c", HELP], stdin=nothing, stdout=nothing, stderr=nothing, env=environment
-    )
+    command, nothing = [sys.executable, "-P", "-c", HELP], subprocess.DEVNULL
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=nothing, stderr=nothing, env=environment)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-DOTS_PER_PATH = 200
 LONGEST_NAME = 16  # characters
+DOTS_PER_PATH = 200
 """Dots of one path do not add up where they overlap; many short paths do, and show density."""
 
 

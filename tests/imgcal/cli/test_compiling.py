@@ -34,6 +34,16 @@ def test_waiting_for_another_process_is_told_once(capsys):
     assert capsys.readouterr().err == f"imgcal: {WAIT}\n"
 
 
+def test_waiting_for_the_own_helper_is_compiling(capsys, monkeypatch):
+    monkeypatch.setattr(compiling, "_helpers", [object()])
+    with announce_compilation() as compiled:
+        with event.trigger_event(renderers.compiling.WAITING):
+            pass
+        numba.njit(lambda x: x + 4)(1)
+    assert len(compiled) == 1
+    assert capsys.readouterr().err == f"imgcal: {HINT}\n"
+
+
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
