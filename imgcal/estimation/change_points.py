@@ -132,8 +132,8 @@ def linearize_snapshots(problem: Problem, state: State) -> Blocks:
     lower = torch.linalg.cholesky(full.pose[:, 0])
     coupling = torch.linalg.solve_triangular(lower, full.coupling[:, 0].flatten(1, 2).mT, upper=False)
     pull = torch.linalg.solve_triangular(lower, clipped.pose_gradient[:, 0, :, None], upper=False)[..., 0]
-    turned = (coupling != 0).any(2).any(0)  # cameras do not see a single point turn
-    coupling, pull = coupling[:, turned], pull[:, turned]
+    observable = (coupling != 0).any(2).any(0)  # a single point has no visible rotation
+    coupling, pull = coupling[:, observable], pull[:, observable]
     # Every snapshot's equations contain the prior; it must count only once.
     gradient = clipped.camera_gradient - state.offset
     camera = full.camera - torch.eye(full.camera.shape[-1], dtype=lower.dtype)

@@ -30,7 +30,7 @@ class PhysicalDrift(StrictRecord):
         tensor([2., 2., 2.], dtype=torch.float64)
     """
 
-    rotation_deg: Spread = 0.5  # degrees, each axis; in experiments 0 if not named, and not beside kappas
+    rotation_deg: Spread = 0.5  # degrees, each axis; experiments have 0 by default, and cannot combine it with kappas
     position: Spread = 2.0  # mm, each axis
     focal_length: Spread = 0.01  # relative
     principal_point: Spread = 5.0  # pixels

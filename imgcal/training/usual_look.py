@@ -155,7 +155,7 @@ def find_centres_of_light(
         names: of the C cameras.
         uv: (C, N, 2) pixels, labels.
         radius: (C, N) pixels, expected.
-        seen: (C, N) bool, labels that there are.
+        seen: (C, N) bool, existing labels.
         detection: options with which blobs were found.
 
     Returns:

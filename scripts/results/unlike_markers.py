@@ -227,9 +227,11 @@ def main(
             results = list(pool.map(measured, *zip(*todo, strict=True), [runs] * len(todo)))
         found = {shape: {name: each for (of, name), each in zip(todo, results, strict=True) if of == shape}
                  for shape in markers}  # fmt: skip
-        known = read_json(JSON)["markers"] if JSON.is_file() else {}
-        rows = {shape: (known | found)[shape] for shape in MARKERS if shape in known | found}
-        write_json(JSON, surroundings() | {"snapshots": SNAPSHOTS, "markers": rows})
+        known = read_json(JSON) if JSON.is_file() else {"markers": {}, "measured_on": {}}
+        all_rows, machine = known["markers"] | found, surroundings()["machine"]
+        rows = {shape: all_rows[shape] for shape in MARKERS if shape in all_rows}
+        machines = known["measured_on"] | dict.fromkeys(found, machine)
+        write_json(JSON, {"measured_on": machines, "snapshots": SNAPSHOTS, "markers": rows})
     if "page" in steps:
         fill(PAGE, {"unlike markers": tables(read_json(JSON)["markers"])})
 
