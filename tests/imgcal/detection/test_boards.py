@@ -69,14 +69,15 @@ def test_says_why_a_board_is_not_found(kind, change, words):
         imgcal.detect(frames, board=replace(printed.board, **change))
 
 
-def test_clutter_behind_a_board_is_no_further_row_of_squares():
+@pytest.mark.parametrize(("dark", "light"), [(60, 160), (0, 255)])
+def test_clutter_behind_a_board_is_no_further_row_of_squares(dark, light):
     obj = imgcal.load_object("checkerboard")
     columns, rows, size = obj.board.columns, obj.board.rows, 32
     random = np.random.default_rng(3)
     frame = np.kron(random.integers(30, 220, (4 * (rows + 6), 4 * (columns + 6))), np.ones((size // 4,) * 2))
     for column in range(columns):  # light and dark in turn, where the next row of squares would be
         at = 3 * size + column * size
-        frame[2 * size + 8 : 2 * size + 24, at + 8 : at + 24] = 60 + 100 * (column % 2)
+        frame[2 * size + 8 : 2 * size + 24, at + 8 : at + 24] = light if column % 2 else dark
     margin = slice(3 * size - 12, (3 + rows) * size + 12), slice(3 * size - 12, (3 + columns) * size + 12)
     frame[margin] = 255
     squares = np.kron(np.add.outer(np.arange(rows), np.arange(columns)) % 2, np.ones((size, size)))
