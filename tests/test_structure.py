@@ -1,6 +1,9 @@
 """The structure drawn in CONTRIBUTING: imports point down, rooms export what others use, each room has tests."""
 
 import ast
+import re
+import tomllib
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 from importlinter.cli import EXIT_STATUS_SUCCESS, lint_imports
@@ -50,3 +53,18 @@ def test_each_room_has_its_tests() -> None:
         rooms = {path.parent.relative_to(ROOT) for path in modules} - {Path("imgcal")}
         without = [str(room) for room in rooms if not list((ROOT / "tests" / room).glob("test_*.py"))]
         assert not without, without
+
+
+def test_types_are_checked_without_the_peers_of_the_benchmarks() -> None:
+    """A newcomer's environment has no peers: mypy must not look for those that a file imports by name."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    peers = {re.split("[>=<[]", need)[0] for need in project["project"]["optional-dependencies"]["peers"]}
+    modules = {module for module, distributions in packages_distributions().items() if peers & set(distributions)}
+    overrides = [one for one in project["tool"]["mypy"]["overrides"] if one.get("ignore_missing_imports")]
+    ignored = {module.removesuffix(".*") for one in overrides for module in one["module"]}
+    for path in [*(ROOT / "scripts").rglob("*.py"), *(ROOT / "tests").rglob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [one.name for one in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            missing = {name.split(".")[0] for name in names} & (modules - ignored)
+            assert not missing, f"{path.relative_to(ROOT)}: {missing}: import_module, or an override in pyproject.toml"

@@ -7,6 +7,7 @@ descriptions of the formats. The output of `write_back.py` is checked with them.
 from __future__ import annotations
 
 import ast
+import importlib
 import json
 import tomllib
 from collections.abc import Callable
@@ -155,8 +156,7 @@ def colmap(path: Path) -> dict[str, Projection]:
     """The rig of a model, by pycolmap; kapture's comma-separated variant, which pycolmap rejects, by hand."""
     if not (path / "rigs.txt").is_file() and not (path / "rigs.bin").is_file():
         return kapture(path)
-    import pycolmap
-
+    pycolmap = importlib.import_module("pycolmap")
     model = pycolmap.Reconstruction(str(path))
     (rig,) = model.rigs.values()
     poses = {rig.ref_sensor_id.id: pycolmap.Rigid3d()}

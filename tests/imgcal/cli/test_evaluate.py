@@ -13,6 +13,7 @@ from imgcal.fleet import StoredResults
 from imgcal.io import load_object, read_rig
 from imgcal.networks import Checkpoint, build_network, save_checkpoint
 from imgcal.training import load_experiment
+from tests.imgcal.cli.calibrating import one_line
 from tests.imgcal.fleet.conftest import engine  # noqa: F401  one Ray for all tests
 
 EXPERIMENT = """
@@ -175,8 +176,7 @@ def test_compare_puts_networks_side_by_side(models, tmp_path, capsys):
 def test_what_cannot_be_evaluated_is_refused_in_one_line(models, tmp_path, capsys, arguments, expected):
     out = tmp_path / "result"
     assert main(["evaluate", str(models[0]), "--count", "2", "--out", str(out), *arguments]) == 2
-    error = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("evaluating ")]
-    assert len(error) == 1 and expected in error[0]
+    assert expected in one_line(capsys)
     assert not out.exists()
 
 
