@@ -389,7 +389,8 @@ class RigMonitor:
         """Learn a case's latest snapshots again, with cameras that moved before them.
 
         If hardly anything was known before, only the factory calibration is kept from that time, and a camera that saw
-        too little then, or whose labels did not fit, has not moved.
+        too little then, or whose labels did not fit, has not moved. If that is true of all, only their earlier labels
+        are forgotten.
 
         Args:
             case: the snapshots and the belief before them.
@@ -405,6 +406,9 @@ class RigMonitor:
         if forget and horizon is None and not self.filter.calibrated:
             misfit = _misfit_cameras(case)
             free = {camera: kind for camera, kind in free.items() if camera not in misfit}
+            if not free and self._beginning is not None:  # nothing moved: forget the wrong labels only
+                earlier = [(drop_cameras(one, misfit), pose) for one, pose in case.snapshots[: -case.count]]
+                return MonitorUpdate(self._restart(self._beginning, [*earlier, *case.latest], case.pauses))
         early = self._moved_early | free.keys()
         before = self._anywhere(early) if forget else free_cameras(case.before, free, jump)
         result = self._restart(before, case.latest, case.pauses[-case.count :])
@@ -561,7 +565,8 @@ def _misfit_cameras(case: Case) -> set[int]:
     if not earlier:
         return set()
     observations, poses = stack_snapshots(earlier)
-    off = absorb(case.before, observations, poses, case.options).residual.norm(dim=-1)  # (S, C, N)
+    before = case.before if case.beginning is None else case.beginning  # nothing has been linearized at wrong labels
+    off = absorb(before, observations, poses, case.options).residual.norm(dim=-1)  # (S, C, N)
     wrong = (observations.seen & (off > WRONG_LABEL * observations.sigma)).any(-1).sum(0)
     seeing = observations.seen.any(-1).sum(0)
     return set(torch.nonzero((seeing < LEAST_BEFORE) | (2 * wrong >= seeing)).flatten().tolist())

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+from numpy.typing import NDArray
+
 from imgcal.online.events import Event
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.rig_state import CALIBRATED, CameraHealth
@@ -23,9 +26,10 @@ SAID: Mapping[CameraHealth, tuple[str, str]] = {
 """The words for one camera, and for several."""
 
 
-def camera_health(memory: KeeperMemory) -> dict[str, CameraHealth]:
-    """The health of each camera, by name."""
+def camera_health(memory: KeeperMemory, predicted: NDArray[np.float64]) -> dict[str, CameraHealth]:
+    """The health of each camera, by name; `predicted`: (C, N, 2) px, where the object should be seen, nan if unknown."""
     found: dict[str, CameraHealth] = {}
+    hidden = memory.sightings.hidden_cameras(memory.belief.rig, predicted)
     doubted = {*memory.sightings.astray, *memory.monitor.quarantine.cameras, *memory.monitor.undecided}
     if memory.in_vain >= VAIN:
         doubted |= set(range(memory.prior.num_cameras))  # it is unknown which of them have moved
@@ -39,8 +43,7 @@ def camera_health(memory: KeeperMemory) -> dict[str, CameraHealth]:
         elif camera in memory.off or camera in doubted:
             found[name] = "doubtful"
         else:
-            hidden = camera in memory.sightings.hidden_cameras
-            found[name] = memory.told_health.get(camera, "hidden" if hidden else "ok")
+            found[name] = memory.told_health.get(camera, "hidden" if camera in hidden else "ok")
     return found
 
 

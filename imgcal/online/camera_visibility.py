@@ -61,9 +61,19 @@ class CameraVisibility:
     astray: dict[int, tuple[float, int, float]] = field(default_factory=dict)  # start, number of snapshots, latest
 
     @property
-    def hidden_cameras(self) -> frozenset[int]:
-        """Cameras that see nothing of the object, which should be in view: mostly, something hides it."""
+    def missing_cameras(self) -> frozenset[int]:
+        """Cameras that did not see the object where it should have been in view, and have not seen it since."""
         return frozenset(camera for camera, (_, times) in self.missing.items() if times >= HIDDEN_SNAPSHOTS)
+
+    def hidden_cameras(self, rig: CameraRig, predicted: NDArray[np.float64]) -> frozenset[int]:
+        """Those of them in which the object should still be in view: mostly, something hides it.
+
+        Args:
+            rig: the current one.
+            predicted: (C, N, 2) px, nan if the object's pose is unknown; it may then be in view.
+        """
+        unknown = set(np.flatnonzero(np.isnan(predicted).all((1, 2))).tolist())
+        return self.missing_cameras & (self._should_see(rig, predicted) | unknown)
 
     def observe(self, rig: CameraRig, look: VisibleObject) -> list[Event]:
         """Return which cameras are lost or back with this snapshot."""

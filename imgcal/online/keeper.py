@@ -244,7 +244,7 @@ class RigKeeper:
             snapshot=memory.count - 1,
             belief=memory.belief,
             factory=memory.factory,
-            cameras=camera_health(memory),
+            cameras=camera_health(memory, predicted),
             sentence="",
             refused=refused,
             detections=shown,
@@ -292,7 +292,7 @@ class RigKeeper:
             for event in test(state, frames, None if found is None else found.update):
                 events.append(event)
                 take_health(memory, event)
-        health = camera_health(memory)
+        health = camera_health(memory, state.predicted)
         sentence = describe_health(health, memory.monitor.filter.count)
         if memory.lights is not None and memory.monitor.filter.count:
             sentence += f"; the scale is known to +- {100 * memory.belief.scale_std():.2g} %"
@@ -330,7 +330,7 @@ class RigKeeper:
             progress: anything else to save in the same step, such as the position in a source.
         """
         memory = self._memory
-        health = camera_health(memory)
+        health = camera_health(memory, memory.predicted(memory.poses[-1][1] if memory.poses else None))
         writer = StateWriter()
         state = {
             "memory": writer.write(KeeperMemory, memory),

@@ -131,5 +131,5 @@ def _search(memory: KeeperMemory, checked: Checked) -> Labelled:
     if there is None:
         return Labelled(checked, frozenset())
     seen = memory.sightings
-    doubted = seen.hidden_cameras | seen.astray.keys() | seen.lost.keys()
+    doubted = seen.missing_cameras | seen.astray.keys() | seen.lost.keys()
     return Labelled(*memory.search.label_lost_cameras(checked, there, memory.time, memory.count - 1, doubted))

@@ -78,7 +78,18 @@ def test_a_steady_rig_gives_no_alarm() -> None:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_camera_with_wrong_labels_in_the_first_snapshot_has_not_moved(seed: int) -> None:
-    assert followed({}, 12, seed, noise=0.005, wrong=2, rate=0.5)[2] == []
+    monitor, rig, told = followed({}, 12, seed, noise=0.005, wrong=2, rate=0.5)
+    assert told == []
+    assert monitor.known_since == 0  # all that the other cameras have shown still counts
+    assert 0.4 < normalized_error(monitor, rig) < 1.8
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("at", [2, 4])
+def test_a_camera_that_moves_after_two_precise_snapshots_is_reported(seed: int, at: int) -> None:
+    monitor, rig, told = followed({at: {2: "rotation"}}, 16, seed, noise=0.02, rate=0.5)
+    assert {(change.camera, change.since) for change in told} == {(2, at)}
+    assert 0.4 < normalized_error(monitor, rig) < 1.8
 
 
 @pytest.mark.parametrize(

@@ -86,16 +86,29 @@ def test_a_camera_is_silent_by_its_own_measure() -> None:
 
 
 def test_the_object_is_hidden_from_a_camera_that_suddenly_sees_nothing_before_it_is_lost() -> None:
-    sightings = CameraVisibility(("a", "b", "c", "d"))
+    sightings, rig = CameraVisibility(("a", "b", "c", "d")), imgcal.load_rig("T4").to(torch.float64)
     hidden = []
     for s in range(4):
         assert kinds(sightings, [look(s / 60, [0, 1, 2])]) == []
-        hidden.append(sightings.hidden_cameras == {3})
+        hidden.append(sightings.hidden_cameras(rig, look(0.0, []).predicted) == {3})
     assert hidden == [False, False, True, True]
     one = look(0.08, [0, 1, 2, 3])
     one = replace(one, blobs=one.blobs.select(np.arange(10)))
-    assert kinds(sightings, [one]) == [] and sightings.hidden_cameras == {3}  # a label may come by chance
-    assert kinds(sightings, [look(0.1, [0, 1, 2, 3])]) == [] and not sightings.hidden_cameras
+    assert kinds(sightings, [one]) == []
+    assert sightings.hidden_cameras(rig, one.predicted) == {3}  # a label may come by chance
+    assert kinds(sightings, [look(0.1, [0, 1, 2, 3])]) == [] and not sightings.hidden_cameras(rig, one.predicted)
+
+
+def test_an_object_that_has_left_the_view_of_a_camera_is_not_hidden_from_it() -> None:
+    sightings, rig = CameraVisibility(("a", "b", "c", "d")), imgcal.load_rig("T4").to(torch.float64)
+    assert kinds(sightings, [look(s / 60, [0, 1, 2]) for s in range(4)]) == []
+    left = look(4 / 60, [0, 1, 2])
+    left.predicted[3] = -900.0
+    assert kinds(sightings, [left]) == []
+    assert sightings.hidden_cameras(rig, left.predicted) == frozenset()
+    unknown = np.full_like(left.predicted, np.nan)  # where the object is now, nobody knows
+    assert sightings.hidden_cameras(rig, unknown) == {3}
+    assert sightings.hidden_cameras(rig, look(5 / 60, []).predicted) == {3}  # it comes back, and is still covered
 
 
 def test_a_camera_that_cannot_see_the_object_misses_nothing() -> None:
