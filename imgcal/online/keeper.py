@@ -218,9 +218,12 @@ class RigKeeper:
         for change in found.changes:
             since = memory.change_time(change.since, change.camera)
             told = memory.relearning.events.get(change.camera)
-            if told is not None and told.change == "unknown" and told.since is not None:  # a repeated report
+            again = told is not None and told.change == "unknown"
+            if told is not None and again and told.since is not None:
                 since = told.since
-            events.append(memory.relearning.report_change(change, since, memory.time, memory.count - 1, memory.before))
+            event = memory.relearning.report_change(change, since, memory.time, memory.count - 1, memory.before)
+            if not again or event.change != "unknown":  # a camera that keeps moving is reported once
+                events.append(event)
         if (of_object := found.object_change) is not None:
             events.append(object_event(of_object, memory.change_time(of_object.since), memory.time, memory.count - 1))
         return events

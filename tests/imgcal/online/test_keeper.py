@@ -47,6 +47,24 @@ def test_a_steady_rig_is_learnt_without_alarm() -> None:
     assert (last.residual < 0.3).all()
 
 
+class Creeping(Stream):
+    """Each bump turns its camera the same way."""
+
+    def changed(self, bump: Bump) -> CameraRig:
+        step = torch.zeros(self.rig.num_cameras, 15, dtype=torch.float64)
+        step[bump.camera, CHANGES[bump.kind].start] = bump.size
+        return self.rig.retract(step)
+
+
+def test_a_camera_that_keeps_turning_is_reported_once() -> None:
+    """By a degree in two seconds: it moves on before it is known how it has moved."""
+    steps = [Bump(64 + 2 * step, 1, "rotation", math.radians(1 / 60)) for step in range(60)]
+    made = Creeping(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 2, bumps=steps)
+    states = kept(made, 100)
+    assert [(event.kind, event.camera) for state in states for event in state.events] == [("moved", "cam02")]
+    assert states[-1].cameras["cam02"] == "relearning"
+
+
 def test_a_bump_is_told_and_learnt_again() -> None:
     made = stream(2, bumps=[Bump(26, 1, "rotation", math.radians(0.5))])
     states = kept(made, 90)
