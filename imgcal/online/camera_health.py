@@ -30,7 +30,11 @@ def camera_health(memory: KeeperMemory, predicted: NDArray[np.float64]) -> dict[
     """The health of each camera, by name; `predicted`: (C, N, 2) px, where the object should be seen, nan if unknown."""
     found: dict[str, CameraHealth] = {}
     hidden = memory.sightings.hidden_cameras(memory.belief.rig, predicted)
-    doubted = {*memory.sightings.doubtful_cameras(memory.time), *memory.monitor.quarantine.cameras, *memory.monitor.undecided}
+    doubted = {
+        *memory.sightings.doubtful_cameras(memory.time),
+        *memory.monitor.quarantine.cameras,
+        *memory.monitor.undecided,
+    }
     if memory.in_vain >= VAIN:
         doubted |= set(range(memory.prior.num_cameras))  # it is unknown which of them have moved
     for camera, name in enumerate(memory.prior.camera_names):

@@ -20,8 +20,7 @@ HIDDEN_SNAPSHOTS = 3
 """Successive snapshots in which a camera sees nothing of what it should see until the object is hidden from it."""
 ASTRAY_SNAPSHOTS, ASTRAY_SECONDS = 2, 0.4
 """Snapshots and seconds for which a camera must see a possible object in the wrong place until it counts as lost. Hands
-and passers-by last less. The camera is in doubt after these snapshots: an object that comes into view quickly has no
-labels in the first."""
+and passers-by last less. The camera is in doubt at once."""
 ABSENT_SECONDS, ABSENT_SNAPSHOTS = 2.0, 30
 """Seconds and snapshots for which a camera must miss what it should see until it counts as lost: arms hide objects."""
 SILENT_SECONDS = 0.5
@@ -79,9 +78,7 @@ class CameraVisibility:
     def doubtful_cameras(self, time: float) -> frozenset[int]:
         """Cameras that have lately seen a possible object in the wrong place, and nothing better since."""
         return frozenset(
-            camera
-            for camera, (_, times, latest) in self.astray.items()
-            if times >= ASTRAY_SNAPSHOTS and time - latest <= self._patience(camera)
+            camera for camera, (_, _, latest) in self.astray.items() if time - latest <= self._patience(camera)
         )
 
     def observe(self, rig: CameraRig, look: VisibleObject) -> list[Event]:

@@ -31,7 +31,10 @@ def test_the_worst_is_said_of_a_camera() -> None:
     assert camera_health(memory, np.full((4, 8, 2), -900.0))["cam02"] == "ok"  # the object has left its view
     memory.sightings.missing.clear()
     memory.in_vain = VAIN
-    assert camera_health(memory, nowhere) == {**dict.fromkeys(("cam01", "cam02", "cam03"), "doubtful"), "cam04": "unseen"}
+    assert camera_health(memory, nowhere) == {
+        **dict.fromkeys(("cam01", "cam02", "cam03"), "doubtful"),
+        "cam04": "unseen",
+    }
 
 
 def test_the_rig_is_said_in_a_sentence() -> None:
