@@ -47,7 +47,7 @@ def test_the_offset_of_a_marker_slightly_off_a_line_or_plane_is_an_error(shape: 
     assert sum(row.numbers for row in exact) == sum(row.numbers for row in near) == 3 * len(points) - rank
     total, numbers = 0.0, 0
     for row in near:
-        size = np.linalg.norm(row.coefficient @ points[row.column])
+        size = float(np.linalg.norm(row.coefficient @ points[row.column]))
         if row.length:
             assert size == pytest.approx(row.length)
         elif size > 1e-6:
