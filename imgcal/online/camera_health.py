@@ -27,7 +27,7 @@ SAID: Mapping[CameraHealth, tuple[str, str]] = {
 
 
 def camera_health(memory: KeeperMemory, predicted: NDArray[np.float64]) -> dict[str, CameraHealth]:
-    """The health of each camera, by name; `predicted`: (C, N, 2) px, where the object should be seen, nan if unknown."""
+    """The health of each camera, by name; `predicted`: (C, N, 2) px, fiducials in the images, nan if unknown."""
     found: dict[str, CameraHealth] = {}
     hidden = memory.sightings.hidden_cameras(memory.belief.rig, predicted)
     doubted = {
