@@ -76,7 +76,7 @@ def describe(
     labelled, detections = calibration.labelled, calibration.labelled.detections
     before, sigma = _blob_residuals(calibration, calibration.before.residual)
     after, _ = _blob_residuals(calibration, calibration.residual)
-    used = np.isfinite(after).all(1)
+    used = np.asarray(np.isfinite(after).all(1))
     seen = calibration.observations.seen
     return ReportContent(
         title=f"{'Calibration' if calibration.from_scratch else 'Recalibration'} of {rig.name}",
