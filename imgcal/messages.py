@@ -39,11 +39,15 @@ def list_names(names: Iterable[str]) -> str:
     return f"{', '.join(shown[: MOST_QUOTED // 50])}, ... ({len(whole)} in all)"
 
 
+def name_several(noun: str, names: Iterable[str]) -> str:
+    """Put a noun before names: `camera a`, `cameras a, b`."""
+    whole = list(names)
+    return f"{noun}{'s' if len(whole) > 1 else ''} {list_names(whole)}"
+
+
 def name_cameras(names: Iterable[str]) -> str:
     """Name cameras in a sentence: `camera a`, `cameras a, b`."""
-    whole = list(names)
-    shown = ", ".join(shorten(name) for name in whole[:8]) + (f", ... ({len(whole)})" if len(whole) > 8 else "")
-    return f"camera{'s' if len(whole) > 1 else ''} {shown}"
+    return name_several("camera", names)
 
 
 def one_line(message: str) -> str:

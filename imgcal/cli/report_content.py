@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import imgcal
-from imgcal.association import match_to_rig
+from imgcal.association import Associations, match_to_rig
 from imgcal.cli.outcome import Findings
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
@@ -76,22 +76,17 @@ def describe(
     labelled, detections = calibration.labelled, calibration.labelled.detections
     before, sigma = _blob_residuals(calibration, calibration.before.residual)
     after, _ = _blob_residuals(calibration, calibration.residual)
-    used = np.isfinite(after).all(1)
-    blobs = np.bincount(detections.snapshot, minlength=len(labelled.snapshots))
-    taken = np.bincount(detections.snapshot[used], minlength=len(labelled.snapshots))
+    used = np.asarray(np.isfinite(after).all(1))
     seen = calibration.observations.seen
     return ReportContent(
         title=f"{'Calibration' if calibration.from_scratch else 'Recalibration'} of {rig.name}",
         status="ok",
         reason=_about_object(calibration),
-        identity=calibration.identity,
+        identity=calibration.identity if calibration.lights is None else "unknown_markers",
         factory=rig,
         detections=detections,
         labels=detections.fiducial,
-        snapshots=tuple(
-            SnapshotSummary(s.name, int(f), int(t), s.reason if s.status == "refused" else "")
-            for s, f, t in zip(labelled.snapshots, blobs, taken, strict=True)
-        ),
+        snapshots=summarize_snapshots(labelled, used),
         recalibrated=calibration.rig,
         predicted_before=before + detections.uv,
         predicted_after=after + detections.uv,
@@ -117,6 +112,23 @@ def describe(
         seconds=seconds,
         command=_command(),
         versions=_versions(),
+    )
+
+
+def summarize_snapshots(labelled: Associations, used: NDArray[np.bool_]) -> tuple[SnapshotSummary, ...]:
+    """Count the blobs of each snapshot of the input, in all its rows; `used`: those of the estimate (M,)."""
+    _, first, number = np.unique(labelled.moments, return_index=True, return_inverse=True)
+    row = labelled.detections.snapshot
+    found, taken = (np.bincount(number[rows], minlength=len(first)) for rows in (row, row[used]))
+    kept = set(number[labelled.used].tolist())
+    return tuple(
+        SnapshotSummary(
+            labelled.snapshots[at].name,
+            int(found[i]),
+            int(taken[i]),
+            "" if i in kept else labelled.snapshots[at].reason,
+        )
+        for i, at in enumerate(first)
     )
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from imgcal.association import PipelineOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate
-from imgcal.messages import name_cameras
+from imgcal.messages import name_cameras, name_several
 from imgcal.pipeline.label_counts import LabelCounts
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
@@ -146,7 +146,7 @@ def require_most_labels(labels: NDArray[np.bool_], kept: NDArray[np.bool_], rig:
     bad = np.flatnonzero((before >= 6) & (after < 0.5 * before)).tolist()
     if bad:
         raise RefusedError(
-            f"estimation: fiducial{'s' if len(bad) > 1 else ''} {', '.join(map(str, bad))} (row of the object file): "
+            f"estimation: {name_several('fiducial', map(str, bad))} (row of the object file): "
             f"{before[bad[0]] - after[bad[0]]} of {before[bad[0]]} labels of fiducial {bad[0]} do not fit: it "
             "has moved on the object, or labels are swapped",
             python="measure it again, or leave it out of the object",

@@ -13,11 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.association import Associations
-from imgcal.messages import plural
+from imgcal.errors import RefusedError
+from imgcal.messages import name_cameras, plural
 from imgcal.types import Detections
 
 LEAST_BLOBS = 2
-"""Minimum number of blobs in a copied image: a single blob, such as a reflection, may recur at the same place."""
+"""Minimum number of copied blobs: a single blob, such as a reflection, may recur at the same place."""
+MOST_SHARED = 0.5
+"""Maximum share of a camera's images that another camera may show bit for bit."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,44 @@ class Repeats:
         return f"{' and '.join(parts)}: these copies are left out" if parts else ""
 
 
+def require_own_images(detections: Detections) -> None:
+    """Refuse if two cameras show the same images: one camera's frames are stored under several names.
+
+    No two cameras see a snapshot alike to the last bit. As both would fit, the result would be a rig of two cameras in
+    one place.
+
+    Args:
+        detections: all blobs.
+
+    Raises:
+        RefusedError: the message names the cameras.
+    """
+    _, order, begins = _sort_images(detections)
+    snapshot, camera = detections.snapshot[order[begins]], detections.camera[order[begins]]
+    ends = np.append(begins[1:], len(order))
+    cameras = len(detections.camera_names)
+    images, blobs = (np.zeros((cameras, cameras), dtype=np.int64) for _ in range(2))
+    same: dict[tuple[int, bytes], list[int]] = {}
+    for number in _find_equal(detections.uv[order], snapshot, begins):
+        part = order[begins[number] : ends[number]]
+        others = same.setdefault((int(snapshot[number]), detections.uv[part].tobytes()), [])
+        images[others, camera[number]] += 1
+        blobs[others, camera[number]] += len(part)
+        others.append(int(camera[number]))
+    own = np.bincount(camera, minlength=cameras)
+    a, b = np.nonzero((blobs >= LEAST_BLOBS) & (images > MOST_SHARED * np.minimum(own[:, None], own)))
+    if len(a):
+        first = int(a[0])
+        copies = b[a == first].tolist()
+        names = [detections.camera_names[c] for c in (first, *copies)]
+        raise RefusedError(
+            f"{name_cameras(names)}: found identical images in {plural(int(images[first, copies].max()), 'snapshot')}, "
+            "expected different ones: one camera's frames may be stored under several names",
+            python="give each camera its own frames, or leave the wrong ones out (rig.select)",
+            command="give each camera its own frames, or leave the wrong ones out (--without)",
+        )
+
+
 def drop_repeats(detections: Detections) -> tuple[Detections, Repeats]:
     """Remove blobs that are bit-identical copies of others.
 
@@ -56,22 +97,18 @@ def drop_repeats(detections: Detections) -> tuple[Detections, Repeats]:
     Returns:
         The other blobs, with the names of all snapshots, and what was removed.
     """
-    u, v = detections.uv.T
-    order = np.lexsort((detections.fiducial, v, u, detections.camera, detections.snapshot))
-    columns = np.stack([detections.snapshot, detections.camera, u, v, detections.fiducial])[:, order]
-    kept = np.ones(len(detections), dtype=np.bool_)
-    kept[order[1:]] = (np.diff(columns, axis=1) != 0).any(0)
+    kept, order, begins = _sort_images(detections)
     rows = int((~kept).sum())
-    order = order[kept[order]]
-    image = np.stack([detections.snapshot[order], detections.camera[order]])
-    begins = np.flatnonzero(np.r_[True, (np.diff(image, axis=1) != 0).any(0)]) if len(order) else np.empty(0, int)
+    snapshots, cameras = detections.snapshot[order[begins]], detections.camera[order[begins]]
     ends = np.append(begins[1:], len(order))
     first: dict[tuple[int, bytes], int] = {}
     originals = dict[int, set[int]]()
     images = 0
-    for number in _are_equal(detections.uv[order], image[1], begins):
+    for number in _find_equal(detections.uv[order], cameras, begins):
         part = order[begins[number] : ends[number]]
-        snapshot, camera = (int(value) for value in image[:, begins[number]])
+        if len(part) < LEAST_BLOBS:
+            continue
+        snapshot, camera = int(snapshots[number]), int(cameras[number])
         earlier = first.setdefault((camera, detections.uv[part].tobytes()), snapshot)
         if earlier != snapshot:
             kept[part] = False
@@ -84,18 +121,30 @@ def drop_repeats(detections: Detections) -> tuple[Detections, Repeats]:
     return (detections if kept.all() else detections.select(kept)), repeats
 
 
-def _are_equal(uv: NDArray[np.float64], camera: NDArray[np.int64], begins: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Find images (I,), starting at the rows `begins`, that may be copies: their blobs have equal sums."""
+def _sort_images(detections: Detections) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
+    """Sort blobs by image: which are listed once (M,), the order of those, and where in it each image begins (I,)."""
+    u, v = detections.uv.T
+    order = np.lexsort((detections.fiducial, v, u, detections.camera, detections.snapshot))
+    columns = np.stack([detections.snapshot, detections.camera, u, v, detections.fiducial])[:, order]
+    kept = np.ones(len(detections), dtype=np.bool_)
+    kept[order[1:]] = (np.diff(columns, axis=1) != 0).any(0)
+    order = order[kept[order]]
+    image = np.stack([detections.snapshot[order], detections.camera[order]])
+    begins = np.flatnonzero(np.r_[True, (np.diff(image, axis=1) != 0).any(0)]) if len(order) else np.empty(0, int)
+    return kept, order, begins
+
+
+def _find_equal(uv: NDArray[np.float64], group: NDArray[np.int64], begins: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Find images (I,), starting at the rows `begins`, that may be copies within their group: equal sums of blobs."""
     if not len(begins):
         return begins
-    sizes = np.diff(np.append(begins, len(uv)))
-    sums = np.column_stack((camera[begins], sizes, np.add.reduceat(uv, begins)))
+    sums = np.column_stack((group, np.diff(np.append(begins, len(uv))), np.add.reduceat(uv, begins)))
     order = np.lexsort(sums.T)
     next_equal = (sums[order[1:]] == sums[order[:-1]]).all(1)
     equal = np.zeros(len(sums), dtype=np.bool_)
     equal[order[1:]] |= next_equal
     equal[order[:-1]] |= next_equal
-    return np.flatnonzero(equal & (sizes >= LEAST_BLOBS))
+    return np.flatnonzero(equal)
 
 
 def name_repeats(labelled: Associations, repeats: Repeats) -> Associations:

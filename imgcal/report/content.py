@@ -43,11 +43,13 @@ class ReportContent:
     title: str
     status: Literal["ok", "refused"]
     reason: str  # why it was refused, or what the run wants to say; may be empty
-    identity: str  # coded | unique | by_prior | by_tracking | ambiguous, or what the run says when refused
+    identity: (
+        str  # coded | unique | by_prior | by_tracking | ambiguous | unknown_markers, or what the run says when refused
+    )
     factory: CameraRig  # no batch axes, C cameras
     detections: Detections  # M blobs of S snapshots
     labels: NDArray[np.int64]  # (M,) fiducial of each blob, -1 = unlabelled
-    snapshots: tuple[SnapshotSummary, ...] = ()  # S
+    snapshots: tuple[SnapshotSummary, ...] = ()  # of the input; S, or fewer: one of several objects is a row of its own
     recalibrated: CameraRig | None = None
     predicted_before: Array | None = None  # (M, 2) pixels by the factory rig, pose refitted; nan where not used
     predicted_after: Array | None = None  # (M, 2) pixels by the recalibrated rig; nan where not used

@@ -97,7 +97,7 @@ def _residuals(content: ReportContent) -> dict[str, object] | None:
         "spread": f"{float(np.sqrt(np.mean(content.whitened**2))):.2f}",
         "beyond": f"{100 * beyond:.2g} %",
         "cameras": charts.rms_by_camera(content),
-        "fiducials": charts.rms_by_fiducial(content),
+        "fiducials": charts.rms_by_fiducial(content) if len(charts.fiducial_rms(content)) > 1 else None,
         "median": svg.pixels(float(np.nanmedian(charts.fiducial_rms(content)))),
         "shown": len(rows),
         "total": int(content.used.sum()),
@@ -196,11 +196,10 @@ def _subsampling(content: ReportContent) -> list[str]:
         notes.append(f"The coverage shows at most {panel} observations of each camera.")
     snapshots, fiducials = scene.choose_fiducials(content)
     total = 0 if content.object_points is None else len(content.object_points)
-    known = sum(not s.reason for s in content.snapshots)
-    if len(snapshots) and (len(snapshots) < known or len(fiducials) < total):
-        notes.append(
-            f"The rig shows {plural(len(snapshots), 'snapshot')} and {len(fiducials)} of {total} fiducials in each."
-        )
+    poses = scene.known_poses(content)
+    if len(snapshots) and (len(snapshots) < len(poses) or len(fiducials) < total):
+        each = f" and {len(fiducials)} of {total} fiducials in each" if total > 1 else ""
+        notes.append(f"The rig shows {len(snapshots)} of {plural(len(poses), 'pose')}{each}.")
     d = content.detections
     if int(d.count_by_camera(d.snapshot == content.frame_snapshot).max()) > overlay.blobs_drawn(content):
         notes.append(f"The overlays show at most {overlay.blobs_drawn(content)} blobs of each camera.")

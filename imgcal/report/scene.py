@@ -48,11 +48,18 @@ def describe_scene(content: ReportContent) -> DrawnScene:
     return DrawnScene(scene, factors, start)
 
 
+def known_poses(content: ReportContent) -> NDArray[np.int64]:
+    """Numbers of the rows with a pose of the object."""
+    if content.rig_from_object is None:
+        return np.zeros(0, dtype=np.int64)
+    return np.flatnonzero(np.isfinite(content.rig_from_object.translation.cpu().numpy()).all(axis=1))
+
+
 def choose_fiducials(content: ReportContent) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Choose snapshots and fiducials to draw: indices, evenly spread, all of them where there are few."""
     if content.rig_from_object is None or content.object_points is None:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    good = np.flatnonzero(np.isfinite(content.rig_from_object.translation.cpu().numpy()).all(axis=1))
+    good = known_poses(content)
     snapshots = good[_evenly(len(good), 60)]
     fiducials = _evenly(len(content.object_points), max(LARGEST_CLOUD // max(len(snapshots), 1), 1))
     return snapshots, fiducials

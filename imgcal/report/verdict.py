@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from imgcal.messages import list_names
 from imgcal.pipeline import DOUBTFUL, MOVED
 from imgcal.report.accuracy import advice, length, sentences
 from imgcal.report.charts import duration
@@ -27,6 +28,7 @@ IDENTITY = {
     "unique": "Every fiducial was recognized, and only one labelling explains what the cameras saw.",
     "by_prior": "The given pose decided between look-alike orientations of the object.",
     "by_tracking": "The labels were carried from snapshot to snapshot; the motion excluded look-alike positions.",
+    "unknown_markers": "Nothing was known about the markers; held-out snapshots confirm the rig that they gave.",
     "ambiguous": (
         "The object is symmetric, so its absolute orientation is unknown. All cameras use the same "
         "choice, so the rig is valid."
@@ -71,7 +73,7 @@ def unexplained_sentences(content: ReportContent) -> list[tuple[str, str]]:
     crowded = [content.cameras[i] for i in np.flatnonzero(blobs - used > CROWDED * np.maximum(used, 10))]
     if crowded:
         notes.append((
-            f"More blobs without a label than with one in {', '.join(crowded[:4])}{' and more' * (len(crowded) > 4)}.",
+            f"More blobs without a label than with one in {list_names(crowded)}.",
             "Cover or mask reflections there.",
         ))  # fmt: skip
     return notes
@@ -171,12 +173,12 @@ def _reservations(content: ReportContent) -> list[tuple[str, str]]:
     blind = [name for name, n in zip(content.cameras, content.observations, strict=True) if n == 0]
     if blind:
         notes.append((
-            f"No usable observations in {_list_names(blind)}: not recalibrated, factory values kept.",
-            f"Bring the object into the view of {_list_names(blind)} and check exposure and cabling.",
+            f"No usable observations in {list_names(blind)}: not recalibrated, factory values kept.",
+            f"Bring the object into the view of {list_names(blind)} and check exposure and cabling.",
         ))  # fmt: skip
     few = [name for name, n in zip(content.cameras, content.observations, strict=True) if 0 < n < FEW_OBSERVATIONS]
     if few:
-        notes.append((f"Few observations in {_list_names(few)}.", "Capture more snapshots, seen by all cameras."))
+        notes.append((f"Few observations in {list_names(few)}.", "Capture more snapshots, seen by all cameras."))
     rejected = sum(bool(s.reason) for s in content.snapshots)
     if rejected > 0.2 * max(len(content.snapshots), 1):
         notes.append((
@@ -259,7 +261,7 @@ def _helpful(content: ReportContent) -> list[str]:
     if total == 0:
         steps.append("No blob was found: check exposure, infrared light, and the polarity (bright or dark markers).")
     elif blind:
-        steps.append(f"Nothing was found in {_list_names(blind)}: check exposure, cabling and the view.")
+        steps.append(f"Nothing was found in {list_names(blind)}: check exposure, cabling and the view.")
     if labelled < 0.5 * total and content.reason.startswith(NOT_IDENTIFIED):
         steps.append(
             f"{group_digits(total - labelled)} of {group_digits(total)} blobs could not be labelled: cover or "
@@ -275,9 +277,3 @@ def _helpful(content: ReportContent) -> list[str]:
     steps.append("Check that the factory file belongs to this rig and that no camera was exchanged.")
     steps.append("Capture more snapshots, the whole object in view of as many cameras as possible, in varied poses.")
     return steps
-
-
-def _list_names(names: list[str]) -> str:
-    shown = names[:4]
-    rest = len(names) - len(shown)
-    return ", ".join(shown) + (f" and {rest} more" if rest else "")

@@ -12,6 +12,7 @@ from imgcal.messages import (
     brief_repr,
     list_names,
     name_cameras,
+    name_several,
     one_line,
     plural,
     quote,
@@ -76,4 +77,6 @@ def test_a_dataclass_of_tensors_shows_shapes() -> None:
 
 def test_cameras_in_a_sentence() -> None:
     assert name_cameras(["a"]) == "camera a"
-    assert name_cameras([str(n) for n in range(9)]) == "cameras 0, 1, 2, 3, 4, 5, 6, 7, ... (9)"
+    assert name_cameras([str(n) for n in range(9)]) == "cameras 0, 1, 2, 3, 4, 5, 6, 7, 8"
+    assert name_cameras(f"camera{n:03}" for n in range(300)).endswith("camera003, ... (300 in all)")
+    assert name_several("fiducial", ["3", "5"]) == "fiducials 3, 5"

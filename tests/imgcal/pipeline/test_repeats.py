@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import imgcal
-from imgcal.pipeline.repeats import Repeats, drop_repeats
+from imgcal.pipeline.repeats import Repeats, drop_repeats, require_own_images
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
@@ -87,7 +87,36 @@ def test_a_reflection_at_rest_is_no_copy(capture) -> None:
     assert drop_repeats(still)[1] == Repeats()
 
 
+@pytest.mark.parametrize("name", ["asymmetric8", "lights"])
+def test_one_cameras_frames_under_two_names_are_refused(capture, name) -> None:
+    blobs, rig, _ = capture
+    if name == "lights":  # one blob an image
+        blobs = blobs.select(blobs.fiducial == 0)
+        blobs = replace(blobs, fiducial=np.full(len(blobs), -1))
+    own = blobs.select(blobs.camera != 2)
+    copy = blobs.select(blobs.camera == 1)
+    columns = ("uv", "sigma", "snapshot", "fiducial", "radius", "flags")
+    joined = {name: np.concatenate([getattr(own, name), getattr(copy, name)]) for name in columns}
+    camera = np.concatenate([own.camera, np.full(len(copy), 2)])
+    both = replace(own, camera=camera, **joined)
+    with pytest.raises(imgcal.RefusedError, match="cameras cam02, cam03: found identical images in 6 snapshots"):
+        imgcal.calibrate(both, rig, imgcal.load_object(name))
+
+
+def test_one_identical_image_of_two_cameras_is_left_to_the_other_checks(capture) -> None:
+    blobs, *_ = capture
+    uv = blobs.uv.copy()
+    first, second = ((blobs.snapshot == 2) & (blobs.camera == c) for c in (1, 2))
+    count = min(first.sum(), second.sum())
+    keep = np.ones(len(blobs), dtype=np.bool_)
+    for own in (first, second):
+        keep[np.flatnonzero(own)[count:]] = False
+    uv[np.flatnonzero(second)[:count]] = uv[np.flatnonzero(first)[:count]]
+    require_own_images(replace(blobs, uv=uv).select(keep))
+
+
 def test_nothing_at_all(capture) -> None:
     blobs, *_ = capture
     nothing = blobs.select(np.zeros(len(blobs), dtype=np.bool_))
     assert drop_repeats(nothing) == (nothing, Repeats())
+    require_own_images(nothing)
