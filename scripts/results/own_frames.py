@@ -57,7 +57,7 @@ ENCODERS = {"ir-cnn": "cnn", "ir-vit": "vit", "ir-vit-stem": "vit-stem"}
 SEEDS = (0, 1, 2)
 KEY = ("captures", "kind", "level", "detector")  # everything that a result depends on
 SIMULATED = {"dots": (2,), "cavity": (0,), "grid": SEEDS}  # seeds that calibrate simulated captures
-CAPTURES, SNAPSHOTS = 2, 2  # simulated captures of each level of difficulty, and snapshots of each
+CAPTURES, SNAPSHOTS = 1, 2  # simulated captures of each level of difficulty, and snapshots of each
 EVERY = 5  # every fifth crop is held out to stop a training; results come from other cameras or views
 
 
