@@ -83,17 +83,22 @@ class LearnedProposer:
 
         What the finder has measured itself is behind the proposal, for where the network's is refused.
         """
-        near = self._around(snapshot) if snapshot.candidates else None
-        if self.finder is None:
-            return near or Proposal.decline(snapshot, "found no pose to start from")
         finder = self.finder
-        if near is not None and self._convinces(near, snapshot):
+        if finder is None:
+            known = bool(snapshot.candidates)
+            return self._around(snapshot) if known else Proposal.decline(snapshot, "found no pose to start from")
+        if snapshot.candidates and self._convinces(near := self._around(snapshot, turns_deg=()), snapshot):
             return replace(near, otherwise=lambda: replace(finder.propose(snapshot), found_by=finder.name))
         found = finder.propose(snapshot)
         if found.rig_from_object is None:
-            return near or self._search_origin(snapshot) or Proposal.decline(snapshot, found.reason)
-        there = self._around(replace(snapshot, candidates=(found.rig_from_object,)))
-        best = there if near is None or len(there.detections) > len(near.detections) else near
+            if snapshot.candidates:
+                return self._around(snapshot)
+            return self._search_origin(snapshot) or Proposal.decline(snapshot, found.reason)
+        there = replace(snapshot, candidates=(found.rig_from_object,))
+        best = self._around(there, turns_deg=())
+        if not self._convinces(best, snapshot):  # rotations cost more than the finder
+            starts = [snapshot, there] if snapshot.candidates else [there]
+            best = max((self._around(start) for start in starts), key=lambda proposal: len(proposal.detections))
         return replace(best, otherwise=lambda: replace(found, found_by=finder.name))
 
     def _search_origin(self, snapshot: Snapshot) -> Proposal | None:
@@ -117,10 +122,11 @@ class LearnedProposer:
         in_view = int(snapshot.rig.project(points).visible.sum())
         return len(proposal.detections) > CONVINCING * in_view
 
-    def _around(self, snapshot: Snapshot) -> Proposal:
+    def _around(self, snapshot: Snapshot, turns_deg: tuple[float, ...] = TURNS_DEG) -> Proposal:
+        """Search around the candidates and, if they show too little, at these rotations of the best."""
         view = _View.of(self.network, self.measurer, snapshot)
         poses = RigidTransform.stack(snapshot.candidates)
-        view, looks = view.align(poses[:1]) if view.tiles.divided else (view, view.near(poses))
+        view, looks = view.align(poses[:1]) if view.tiles.divided else (view, view.near(poses, turns_deg))
         if view.tiles.divided and not looks.count:
             return Proposal.decline(
                 snapshot, "too little of the object is visible to tell one step of its pattern from the next"
@@ -196,11 +202,10 @@ class _View:
 
     def _search(self, queries: Queries, count: int, window: int | None) -> Evidence:
         """Search for queries (H T, n) of `count` poses."""
-        if not self.tiles.divided:
-            return self.network.search(self.features.repeat(count, 1, 1, 1), queries, window)
+        tiles = len(self.features)
         parts = [
-            self.network.search(self.features[rows], queries.select(rows), window)
-            for rows in torch.arange(len(self.features)).split(TILES_AT_ONCE)
+            self.network.search(self.features[rows % tiles], queries.select(rows), window)
+            for rows in torch.arange(count * tiles).split(TILES_AT_ONCE if self.tiles.divided else tiles)
         ]
         return Evidence.cat(parts)
 
@@ -228,12 +233,12 @@ class _View:
         view = replace(self, tiles=self.tiles.select_cameras(sure), most=most)
         return view, view.ask(rig, pose, window, steps[best, cameras])
 
-    def near(self, poses: RigidTransform) -> NetworkPass:
+    def near(self, poses: RigidTransform, turns_deg: tuple[float, ...]) -> NetworkPass:
         """The best of poses (H,); if it shows too little, also try rotated ones."""
         rig = self.snapshot.rig
         looks = self.best(rig, poses)
-        if float(looks.found[0]) < LEAST_SEEN * looks.count:
-            tried = self.best(rig, _turn_pose(looks.poses[0], self.snapshot.obj))
+        if turns_deg and float(looks.found[0]) < LEAST_SEEN * looks.count:
+            tried = self.best(rig, _turn_pose(looks.poses[0], self.snapshot.obj, turns_deg))
             looks = tried if float(tried.found[0]) > float(looks.found[0]) else looks
         return looks
 
@@ -361,10 +366,10 @@ def _mask_frame(frame: np.ndarray | None, mask: np.ndarray | None) -> np.ndarray
     return np.where(mask, np.median(frame[::8, ::8]).astype(frame.dtype), frame)
 
 
-def _turn_pose(pose: RigidTransform, obj: CalibrationObject) -> RigidTransform:
+def _turn_pose(pose: RigidTransform, obj: CalibrationObject, turns_deg: tuple[float, ...]) -> RigidTransform:
     """Rotate a pose about the object's centre, in both directions about each axis: (H,)."""
     axes = torch.cat((torch.eye(3), -torch.eye(3))).to(pose.rotation)
-    vectors = torch.cat([axes * math.radians(angle) for angle in TURNS_DEG])
+    vectors = torch.cat([axes * math.radians(angle) for angle in turns_deg])
     centre = obj.points.mean(0).to(pose.rotation)
     rotation = rotation_from_vector(vectors) @ pose.rotation
     return RigidTransform(rotation, pose.rotation @ centre + pose.translation - rotation @ centre)

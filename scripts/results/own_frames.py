@@ -13,11 +13,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -27,16 +28,18 @@ from torch import Tensor, nn
 
 import imgcal
 from imgcal.errors import RefusedError
+from imgcal.evaluation import Contender, Outcome, Scene, compare_detectors
+from imgcal.fleet import StoredResults, workers
 from imgcal.io import MODEL
 from imgcal.matching import MatchedFilter
 from imgcal.networks import Evidence, InfraredNetwork, Queries, load_infrared, load_measurer
 from imgcal.pipeline.learned_proposer import LearnedProposer
 from imgcal.pipeline.sources import Detector
-from imgcal.synthesis import DIFFICULTIES
+from imgcal.synthesis import DIFFICULTIES, FrameModel
 from imgcal.training import HELD_OUT, TRAIN
 from imgcal.training.labelled_crops import cut_labelled
 from imgcal.types import CameraRig, Detections
-from scripts.output import RESULTS, ROOT, command, fill, machine, markdown, read_json, write_json
+from scripts.output import RESULTS, ROOT, WORK, command, fill, machine, markdown, read_json, surroundings, write_json
 from scripts.results import degraded_captures as captures
 from scripts.results import infrared
 from scripts.results.degradations import DEGRADATIONS
@@ -53,6 +56,8 @@ REST = {"dots": ("cam2", "cam3"), "cavity": ("cam4",), "grid": ("cam",)}
 ENCODERS = {"ir-cnn": "cnn", "ir-vit": "vit", "ir-vit-stem": "vit-stem"}
 SEEDS = (0, 1, 2)
 KEY = ("captures", "kind", "level", "detector")  # everything that a result depends on
+SIMULATED = {"dots": (2,), "cavity": (0,), "grid": SEEDS}  # seeds that calibrate simulated captures
+CAPTURES, SNAPSHOTS = 1, 2  # simulated captures of each level of difficulty, and snapshots of each
 EVERY = 5  # every fifth crop is held out to stop a training; results come from other cameras or views
 
 
@@ -311,9 +316,44 @@ def _share(row: dict[str, float]) -> str:
     return f"{row['right_percent']:.1f} / {row['wrong_percent']:.1f}"
 
 
+def calibrate_simulated(runs: Path) -> tuple[Outcome, ...]:
+    """Calibrate simulated captures of all levels with the matched filter, the shipped and the adapted networks."""
+    levels = {name: FrameModel(difficulty=each) for name, each in (DIFFICULTIES | infrared.HARDER).items()}
+    scene = Scene(imgcal.load_rig("O10"), imgcal.load_object("asymmetric8"), levels, SNAPSHOTS)
+    networks = [Contender(f"adapted to {captures.SETS[name]}", str(adapted(runs, name, "ir-cnn", seed)), seed)
+                for name, seeds in SIMULATED.items() for seed in seeds]  # fmt: skip
+    detectors = (Contender("matched filter", "matched"), Contender("shipped", "learned"), *networks)
+    kept = StoredResults(WORK / "own_frames", repr((SNAPSHOTS, detectors)))
+    with workers(cores=1, kept=kept) as mapped:
+        return compare_detectors(
+            detectors, scene, CAPTURES, progress=lambda _: print(end=".", flush=True), mapped=mapped
+        )
+
+
+def tables_of_calibrations(outcomes: Sequence[Outcome]) -> str:
+    """Count outcomes of simulated captures, and compare errors on those that every detector calibrates."""
+    lost = {(one.difficulty, one.capture) for one in outcomes if one.status != "calibrated"}
+    lines = {name: [name] for name in dict.fromkeys(one.contender for one in outcomes)}
+    for levels in (DIFFICULTIES, infrared.HARDER):
+        for name, line in lines.items():
+            mine = [one for one in outcomes if one.contender == name and one.difficulty in levels]
+            seeds = dict.fromkeys(one.training_seed for one in mine)
+            line.append(", ".join(counts([one for one in mine if one.training_seed == seed]) for seed in seeds))
+            errors = [one.held_out_px for one in mine if (one.difficulty, one.capture) not in lost]
+            line.append(f"{median(error for error in errors if error is not None):.3f}" if errors else "")
+    head = ["calibrated / refused / wrong", "named levels", "median px", "harder levels", "median px"]
+    return markdown(head, list(lines.values()))
+
+
+def counts(outcomes: Sequence[Outcome]) -> str:
+    """Calibrated, refused and wrong."""
+    said = [one.status for one in outcomes]
+    return " / ".join(str(said.count(kind)) for kind in ("calibrated", "refused", "wrong"))
+
+
 def main(
     runs: Path,
-    steps: tuple[str, ...] = ("prepare", "train", "measure", "levels", "page"),
+    steps: tuple[str, ...] = ("prepare", "train", "measure", "levels", "calibrations", "page"),
     cores: int = 1,
     only: tuple[str, ...] = (),
     device: str = "cpu",
@@ -323,7 +363,7 @@ def main(
 
     Args:
         runs: folder of data sets and training runs.
-        steps: prepare, train, measure, levels, page.
+        steps: prepare, train, measure, levels, calibrations, page.
         cores: processes at once.
         only: detectors to measure; none = all.
         device: of the query networks.
@@ -337,9 +377,16 @@ def main(
         measure(runs, cores, cases(runs, only or detectors(), device))
     if "levels" in steps:
         measure_levels(runs, count)
+    if "calibrations" in steps:
+        outcomes = [asdict(one) for one in calibrate_simulated(runs)]
+        write_json(JSON, read_json(JSON) | {"calibrations": outcomes, "calibrations_measured_on": surroundings()})
     if "page" in steps:
         found = read_json(JSON)
-        fill(PAGE, {"own frames": tables(found["outcomes"]), "own frames levels": tables_of_levels(found["levels"])})
+        fill(PAGE, {
+            "own frames": tables(found["outcomes"]),
+            "own frames levels": tables_of_levels(found["levels"]),
+            "own frames calibrations": tables_of_calibrations([Outcome(**row) for row in found["calibrations"]]),
+        })  # fmt: skip
 
 
 if __name__ == "__main__":
