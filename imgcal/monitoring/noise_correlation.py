@@ -48,11 +48,12 @@ SMOOTHING = 0.1
 """Weight of the latest interval in the running mean of intervals."""
 
 # Persistent and passing errors.
-EPISODE, EPISODE_SECONDS = 2.0, 0.4
-"""How long a passing error may last: correlation times, and at least so many seconds. A target at the edge of an image,
-behind somebody's arm, or with wrong labels stays so for a while, and may seem to be shifted by pixels."""
-LARGEST = 10.0
-"""Errors larger than this many times the usual persistent error last no longer than those seconds."""
+EPISODE, EPISODE_SECONDS = 2.0, 1.0
+"""How long a passing error may last: correlation times, and at least so many seconds. On the recorded wand, the mean
+shift of a camera over 0.8 s reaches 6 times its usual persistent error, and 3.5 times over 1.5 s."""
+LARGEST, LARGE_EPISODE_SECONDS = 10.0, 0.4
+"""Errors larger than this many times the usual persistent error last no longer than those seconds. A target at the edge
+of an image, behind somebody's arm, or with wrong labels stays so for a while, and may seem to be shifted by pixels."""
 LEAST_LASTING = 0.05
 """Pixels: least size of persistent errors, as measured on ten well calibrated infrared cameras."""
 LEAST_SHIFT = 6.0
@@ -122,7 +123,12 @@ class NoiseCorrelation:
         """Number of successive snapshots that a camera's error may last that shifts the image so far (px)."""
         usual = self.episodes[camera]
         large = shift > LARGEST * float(self.model_error[camera])
-        return min(usual, math.ceil(self._least_episode)) if large else usual
+        return min(usual, self._count(LARGE_EPISODE_SECONDS)) if large else usual
+
+    @property
+    def persistent(self) -> Tensor:
+        """Noise (px) of each camera's whole image in a snapshot, as if independent of other snapshots: (C,)."""
+        return torch.where(self.time > 1, self.model_error * self.time.sqrt(), 0.0)
 
     @property
     def correlated(self) -> Tensor | None:
@@ -132,12 +138,12 @@ class NoiseCorrelation:
     @property
     def episodes(self) -> list[int]:
         """Number of successive snapshots that a passing error of each camera may last."""
-        least = self._least_episode
-        return [1 if time <= 1 else math.ceil(max(EPISODE * time, least)) for time in self.time.tolist()]
+        least = self._count(EPISODE_SECONDS)
+        return [1 if time <= 1 else max(math.ceil(EPISODE * time), least) for time in self.time.tolist()]
 
-    @property
-    def _least_episode(self) -> float:
-        return EPISODE_SECONDS / (self.interval or FASTEST)
+    def _count(self, seconds: float) -> int:
+        """Number of snapshots within some seconds."""
+        return math.ceil(seconds / (self.interval or FASTEST))
 
     @property
     def least_shifts(self) -> list[float]:

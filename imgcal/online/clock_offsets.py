@@ -29,15 +29,17 @@ LEAST_KNOWN = 1e-4
 """... and seconds from which it is corrected."""
 LEAST_CHANGE = 0.05
 """Relative change of an offset at which it is reported again."""
-LEAST_MEMORY = 1.0
-"""Seconds of motion required before a report."""
+LEAST_MEMORY = 0.75
+"""Seconds of motion that a camera must have seen before a report."""
 
 # When motion and shift can be separated.
 LEAST_MOTION, LEAST_SIGMAS = 0.5, 5.0
 """Pixels, and standard deviations, by which blobs (their median) must move between snapshots: less is noise of the
 pose, which correlates with the residuals. Predictions would not do: they also move as the rig is learnt."""
 CAMERA_STEP, STEP_SNAPSHOTS = 0.2, 3
-"""Change (px) of a camera's image, and number of snapshots that it must last, to restart that camera's estimate."""
+"""Change (px) of a camera's image, and number of snapshots that it must last, to restart that camera's estimate ..."""
+LASTING_STEP = 2.0
+"""... and the least change, relative to `RigState.persistent`."""
 LEAST_DETERMINED = 1e-6
 """Minimum determinant, scaled to a unit diagonal, for separating motion and shift."""
 MOST_PIXELS = 50.0
@@ -145,7 +147,7 @@ class ClockOffsets:
         keep = math.exp(-self._period / MEMORY_SECONDS)
         self._normal *= keep
         self._right *= keep
-        self._seconds = self._seconds * keep + self._period
+        self._seconds *= keep
         blobs = state.detections
         rows = np.flatnonzero((blobs.fiducial >= 0) & blobs.usable)
         at = blobs.camera[rows], blobs.fiducial[rows]
@@ -156,8 +158,11 @@ class ClockOffsets:
             good = np.isfinite(velocity).all(-1) & (np.linalg.norm(residual, axis=-1) < MOST_PIXELS)
         # Leave out untrusted cameras: their residuals have other causes than a small delay.
         good &= np.array([state.cameras.get(name) not in UNTRUSTED for name in state.factory.camera_names])[:, None]
-        good &= ~self._reset_changed(velocity, residual, sigma, good)[:, None]
-        weight = np.where(good, 1 / np.square(sigma), 0.0)
+        good &= ~self._reset_changed(state, velocity, residual, sigma, good)[:, None]
+        self._seconds += np.where(good.any(1), self._period, 0.0)
+        # Counts labels of one camera as independent, so each carries its share of the shift that they have in common.
+        shared = good.sum(1, keepdims=True) * np.square(state.persistent)[:, None]
+        weight = np.where(good, 1 / (np.square(sigma) + shared), 0.0)
         motion, residual = np.where(good[..., None], velocity, 0.0), np.where(good[..., None], residual, 0.0)
         total, shift = weight.sum(1), np.einsum("cn,cni->ci", weight, motion)
         self._normal[:, 0, 0] += np.einsum("cn,cni,cni->c", weight, motion, motion)
@@ -169,6 +174,7 @@ class ClockOffsets:
 
     def _reset_changed(
         self,
+        state: RigState,
         velocity: NDArray[np.float64],
         residual: NDArray[np.float64],
         sigma: NDArray[np.float64],
@@ -188,7 +194,8 @@ class ClockOffsets:
         middle = _middle(np.where(good[..., None], off, np.inf), count)
         usual = _middle(np.where(good, sigma, np.inf)[..., None], count)[:, 0]
         with np.errstate(invalid="ignore"):
-            other = known & (np.linalg.norm(middle, axis=1) > np.maximum(CAMERA_STEP, 6 * usual / np.sqrt(count)))
+            least = np.maximum(CAMERA_STEP, np.maximum(6 * usual / np.sqrt(count), LASTING_STEP * state.persistent))
+            other = known & (np.linalg.norm(middle, axis=1) > least)
         self._other = np.where(other, self._other + 1, np.where(known, 0, self._other))
         restarted = self._other >= STEP_SNAPSHOTS
         self._begin(restarted)

@@ -257,6 +257,7 @@ class RigKeeper:
             clock_offset_sigma=sigma,
             noise=memory.noise.additive,
             shake=memory.monitor.shaking.shake.numpy(),
+            persistent=memory.monitor.noise.persistent.numpy(),
         )
 
     def _conclude(

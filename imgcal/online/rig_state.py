@@ -66,6 +66,7 @@ class RigState:
     clock_offset_sigma: NDArray[np.float64]  # (C,) s, one standard deviation
     noise: NDArray[np.float64]  # (C,) pixels, noise of blobs beyond their own sigmas
     shake: NDArray[np.float64]  # (C,) pixels, random shift shared by all blobs of a camera
+    persistent: NDArray[np.float64]  # (C,) pixels, the same of shifts that last, as if each snapshot had another one
     lights: FoundLights | None = None  # which blobs show the same light; None = no lights found, or a known object
 
     @property

@@ -147,6 +147,7 @@ def made_state(
         time=time, snapshot=number, belief=belief, factory=rig, cameras=dict.fromkeys(rig.camera_names, "ok"),
         sentence="", refused=None, detections=blobs, lag=np.zeros((len(blobs), 2)), predicted=uv, residual=nothing,
         rig_from_object=pose, events=(), clock_offset=nothing, clock_offset_sigma=nothing, noise=nothing, shake=nothing,
+        persistent=nothing,
     )  # fmt: skip
 
 

@@ -63,6 +63,7 @@ def made_state(rig, obj, snapshot=0, now=None, health=None, events=(), place=Non
         clock_offset_sigma=np.full(rig.num_cameras, np.nan),
         noise=np.zeros(rig.num_cameras),
         shake=np.zeros(rig.num_cameras),
+        persistent=np.zeros(rig.num_cameras),
     )
 
 

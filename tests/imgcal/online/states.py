@@ -56,5 +56,5 @@ def state_at(
         refused=None, detections=blobs, lag=np.zeros((32, 2)), predicted=seen(seconds), residual=np.zeros(4),
         rig_from_object=pose_at(seconds),
         events=(), clock_offset=np.full(4, np.nan), clock_offset_sigma=np.full(4, np.nan),
-        noise=np.zeros(4), shake=np.zeros(4),
+        noise=np.zeros(4), shake=np.zeros(4), persistent=np.zeros(4),
     )  # fmt: skip

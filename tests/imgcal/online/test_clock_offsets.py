@@ -82,6 +82,37 @@ def test_a_rig_that_is_learnt_anew_is_no_motion_of_the_object() -> None:
     assert np.all((np.abs(offset) < 5 * sigma + 1e-3)[[0, 2, 3]])
 
 
+def test_a_few_snapshots_of_a_camera_say_nothing_of_its_clock() -> None:
+    test, events = ClockOffsets(4), []
+    for number in range(90):  # camera 2 is late for a fifth of a second, and then sees nothing
+        state = state_at(number, number / 20, lambda camera, late=10 <= number: 0.01 * (late and camera == 2))
+        if number >= 14:
+            rows = np.flatnonzero(state.detections.camera != 2)
+            state = replace(state, detections=state.detections.select(rows), lag=state.lag[rows])
+        events += test(state, None, None)
+    assert events == []
+
+
+def test_errors_that_last_do_not_look_like_a_late_clock() -> None:
+    def follow(late: float, persistent: float, seed: int) -> tuple[float, float]:
+        """Correction (s) of a camera whose image is shifted, another way after ten snapshots; its largest z-score."""
+        test, random, shift, scores = ClockOffsets(4), np.random.default_rng(seed), np.zeros(2), [0.0]
+        for number in range(100):
+            shift = 0.9 * shift + 0.15 * (1 - 0.9**2) ** 0.5 * random.standard_normal(2)
+            state = state_at(number, number / 60, lambda camera: (late - test.late[2]) * (camera == 2))
+            uv = state.detections.uv + shift * (state.detections.camera == 2)[:, None]
+            noise = np.array([0.0, 0.0, persistent, 0.0])
+            list(test(replace(state, detections=replace(state.detections, uv=uv), persistent=noise), None, None))
+            offset, sigma = test.offsets()
+            scores.append(abs(float(offset[2] - test.late[2]) / float(sigma[2])) if number > 40 else 0.0)
+        return float(test.late[2]), max(scores)
+
+    lasting = 0.15 * (1.9 / 0.1) ** 0.5  # times the root of the correlation time
+    assert follow(late=0.0, persistent=0.0, seed=4)[1] > 6  # as if the noise were independent
+    assert all(follow(late=0.0, persistent=lasting, seed=seed)[1] < 3 for seed in (0, 4, 5))
+    assert abs(follow(late=0.03, persistent=lasting, seed=4)[0] - 0.03) < 1e-3
+
+
 def test_what_was_told_is_kept() -> None:
     test, _ = watched({2: 0.01})
     again = ClockOffsets(4)

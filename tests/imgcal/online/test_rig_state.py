@@ -21,7 +21,7 @@ def state(rig: imgcal.CameraRig, belief: RigBelief) -> RigState:
     )  # fmt: skip
     empty = np.full((rig.num_cameras, 8, 2), np.nan)
     values = belief, rig, {}, "", None, blobs, np.zeros((len(blobs), 2)), empty, empty[:, 0, 0], None, ()
-    return RigState(0.0, 0, *values, *4 * (empty[:, 0, 0],))
+    return RigState(0.0, 0, *values, *5 * (empty[:, 0, 0],))
 
 
 def test_a_motion_of_the_whole_rig_is_none() -> None:
