@@ -126,12 +126,12 @@ def linearize(problem: Problem, state: State, loss: str, threshold: float) -> No
     """Do the work of `linearization.linearize` for tensors on the CPU, without gradients; the loss as in `minimize`."""
     own_std, state = _object_spread(problem, state, len(problem.uv))
     blocks = _Blocks.of(problem, len(problem.uv))
-    given = (*shared_arrays(problem), *_arrays((*_problem_arrays(problem), own_std)))
+    shared, given = shared_arrays(problem), _arrays((*_problem_arrays(problem), own_std))
     states, parts, cost = _arrays(_parts(state)), _arrays(blocks.parts), blocks.cost.numpy()
     limits, steady = (blocks.cameras_first, LOSS_CODES[loss], threshold), np.empty((0, 0))
     for b in range(len(cost)):  # no compiled loop, which would contain all of `linearize_rig` once more
-        one = (*given[:3], *(array[b] for array in given[3:]))
-        cost[b] = linearize_rig(one, tuple(s[b] for s in states), tuple(p[b] for p in parts), *limits, steady)
+        given_here, state_here, blocks_here = (tuple(array[b] for array in arrays) for arrays in (given, states, parts))
+        cost[b] = linearize_rig((*shared, *given_here), state_here, blocks_here, *limits, steady)
     return blocks.equations()
 
 
