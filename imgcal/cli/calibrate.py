@@ -21,6 +21,7 @@ from imgcal.cli.common import (
     parse_range,
     progress,
     read_detections,
+    require_board_files,
     select_cameras,
     start_pose,
 )
@@ -82,6 +83,7 @@ class Calibrate(arguments.Calibrate):
         )
         source = open_input(self.input, complete, obj.rows, self.videos_differ)
         self._require_frames(source, rig)
+        require_board_files(self.object, source)
         measurer = None if self.measurer is None else LearnedMeasurer.load(self.measurer)
         detector = self._detector(source, measurer)
         if self.trust and self.first_guess == "none":

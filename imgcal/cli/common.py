@@ -8,7 +8,7 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -99,6 +99,22 @@ def read_detections(
         return source.of_snapshots(first, count if last is None else min(last, count)), {}
     bar = partial(progress, label="detecting blobs")
     return detect_capture(source, first, last, options, measurer, board, bar)
+
+
+def require_board_files(objects: Sequence[str], source: Capture | Detections) -> None:
+    """Require a board's own file for frames: its points alone do not say how they are printed.
+
+    Raises:
+        InputError: an object is the `object.csv` of a calibration from a printed board.
+    """
+    for given in objects:
+        path = Path(given)
+        board = path.with_name("board.yaml")
+        if isinstance(source, Capture) and path.name == "object.csv" and board.is_file():
+            raise InputError(
+                f"--object {given}: found the corners of a printed board, which frames show without markers; expected "
+                f"the board's file, {board}"
+            )
 
 
 def progress(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from imgcal.cli import arguments
-from imgcal.cli.common import open_rig, progress, read_detections
+from imgcal.cli.common import open_rig, progress, read_detections, require_board_files
 from imgcal.io import load_objects, open_input
 from imgcal.messages import plural
 from imgcal.pipeline import RigScore, rms_length, score, unit_doubt
@@ -26,6 +26,7 @@ class Score(arguments.Score):
         """Score and print."""
         rig, obj = open_rig(self.rig), load_objects(self.object)
         source = open_input(self.input, rig, obj.rows, self.videos_differ)
+        require_board_files(self.object, source)
         detections, _ = read_detections(source, self.snapshots, self.detection, board=obj.board)
         bar = partial(progress, label="scoring")
         found = summary(score(detections, rig, obj, progress=bar), rig)

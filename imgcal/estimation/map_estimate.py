@@ -177,7 +177,7 @@ def minimize(problem: Problem, start: State, options: EstimationOptions) -> leve
     Precise observations make narrow, winding valleys of the cost. A rig without convergence after `RESTART_AFTER` steps
     starts over with larger standard deviations, which shrink to the given ones in stages (graduated non-convexity).
     """
-    first = _solve(problem, start, replace(options, max_iterations=min(options.max_iterations, RESTART_AFTER)))
+    first = descend(problem, start, replace(options, max_iterations=min(options.max_iterations, RESTART_AFTER)))
     rows = (~first.converged).nonzero().squeeze(-1)
     left = options.max_iterations - first.iterations
     if left <= 0 or not len(rows):
@@ -186,12 +186,12 @@ def minimize(problem: Problem, start: State, options: EstimationOptions) -> leve
     coarse = replace(options, tolerance=COARSE_TOLERANCE, max_iterations=min(options.max_iterations, 2 * RESTART_AFTER))
     state, spent = levenberg_marquardt.select_rows(start, rows), first.iterations
     for factor in COARSER:
-        stage = _solve(replace(slow, root_weight=slow.root_weight / factor), state, coarse)
+        stage = descend(replace(slow, root_weight=slow.root_weight / factor), state, coarse)
         state, spent = stage.state, spent + stage.iterations
-    second = _solve(slow, state, options)
+    second = descend(slow, state, options)
     spent += second.iterations
     if not bool((second.converged & (second.equations.cost <= first.equations.cost[rows])).all()):
-        further = _solve(
+        further = descend(
             slow, levenberg_marquardt.select_rows(first.state, rows), replace(options, max_iterations=left)
         )
         spent += further.iterations
@@ -199,7 +199,8 @@ def minimize(problem: Problem, start: State, options: EstimationOptions) -> leve
     return levenberg_marquardt.replace_rows(first, rows, second, spent)
 
 
-def _solve(problem: Problem, start: State, options: EstimationOptions) -> levenberg_marquardt.Solution:
+def descend(problem: Problem, start: State, options: EstimationOptions) -> levenberg_marquardt.Solution:
+    """Minimize from a start in one attempt; see `minimize`."""
     with torch.no_grad():
         if problem.uv.device.type == "cpu":
             limits = (options.loss, options.threshold, options.max_iterations, options.tolerance)

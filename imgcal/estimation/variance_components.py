@@ -16,7 +16,7 @@ from imgcal.errors import RefusedError
 from imgcal.estimation.covariance import remaining_variance
 from imgcal.estimation.levenberg_marquardt import Solution
 from imgcal.estimation.linearization import Problem, State, points_at
-from imgcal.estimation.map_estimate import EstimationOptions, make_loss, minimize
+from imgcal.estimation.map_estimate import EstimationOptions, descend, make_loss, minimize
 from imgcal.estimation.object_shape import (
     ScaleEvidence,
     ShapeEvidence,
@@ -30,6 +30,8 @@ from imgcal.types import PARAMETER_KINDS
 
 ROUNDS = 40
 """Most fits: noise, outliers, object and prior depend on each other, and most captures need three to six."""
+PATIENCE = 10
+"""Iterations after which a fit without a minimum is given up, as a multiple of those of one attempt."""
 BENT = 5.0
 """Standard deviations from which the object does not match its file."""
 WRONG_SCALE = 4.0
@@ -155,6 +157,8 @@ def estimate_variance_components(
     nearer, needed = start.nearer, 0.0
     for _ in range(ROUNDS):
         fit, known = _fit(problem, state, additive_noise, variance, kept, options, known), None
+        if not (fit.converged or later):
+            fit = _continue(fit, options)
         problem, solution, seen = fit.problem, fit.solution, fit.seen
         if unexamined and not later and fit.converged and not fit.is_clean(options.outlier):
             # Test before removing outliers, because they may include all labels of a misplaced fiducial.
@@ -314,6 +318,12 @@ def _fit(
     root_weight = torch.from_numpy(np.where(seen, noise**-0.5, 0.0)).to(problem.uv)
     problem = replace(problem, root_weight=root_weight[None])
     return _Fit(problem, known or minimize(problem, state, options.estimation), noise, seen, variance)
+
+
+def _continue(fit: _Fit, options: FitOptions) -> _Fit:
+    """Continue a fit that has not converged: the way to values that the data hardly determine is long."""
+    patient = replace(options.estimation, max_iterations=PATIENCE * options.estimation.max_iterations)
+    return replace(fit, solution=descend(fit.problem, fit.solution.state, patient))
 
 
 def _additive_noise(squared: NDArray[np.floating], variance: NDArray[np.floating], taken: float) -> float:

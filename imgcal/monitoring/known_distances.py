@@ -5,12 +5,16 @@ equations: a sum of light positions, with coefficients whose sum is zero, has a 
 distance. A marker on the line, in the plane, or in the space of others is an affine combination of these: the
 difference from it has length zero, which is three numbers. So n markers in view give 3 n - 5 numbers on a line, and
 3 n - 6 otherwise, all but those of a pose.
+
+A marker slightly off a line or plane lies on a circle or between two mirror images. Lengths that say so have no
+minimum that small steps could find if the circle is smaller than the error of a light's place. So such a marker has
+lengths along the line or plane, and its offset is an error of unknown direction.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -22,8 +26,8 @@ TERMS = 5
 """Most lights in a row: one, and four that span space."""
 DISTANCE_SIGMA = 1e-5
 """Standard deviation of a known length, relative to the object's size: small beside the error of any light's place."""
-LEAST_EXTENT = 1e-3
-"""Least distance of a marker from the line or plane of others, relative to the object's size; nearer ones lie in it."""
+LEAST_EXTENT = 1e-2
+"""Least distance of a marker from the line or plane of others, relative to the object's size, for its side to count."""
 
 
 @dataclass(frozen=True)
@@ -61,44 +65,64 @@ def known_distances(
         return KnownDistances.none(len(number))
     every = []
     for named, there in zip(number, used, strict=True):
-        rows = list[tuple[NDArray[np.int64], Array, float]]()
+        rows = list[ShapeRow]()
         for first, points in parts:
             column = np.flatnonzero(there & (named >= first) & (named < first + len(points)))
-            unit = DISTANCE_SIGMA * float(np.linalg.norm(np.ptp(points, axis=0)))
-            seen = points[named[column] - first]
-            rows += [(column[which], by / unit, length / unit) for which, by, length in shape_rows(seen)]
+            sigma = DISTANCE_SIGMA * float(np.linalg.norm(np.ptp(points, axis=0)))
+            shape = shape_rows(points[named[column] - first], sigma)
+            rows += [replace(row, column=column[row.column]) for row in shape]
         every.append(rows)
     found = KnownDistances.none(len(number))
     most = max(map(len, every))
     column = np.zeros((len(number), most, TERMS), dtype=np.int64)
     coefficient, length = np.zeros((len(number), most, TERMS)), np.zeros((len(number), most))
-    numbers = 0
     for s, rows in enumerate(every):
-        for r, (which, by, apart) in enumerate(rows):
-            column[s, r, : len(which)], coefficient[s, r, : len(which)], length[s, r] = which, by, apart
-            numbers += 1 if apart > 0 else 3
+        for r, row in enumerate(rows):
+            terms = slice(len(row.column))
+            column[s, r, terms], coefficient[s, r, terms], length[s, r] = row.column, row.coefficient, row.length
+    numbers = sum(row.numbers for rows in every for row in rows)
     return KnownDistances(column, coefficient, length, numbers) if most else found
 
 
-def shape_rows(points: Array) -> list[tuple[NDArray[np.int64], Array, float]]:
-    """Describe the shape of some points (n, 3) by rows: indices, coefficients, and the length of the sum.
+@dataclass(frozen=True)
+class ShapeRow:
+    """A fact about the shape of some points: a sum of theirs has a known length."""
+
+    column: NDArray[np.int64]  # (T,) points in the sum
+    coefficient: Array  # (T,) 1/mm
+    length: float  # of the sum, in standard deviations
+    numbers: int  # that the row fixes
+
+
+def shape_rows(points: Array, sigma: float) -> list[ShapeRow]:
+    """Describe the shape of some points (n, 3); `sigma`: of known lengths, mm.
 
     Examples:
-        >>> rows = shape_rows(np.array([[0.0, 0, 0], [200.0, 0, 0], [500.0, 0, 0]]))
-        >>> [(which.tolist(), by.round(6).tolist(), length) for which, by, length in rows]
+        >>> rows = shape_rows(np.array([[0.0, 0, 0], [200.0, 0, 0], [500.0, 0, 0]]), 1.0)
+        >>> [(row.column.tolist(), row.coefficient.round(6).tolist(), row.length) for row in rows]
         [([0, 2], [1.0, -1.0], 500.0), ([1, 0, 2], [-1.0, 0.6, 0.4], 0.0)]
     """
     if len(points) < 2:
         return []
     frame = _frame(points)
-    rows = [
-        (np.array(pair), np.array((1.0, -1.0)), float(np.linalg.norm(points[pair[0]] - points[pair[1]])))
-        for pair in combinations(frame, 2)
-    ]
-    span = np.concatenate((points[frame].T, np.ones((1, len(frame)))))
+
+    def distance(one: int, other: int) -> ShapeRow:
+        length = float(np.linalg.norm(points[one] - points[other])) / sigma
+        return ShapeRow(np.array((one, other)), np.array((1.0, -1.0)) / sigma, length, 1)
+
+    rows = [distance(one, other) for one, other in combinations(frame, 2)]
+    edges = (points[frame[1:]] - points[frame[0]]).T
     for other in sorted(set(range(len(points))) - set(frame)):
-        share = np.linalg.lstsq(span, np.append(points[other], 1.0), rcond=None)[0]
-        rows.append((np.array([other, *frame]), np.array([-1.0, *share]), 0.0))
+        there = points[other] - points[frame[0]]
+        share = np.linalg.lstsq(edges, there, rcond=None)[0]
+        height, sides = float(np.linalg.norm(there - edges @ share)), 4 - len(frame)
+        fixed, error = 3, sigma
+        if sides > 0 and height > sigma:  # its offset is an error, which leaves its place on the line or plane
+            far = np.linalg.norm(points[frame] - points[other], axis=1).argsort()[1:]
+            rows += [distance(other, frame[at]) for at in far.tolist()]
+            fixed, error = sides, max(height / sides**0.5, sigma)
+        coefficient = np.array([-1.0, 1 - share.sum(), *share]) / error
+        rows.append(ShapeRow(np.array([other, *frame]), coefficient, 0.0, fixed))
     return rows
 
 

@@ -58,8 +58,8 @@ class Quarantine:
         Args:
             observations: (1, C, N).
             seconds: since the previous snapshot.
-            episode: successive snapshots that a passing error of these cameras may last. No case is made before that is
-                over, because the error may pass.
+            episode: successive snapshots that a passing error of one of these cameras may last, the least of all. No
+                case is made before that is over, because the error may pass.
         """
         self.seconds += seconds if self.seen else 0.0
         self.snapshots += 1

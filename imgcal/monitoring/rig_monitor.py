@@ -232,19 +232,20 @@ class RigMonitor:
         if not quarantine.cameras or quarantine.cameras != cameras:  # new ones have seen it already
             return found
         snapshot = observations, found.update.rig_from_object[-1:]
-        episode = max(self.noise.episode(camera, _shift(found.update.belief, snapshot, camera)) for camera in cameras)
+        episode = min(self.noise.episode(camera, _shift(found.update.belief, snapshot, camera)) for camera in cameras)
         if quarantine.observe(observations, seconds, episode):
             with contextlib.suppress(RefusedError):  # undecided, or they do not see enough
                 found = self._diagnose_quarantine(found)
         return replace(found, unsynchronized=quarantine.report_unsynchronized())
 
-    def _shifted_cameras(self, case: Case) -> tuple[int, ...]:
-        """Suspected cameras whose images are shifted by clearly more than persistent errors."""
+    def _shifted_cameras(self, case: Case, lasted: int) -> tuple[int, ...]:
+        """Suspected cameras whose images are shifted by clearly more than errors that last for so many snapshots."""
         found, least = [], self.noise.least_shifts
         for camera in case.cameras:
             seen = [one for one in case.latest if bool(one[0].seen[0, camera].any())]
             shifts = [_shift(case.before, snapshot, camera) for snapshot in seen]
-            if shifts and sorted(shifts)[len(shifts) // 2] >= least[camera]:
+            shift = sorted(shifts)[len(shifts) // 2] if shifts else 0.0
+            if shift >= least[camera] and self.noise.episode(camera, shift) <= max(lasted, 1):
                 found.append(camera)
         return tuple(found)
 
@@ -262,13 +263,14 @@ class RigMonitor:
         quarantine.unsynchronized = bool(verdict.best.finding.unsynchronized)
         if quarantine.unsynchronized:
             return found
+        lasted = quarantine.snapshots
         quarantine.release()
         if verdict.harmless and self._pending is None:
             # The belief allows for it, so learn it like any other snapshot. Otherwise the question would never be
             # settled.
             quiet = verdict.explained[Steady.name]
             return MonitorUpdate(self._restart(quiet.before, quiet.snapshots, case.pauses[-case.count :]))
-        if verdict.best.name == Moved.name and (moved := self._shifted_cameras(case)):
+        if verdict.best.name == Moved.name and (moved := self._shifted_cameras(case, lasted)):
             decided = self._decide_kinds(last=True)
             anew = self._learn_moved(case, dict.fromkeys(moved), JUMPS[-1], sum(case.pauses[-case.count :]))
             return replace(anew, changes=(*found.changes, *decided, *anew.changes))

@@ -262,7 +262,14 @@ def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject
             return trial, agreement, start + 1
         if agreement is not None and (best is None or agreement.score > best.score):
             best = agreement
-    raise RefusedError(_why(best, rig))
+    wider = "if cameras may have moved farther than the rig's prior says, "
+    raise _refusal(
+        best,
+        rig,
+        python=f"show fewer markers at once, or one light alone; {wider}widen it: replace(rig, prior=RigPrior(...))",
+        command=f"show fewer markers at once, or one light alone; {wider}write larger values under `prior` in the rig "
+        "file, or carry one light around and use --cameras",
+    )
 
 
 def _try_start(
@@ -319,27 +326,31 @@ def require_agreement(agreement: Agreement, rig: CameraRig) -> None:
         RefusedError: names the cameras, and how far they are from agreement.
     """
     if not bool(agreement.agrees.all()):
-        raise RefusedError(_why(agreement, rig))
+        advice = "carry one light alone through the view of all cameras"
+        raise _refusal(agreement, rig, python=advice, command=advice)
 
 
-def _why(agreement: Agreement | None, rig: CameraRig) -> str:
+def _refusal(agreement: Agreement | None, rig: CameraRig, *, python: str, command: str) -> RefusedError:
+    """Name the cameras that do not agree with the others, or cannot be judged; the advice is for the former."""
     if agreement is None:
-        return NOTHING
+        return RefusedError(NOTHING, python=python, command=command)
     unjudged = [rig.camera_names[c] for c in np.flatnonzero(~agreement.judged)]
     if unjudged and not (agreement.judged & ~agreement.agrees).any():
-        return (
+        return RefusedError(
             f"unknown markers: {name_cameras(unjudged)}: in the held-out snapshots, the other "
             "cameras find "
             f"too few markers in its view to judge it by (expected {LEAST_PREDICTED}): capture more, or leave it out"
         )
     bad = np.flatnonzero(agreement.judged & ~agreement.agrees)
     worst = int(bad[np.argmin(agreement.found[bad])])
-    return (
+    return RefusedError(
         f"unknown markers: {name_cameras(rig.camera_names[c] for c in bad)}: of {agreement.predicted[worst]} "
         f"markers that the other cameras find in view of {rig.camera_names[worst]}, in held-out snapshots, "
         f"{100 * max(agreement.found[worst], 0):.0f} % have a blob in their place and "
         f"{100 * max(agreement.near_misses[worst], 0):.0f} % one beside it: which blobs belong together cannot be "
-        "decided; show fewer markers at once, or give a more accurate rig"
+        "decided",
+        python=python,
+        command=command,
     )
 
 

@@ -1,13 +1,14 @@
-"""What `calibrate` writes about a printed board."""
+"""What `calibrate` writes about a printed board, and which of its files belongs to frames."""
 
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 import imgcal
 from imgcal.cli.main import main
-from imgcal.io import load_object, save_detections
+from imgcal.io import load_object, save_detections, save_object
 from imgcal.synthesis import simulate_board, true_detections
 
 
@@ -26,3 +27,24 @@ def test_a_board_whose_corners_are_off_still_gets_its_file(tmp_path, capsys):
     found = load_object(out / "board.yaml").board
     assert found is not None and found.columns == obj.board.columns and found.bend != (0.0, 0.0)
     assert load_object(out / "object.csv").num_fiducials == obj.num_fiducials
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("board") / "frames"
+    assert main(["simulate", "--rig", "T4", "--object", "charuco", "--snapshots", "1", "--out", str(folder)]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("command", ["score", "calibrate"])
+def test_frames_of_a_board_need_its_own_file(command, frames, tmp_path, capsys):
+    out, obj = tmp_path / "out", imgcal.load_object("charuco")
+    out.mkdir()
+    save_object(obj, out / "board.yaml")
+    save_object(replace(obj, board=None), out / "object.csv")
+    given = ["--rig", "T4", "--object", str(out / "object.csv")]
+    given += ["--out", str(tmp_path / "result")] if command == "calibrate" else []
+    assert main([command, str(frames), *given]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1 and str(out / "board.yaml") in said[0]
+    assert not (tmp_path / "result").exists()

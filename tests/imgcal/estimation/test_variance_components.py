@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association import associate
+from imgcal.association import PipelineOptions, associate
 from imgcal.errors import RefusedError
-from imgcal.estimation import variance_components
+from imgcal.estimation import EstimationOptions, variance_components
 from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate, fit_labelled, fitting
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
@@ -112,6 +112,14 @@ def test_what_does_not_come_to_rest_is_refused_after_forty_fits(monkeypatch) -> 
         endless += said
         counts.clear()
     assert endless >= 2
+
+
+def test_a_fit_that_is_slow_to_converge_is_continued(o10, asymmetric8):
+    labelled = associate(two_captures(o10, asymmetric8)[0], o10, asymmetric8)
+    hasty = PipelineOptions(estimation=EstimationOptions(max_iterations=2))
+    found, usual = fit_labelled(labelled, o10, asymmetric8, hasty), fit_labelled(labelled, o10, asymmetric8)
+    shift = found.rig.local(usual.rig).abs() / usual.estimate.problem.prior_std[0]
+    assert shift.max() < 0.02
 
 
 def test_ordinary_captures_come_to_rest_in_a_few_fits(o10, asymmetric8, monkeypatch) -> None:

@@ -17,7 +17,8 @@ SHAPES = {
 def derivative(points: np.ndarray) -> np.ndarray:
     """What small steps (3 n,) of the points change in the rows' sums or lengths."""
     rows = []
-    for which, by, length in shape_rows(points):
+    for row in shape_rows(points, 1.0):
+        which, by, length = row.column, row.coefficient, row.length
         total = by @ points[which]
         assert np.linalg.norm(total) == pytest.approx(length, abs=1e-9)
         full = np.zeros((3, len(points), 3))
@@ -35,6 +36,24 @@ def test_rows_leave_only_the_motions_of_a_rigid_body(name: str) -> None:
     turn = np.stack([np.cross(axis, points).ravel() for axis in np.eye(3)])
     shift = np.tile(np.eye(3), (1, len(points)))
     np.testing.assert_allclose(rows @ np.concatenate((turn, shift)).T, 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("shape", ["line", "plane"])
+def test_the_offset_of_a_marker_slightly_off_a_line_or_plane_is_an_error(shape: str) -> None:
+    flat, rank = SHAPES[shape]
+    points, away = flat.copy(), 0.2
+    points[-1] += away * np.linalg.svd(flat - flat.mean(0))[2][-1]
+    exact, near = shape_rows(flat, 1e-3), shape_rows(points, 1e-3)
+    assert sum(row.numbers for row in exact) == sum(row.numbers for row in near) == 3 * len(points) - rank
+    total, numbers = 0.0, 0
+    for row in near:
+        size = float(np.linalg.norm(row.coefficient @ points[row.column]))
+        if row.length:
+            assert size == pytest.approx(row.length)
+        elif size > 1e-6:
+            total, numbers = total + size**2, numbers + row.numbers
+    assert total == pytest.approx(numbers)  # as much as an error of one standard deviation in each direction
+    assert numbers > 0
 
 
 def test_rows_name_the_columns_of_lights_in_view() -> None:

@@ -5,10 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from imgcal import load_rig
 from imgcal.errors import RefusedError
 from imgcal.estimation import step_by_error
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring import RigBelief, absorb
+from imgcal.synthesis import PhysicalDrift, simulate_volume
 from imgcal.types import CalibrationObject, Observations
 from tests.imgcal.monitoring.lights import ROOM, lights_of
 from tests.imgcal.monitoring.made_snapshots import SQUARED, batch, made_snapshots, part, snapshots, worst
@@ -131,3 +133,24 @@ def test_lights_with_known_distances_say_what_the_rigid_object_says(kept) -> Non
         assert known.evidence == pytest.approx(expected.evidence, abs=1.0)
     alone = absorb(RigBelief.of_prior(factory, lights), seen, at)
     assert known.belief.scale_std() < 0.5 * alone.belief.scale_std()
+
+
+def test_a_marker_slightly_off_the_line_of_a_stick_does_not_keep_snapshots_from_fitting() -> None:
+    points = torch.tensor(((0.0, 0, 0), (159.6, 0.5, 0), (239.3, 0, 0))).double()
+    stick, factory = CalibrationObject(points, torch.ones(3, 3).double()), load_rig("room10")
+    generator, noise, count = torch.Generator().manual_seed(1), 0.3, 100
+    truth = simulate_volume(factory, stick, count, generator, PhysicalDrift())
+    uv = truth.uv + noise * torch.randn(truth.uv.shape, generator=generator, dtype=torch.float64)
+    given = Observations(uv, torch.full(uv.shape[:-1], noise).double(), truth.visible)
+    start = truth.rig_from_object.apply(points) + 0.5 * torch.randn(count, 3, 3, generator=generator).double()
+    lights, seen, at = lights_of(given, start)
+    known = [*range(ROOM, ROOM + 3), *range(ROOM)]  # known markers come first
+    seen = Observations(seen.uv[:, :, known], seen.sigma[:, :, known], seen.seen[:, :, known])
+    at = RigidTransform(at.rotation, at.translation[:, known])
+    lights = replace(lights, parts=(stick, CalibrationObject.unknown(most=ROOM)))
+    belief = RigBelief.of_prior(factory, lights)
+    for snapshot in range(60):
+        found = absorb(belief, part(seen, snapshot, snapshot + 1), at[snapshot : snapshot + 1])
+        there = found.rig_from_object.translation[0, :3]
+        torch.testing.assert_close(torch.cdist(there, there), torch.cdist(points, points), rtol=0, atol=2e-2)
+        belief = found.belief

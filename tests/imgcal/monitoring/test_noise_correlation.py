@@ -57,13 +57,13 @@ def test_errors_that_last_count_by_their_effective_number() -> None:
     weighed = noise.weigh(observations())
     assert torch.allclose(weighed.sigma[0, 0], SIGMA * noise.time[0].sqrt())
     assert 0.7 * SIGMA < float(noise.lasting[0]) < 1.3 * SIGMA
-    assert noise.episodes[0] == max(math.ceil(2 * float(noise.time[0])), 24)  # 0.4 s at 60 Hz
+    assert noise.episodes[0] == max(math.ceil(2 * float(noise.time[0])), 60)  # 1 s at 60 Hz
 
 
 def test_passing_errors_last_for_seconds_whatever_the_rate() -> None:
     noise = follow([0.9, 0.9])
     noise.time[:] = 1.5
-    for seconds, episode in ((1 / 60, 24), (1 / 30, 12), (0.1, 4), (0.5, 3)):
+    for seconds, episode in ((1 / 60, 60), (1 / 30, 30), (0.1, 10), (0.5, 3)):
         noise.interval = 0.0
         noise.pass_time(seconds)
         assert noise.episodes == [episode] * 2
@@ -74,7 +74,7 @@ def test_passing_errors_last_for_seconds_whatever_the_rate() -> None:
 def test_a_large_error_passes_in_less_time_than_the_correlation_of_small_ones() -> None:
     noise = follow([0.98, 0.98], count=MEMORY_SNAPSHOTS)
     usual = float(noise.model_error[0])
-    assert noise.episode(0, 3 * usual) == noise.episodes[0] > 24
+    assert noise.episode(0, 3 * usual) == noise.episodes[0] >= 60
     assert noise.episode(0, 30 * usual) == 24
 
 

@@ -288,6 +288,8 @@ def test_of_two_cameras_in_quarantine_only_the_one_whose_image_is_shifted_has_mo
     monitor.noise.time = torch.full((4,), 2.0, dtype=torch.float64)
     for number in range(120):
         off = (1, 2) if number == 60 else ()
-        told += monitor.update(seen.of_snapshots([number]), poses[number : number + 1], 1 / 60, moved=off).changes
-    assert {change.camera for change in told} == {1}
+        found = monitor.update(seen.of_snapshots([number]), poses[number : number + 1], 1 / 60, moved=off)
+        told += [(number, change.camera) for change in found.changes]
+    assert {camera for _, camera in told} == {1}
+    assert told[0][0] <= 60 + 30  # half a second: the error of camera 2 may pass for longer
     assert not monitor.quarantine.cameras

@@ -85,7 +85,7 @@ def test_a_rig_that_is_learnt_anew_is_no_motion_of_the_object() -> None:
 def test_a_few_snapshots_of_a_camera_say_nothing_of_its_clock() -> None:
     test, events = ClockOffsets(4), []
     for number in range(90):  # camera 2 is late for a fifth of a second, and then sees nothing
-        state = state_at(number, number / 20, lambda camera, late=10 <= number: 0.01 * (late and camera == 2))
+        state = state_at(number, number / 20, lambda camera, late=number >= 10: 0.01 * (late and camera == 2))
         if number >= 14:
             rows = np.flatnonzero(state.detections.camera != 2)
             state = replace(state, detections=state.detections.select(rows), lag=state.lag[rows])
