@@ -28,7 +28,6 @@ from imgcal.estimation.levenberg_marquardt import (
 from imgcal.estimation.linearization import NormalEquations, ObjectEquations, Problem, State
 from imgcal.estimation.linearization_cpu import (
     given_values,
-    linearize_all,
     linearize_rig,
     move,
     select_blocks,
@@ -127,9 +126,12 @@ def linearize(problem: Problem, state: State, loss: str, threshold: float) -> No
     """Do the work of `linearization.linearize` for tensors on the CPU, without gradients; the loss as in `minimize`."""
     own_std, state = _object_spread(problem, state, len(problem.uv))
     blocks = _Blocks.of(problem, len(problem.uv))
-    given = (*shared_arrays(problem), *_arrays((*_problem_arrays(problem), own_std)))
-    arrays = (_arrays(_parts(state)), _arrays(blocks.parts), *_arrays((blocks.cost,)))
-    linearize_all(given, *arrays, blocks.cameras_first, LOSS_CODES[loss], threshold)  # type: ignore[call-arg]
+    shared, given = shared_arrays(problem), _arrays((*_problem_arrays(problem), own_std))
+    states, parts, cost = _arrays(_parts(state)), _arrays(blocks.parts), blocks.cost.numpy()
+    limits, steady = (blocks.cameras_first, LOSS_CODES[loss], threshold), np.empty((0, 0))
+    for b in range(len(cost)):  # no compiled loop, which would contain all of `linearize_rig` once more
+        given_here, state_here, blocks_here = (tuple(array[b] for array in arrays) for arrays in (given, states, parts))
+        cost[b] = linearize_rig((*shared, *given_here), state_here, blocks_here, *limits, steady)
     return blocks.equations()
 
 
@@ -259,7 +261,7 @@ def _arrays(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:
 def _minimize_all(given, state, blocks, cost, converged, iterations, limits, tolerances):
     """Run Levenberg-Marquardt on all rigs of a batch; the outputs receive the best states and their equations."""
     for row in prange(len(cost)):
-        b = np.int64(row)  # as in `linearize_all`: for the unsigned number, all would be compiled once more
+        b = np.int64(row)  # for the unsigned number, all would be compiled once more
         own, found = select_state(state, b), select_blocks(blocks, b)
         offset, rotation, centre, own_offset = own
         camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual = found

@@ -27,22 +27,6 @@ SHIFTS = 50
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def linearize_all(given, state, blocks, cost, cameras_first, loss, threshold):
-    """Fill the blocks and the costs of all rigs of a batch."""
-    steady = np.empty((0, 0))
-    for b in range(len(cost)):
-        cost[b] = linearize_rig(
-            given_values(given, b),
-            select_state(state, b),
-            select_blocks(blocks, b),
-            cameras_first,
-            loss,
-            threshold,
-            steady,
-        )
-
-
-@njit(cache=True, fastmath=kernels.FAST)
 def given_values(given, b):
     """Select the inputs of one rig; the points and their radii are shared by all."""
     (

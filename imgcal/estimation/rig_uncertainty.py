@@ -19,6 +19,8 @@ from imgcal.types import CameraRig
 
 ROUNDS = 3
 """Alignments in all; after the first, points are weighted by the errors that the previous one leaves."""
+POINTS_AT_ONCE = 512
+"""Points whose errors are computed together, so that their Jacobians stay in the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +82,15 @@ class RigUncertainty:
         Returns:
             (C, P) px, (P,) mm, (P,) mm with noise.
         """
-        pixels = pixel_jacobian(self.rig, points)
-        triangulation, by_noise = _triangulation(pixels, seen)
-        variance = _point_variance(triangulation, self.mm_covariance)
-        noisy = _length(variance + noise**2 * by_noise, seen)
-        return _pixel_error(pixels, self.px_covariance), _length(variance, seen), noisy
+        parts = []
+        for some, those in zip(points.split(POINTS_AT_ONCE), seen.split(POINTS_AT_ONCE, 1), strict=True):
+            pixels = pixel_jacobian(self.rig, some)
+            triangulation, by_noise = _triangulation(pixels, those)
+            variance = _point_variance(triangulation, self.mm_covariance)
+            noisy = _length(variance + noise**2 * by_noise, those)
+            parts.append((_pixel_error(pixels, self.px_covariance), _length(variance, those), noisy))
+        px, mm, mm_with_noise = (torch.cat(part, -1) for part in zip(*parts, strict=True))
+        return px, mm, mm_with_noise
 
 
 def _pixel_error(pixels: Tensor, covariance: Tensor) -> Tensor:
@@ -125,6 +131,7 @@ def uncertainty_over(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigU
     by_motion = motion.unflatten(0, (rig.num_cameras, -1))
     px_moved, mm_moved = px_rows @ by_motion, mm_rows @ motion
     mm_spread = mm_rows @ covariance
+    mm_variance = (mm_spread * mm_rows).sum(-1)
 
     def align() -> tuple[Tensor, Tensor]:
         """Covariance after the alignment in pixels, and the map from errors to the motion of the one in mm."""
@@ -137,25 +144,25 @@ def uncertainty_over(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigU
     for _ in range(ROUNDS - 1):
         # The weights only need the error that remains after the previous alignment.
         px_weight = _weight(_pixel_error(pixels, px_covariance), seen)
-        variance = _aligned_variance(mm_rows, mm_spread, mm_moved, mm_best, covariance)
+        variance = _aligned_variance(mm_variance, mm_spread, mm_moved, mm_best, covariance)
         mm_weight = _weight(_length(variance.unflatten(0, (-1, 3)).sum(-1), seen), shared)
         px_covariance, mm_best = align()
     mm_covariance = _remove_motion(covariance, motion, mm_best)
     return RigUncertainty(rig, covariance, points, px_weight, mm_weight, px_covariance, mm_covariance)
 
 
-def _aligned_variance(rows: Tensor, spread: Tensor, moved: Tensor, best: Tensor, covariance: Tensor) -> Tensor:
+def _aligned_variance(variance: Tensor, spread: Tensor, moved: Tensor, best: Tensor, covariance: Tensor) -> Tensor:
     """Variance (R,) of linear functions (R, K C) of the parameters after removing the motion that `best` extracts.
 
     Args:
-        rows: derivatives with respect to the parameters.
-        spread: (R, K C) rows times the covariance.
-        moved: (R, 6) rows times the motion.
+        variance: (R,) before.
+        spread: (R, K C) derivatives with respect to the parameters, times the covariance.
+        moved: (R, 6) derivatives times the motion.
         best: (6, K C), see `_best_motion`.
         covariance: (K C, K C).
     """
     across, own = spread @ best.mT, best @ covariance @ best.mT
-    return (spread * rows).sum(-1) + ((moved @ own - 2 * across) * moved).sum(-1)
+    return variance + ((moved @ own - 2 * across) * moved).sum(-1)
 
 
 def _weight(error: Tensor, valid: Tensor) -> Tensor:
