@@ -73,6 +73,10 @@ class Quarantine:
         due = self.sightings in CASE_AFTER or self.sightings % CASE_EVERY == 0
         return due and not self.passing and self.sightings >= self.least
 
+    def expect_passing(self) -> None:
+        """Wait for another episode: an error begins after these cameras have seen the object in its place."""
+        self.snapshots, self.passing = 0, True
+
     def _is_sighting(self, observations: Observations) -> bool:
         return bool(observations.seen[:, list(self.cameras)].any())
 

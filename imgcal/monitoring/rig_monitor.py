@@ -231,12 +231,25 @@ class RigMonitor:
         found = self._follow(drop_cameras(observations, cameras), rig_from_object, seconds)
         if not quarantine.cameras or quarantine.cameras != cameras:  # new ones have seen it already
             return found
-        snapshot = observations, found.update.rig_from_object[-1:]
-        episode = min(self.noise.episode(camera, _shift(found.update.belief, snapshot, camera)) for camera in cameras)
+        snapshot, belief = (observations, found.update.rig_from_object[-1:]), found.update.belief
+        if any(self._error_begins(belief, snapshot, camera) for camera in cameras):
+            quarantine.expect_passing()
+        episode = min(self.noise.episode(camera, _shift(belief, snapshot, camera)) for camera in cameras)
         if quarantine.observe(observations, seconds, episode):
             with contextlib.suppress(RefusedError):  # undecided, or they do not see enough
                 found = self._diagnose_quarantine(found)
         return replace(found, unsynchronized=quarantine.report_unsynchronized())
+
+    def _error_begins(self, belief: RigBelief, snapshot: Snapshot, camera: int) -> bool:
+        """Tell whether a camera in quarantine saw the object in its place last time, and does not see it there now."""
+        least = self.noise.least_shifts[camera]
+        if _shift(belief, snapshot, camera) < least:
+            return False
+        poses = [pose for _, pose in self._recent.latest(len(self._recent))[0]]
+        for earlier in zip(reversed(self.quarantine.seen), reversed(poses[:-1]), strict=False):
+            if bool(earlier[0].seen[0, camera].any()):
+                return _shift(belief, earlier, camera) < least
+        return False
 
     def _shifted_cameras(self, case: Case, lasted: int) -> tuple[int, ...]:
         """Suspected cameras whose images are shifted by clearly more than errors that last for so many snapshots."""

@@ -288,6 +288,22 @@ def test_a_camera_that_was_held_and_surely_stands_still_is_learnt_from_what_it_s
     assert not monitor.quarantine.cameras and learnt == [1]
 
 
+def test_an_error_that_begins_in_quarantine_may_pass_too() -> None:
+    """The camera was in its place meanwhile, so the time before the error says nothing about how long it lasts."""
+    made = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 4, Conditions(labelled=True))
+    poses = made.poses_at(torch.arange(240, dtype=torch.float64) / 60)
+    seen, _ = made.labelled(0, 240)
+    seen.uv[95:110, 2] += 2.5
+    monitor, told = RigMonitor(RigFilter(made.factory, made.obj)), []
+    monitor.noise.usual = 2.0  # errors last, as on real streams
+    monitor.noise.time = torch.full((4,), 2.0, dtype=torch.float64)
+    for number in range(240):
+        off = (2,) if number == 60 else ()
+        told += monitor.update(seen.of_snapshots([number]), poses[number : number + 1], 1 / 60, moved=off).changes
+    assert told == []
+    assert not monitor.quarantine.cameras
+
+
 def test_of_two_cameras_in_quarantine_only_the_one_whose_image_is_shifted_has_moved() -> None:
     """The labels of camera 2 do not fit for one snapshot, and fit again when the case is decided."""
     bump = Bump(60, 1, "rotation", math.radians(0.1))
