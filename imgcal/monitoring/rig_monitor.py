@@ -283,16 +283,17 @@ class RigMonitor:
             # settled.
             quiet = verdict.explained[Steady.name]
             return MonitorUpdate(self._restart(quiet.before, quiet.snapshots, case.pauses[-case.count :]))
-        if verdict.best.name == Moved.name and (moved := self._shifted_cameras(case, lasted)):
+        shifted = self._shifted_cameras(case, lasted)
+        if verdict.best.name == Moved.name and shifted:
             decided = self._decide_kinds(last=True)
-            anew = self._learn_moved(case, dict.fromkeys(moved), JUMPS[-1], sum(case.pauses[-case.count :]))
+            anew = self._learn_moved(case, dict.fromkeys(shifted), JUMPS[-1], sum(case.pauses[-case.count :]))
             return replace(anew, changes=(*found.changes, *decided, *anew.changes))
         if verdict.best.name == LensMisfit.name:
             best = verdict.best
             return MonitorUpdate(self._restart(best.before, best.snapshots, case.pauses[-case.count :]), found.changes)
         if verdict.best.finding.slips and len(verdict.best.snapshots) > case.count:  # late from the beginning
             return replace(self._adopt(case, verdict), changes=found.changes)
-        return replace(found, slips=self._clock_slips(verdict))
+        return replace(found, slips=tuple(slip for slip in self._clock_slips(verdict) if slip.camera in shifted))
 
     def _diagnose_alarm(self, age: int, changes: list[Change]) -> MonitorUpdate:
         """Diagnose what has happened before the latest snapshots, since which cameras seem to have changed.
