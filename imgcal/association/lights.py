@@ -315,8 +315,8 @@ def predicted_misses(
         far: standard deviations within which it is a near miss.
 
     Returns:
-        Number of markers in the camera's view; the share with a blob in place, and the share whose nearest blob is a
-        near miss, both less the chance level at shifted places.
+        Number of markers in the camera's view; the share with a blob in place, and the share whose nearest blob that
+        is not in another one's place is a near miss, both less the chance level at shifted places.
     """
     blobs = sort_blobs(detections, rig)
     one, focal = rig.select([camera]), float(rig.focal_length[camera].mean())
@@ -330,21 +330,27 @@ def predicted_misses(
     xy = (there[:, :2] / there[:, 2:]).numpy()
     sigma = error[camera] * np.sqrt(1 + _uncertainty(lights, rig, camera))
     shifted = xy[:, None] + np.array([(0.0, 0.0), *SHIFTS]) / focal  # (R, 1 + shifts, 2)
-    least = np.full((1 + len(SHIFTS), len(xy)), np.inf)  # standard deviations to the nearest blob
-    for row in np.flatnonzero(inside):
-        own = slice(blobs.start[lights.moment[row], camera], blobs.start[lights.moment[row], camera + 1])
-        away = np.hypot(*(blobs.xy[own][:, None] - shifted[row]).transpose(2, 0, 1)) * focal / sigma[row]
-        least[:, row] = away.min(axis=0, initial=np.inf)
+    least = np.full((2, 1 + len(SHIFTS), len(xy)), np.inf)  # standard deviations to the nearest blob, as counted below
+    for moment in np.unique(lights.moment[inside]):
+        rows = np.flatnonzero(inside & (lights.moment == moment))
+        own = slice(blobs.start[moment, camera], blobs.start[moment, camera + 1])
+        away = np.linalg.norm(blobs.xy[own] - shifted[rows][:, :, None], axis=-1)  # (rows, 1 + shifts, blobs)
+        away *= (focal / sigma[rows])[:, None, None]
+        least[0, :, rows] = away.min(axis=-1, initial=np.inf)
+        in_place = away[:, 0] < near
+        away[np.broadcast_to((in_place.any(0) & ~in_place)[:, None], away.shape)] = np.inf  # the blob of another marker
+        least[1, :, rows] = away.min(axis=-1, initial=np.inf)
     total = int(inside.sum())
     if total == 0:
         return 0, 0.0, 0.0
-    least = least[:, inside]
-    share = np.stack(((least < near).mean(1), ((near <= least) & (least < far)).mean(1)), 1)
+    nearest, not_of_others = least[..., inside]
+    beside = (nearest >= near) & (near <= not_of_others) & (not_of_others < far)
+    share = np.stack(((nearest < near).mean(1), beside.mean(1)), 1)
     chance = share[1:].mean(0)
     found = (share[0, 0] - chance[0]) / max(1 - chance[0], 1e-9)
     # A near miss counts only if no blob is in place.
-    beside = share[0, 1] - chance[1] * (1 - share[0, 0]) / max(1 - chance[0], 1e-9)
-    return total, float(found), float(beside)
+    missed = share[0, 1] - chance[1] * (1 - share[0, 0]) / max(1 - chance[0], 1e-9)
+    return total, float(found), float(missed)
 
 
 def _uncertainty(lights: Lights, rig: CameraRig, camera: int) -> Array:

@@ -56,7 +56,9 @@ NEAR, FAR = 4.0, 24.0
 LEAST_PREDICTED = 10
 """Minimum number of predicted markers for judging a camera."""
 LEAST_SHARE = 0.25
-"""Minimum share of a camera's predicted markers with a blob in place, corrected for chance."""
+"""Minimum share of a camera's predicted markers with a blob in place, corrected for chance ..."""
+HIDDEN_SHARE, LEAST_FOUND = 0.12, 8.0
+"""... or this share, if it is at least so many markers: a body hides the markers on its other side."""
 LEAST_NEAR = 0.8
 """Minimum share, among blobs near predicted markers, of those in place; corrected for chance."""
 LEAST_MARGIN = 5.0
@@ -89,7 +91,8 @@ class Agreement:
     def agrees(self) -> NDArray[np.bool_]:
         """Which cameras agree with the others: (C,)."""
         near = self.found >= LEAST_NEAR * (self.found + np.maximum(self.near_misses, 0))
-        return self.judged & (self.found >= LEAST_SHARE) & near
+        many = (self.found >= HIDDEN_SHARE) & (self.found * self.predicted >= LEAST_FOUND)
+        return self.judged & ((self.found >= LEAST_SHARE) | many) & near
 
     @property
     def score(self) -> float:

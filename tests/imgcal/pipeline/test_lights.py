@@ -9,6 +9,7 @@ import torch
 import imgcal
 from imgcal import InputError, RefusedError
 from imgcal.association import associate
+from imgcal.geometry import rotation_from_vector
 from imgcal.pipeline.motion_check import _prepend_earlier
 from scripts.benchmarks.lights import LIGHTS, Scene, simulate, triangulation_error
 from tests.imgcal.association.stick_scenes import BODY, capture, several
@@ -183,3 +184,35 @@ def test_an_error_that_ends_is_no_motion() -> None:
     assert triangulation_error(found.rig, scene) < 1
     with pytest.raises(RefusedError, match=r"cam05 moved before snapshot 000(39|40|41).* all 60 snapshots"):
         imgcal.calibrate(shifted(scene, 4, range(40, 60)), scene.factory, LIGHTS)
+
+
+def opaque_body(rig: imgcal.CameraRig, moments: int, seed: int) -> imgcal.Detections:
+    """Blobs of twenty markers on a ball of 300 mm that is carried around and turned; it hides those behind it."""
+    random = np.random.default_rng(seed)
+    normal = random.standard_normal((20, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    assert rig.volume is not None
+    low, high = np.array(rig.volume.low), np.array(rig.volume.high)
+    centre = (low + high) / 2 + 0.3 * (high - low) * random.uniform(-1, 1, (moments, 3))
+    turns = rotation_from_vector(torch.from_numpy(random.uniform(-1.5, 1.5, (moments, 3)))).numpy()
+    normals = normal @ turns.transpose(0, 2, 1)  # (S, N, 3)
+    points = centre[:, None] + 300 * normals
+    to_camera = rig.positions.numpy()[:, None, None] - points  # (C, S, N, 3)
+    facing = (to_camera * normals).sum(-1) > 0.1 * np.linalg.norm(to_camera, axis=-1)
+    image = rig.project(torch.from_numpy(points.reshape(-1, 3)))
+    shown = image.visible.numpy().reshape(facing.shape) & facing & (random.random(facing.shape) > 0.1)
+    camera, snapshot, marker = np.nonzero(shown)
+    uv = image.uv.numpy().reshape(*facing.shape, 2)[camera, snapshot, marker]
+    order = np.lexsort((random.random(len(uv)), camera, snapshot))
+    uv = (uv + 0.1 * random.standard_normal(uv.shape))[order]
+    count, names = len(uv), tuple(f"{number:05d}" for number in range(moments))
+    return imgcal.Detections(
+        uv, np.full(count, 0.1), camera[order], snapshot[order], np.full(count, -1), np.full(count, np.nan),
+        np.zeros(count, np.uint8), rig.camera_names, names,
+    )  # fmt: skip
+
+
+def test_markers_that_a_body_hides_from_half_of_the_cameras_calibrate(scene: Scene) -> None:
+    """Few of the markers that the others find are in view of a camera on the other side; those few are in place."""
+    found = imgcal.calibrate(opaque_body(scene.rig, 60, seed=0), scene.factory, LIGHTS)
+    assert triangulation_error(found.rig, scene) < 0.4 * triangulation_error(scene.factory, scene)
