@@ -145,7 +145,8 @@ def missed_gates() -> str:
             f"{100 * replayed['beyond_3_sigma']:.1f} % of the estimates are off by more than three standard deviations "
             "(target: 1 %)."
         )
-    first = "With replayed noise, these targets are missed. " if missed else ""
+    targets = "one target is" if len(missed) == 1 else "these targets are"
+    first = f"With replayed noise, {targets} missed. " if missed else ""
     return (
         f"{first}{' '.join(missed)}\nLens models that are wrong by 0.05 px over hundreds of pixels "
         f"caused {lens['alarms']} false alarms in {lens['snapshots']:,} snapshots."
