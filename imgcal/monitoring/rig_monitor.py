@@ -232,18 +232,19 @@ class RigMonitor:
         if not quarantine.cameras or quarantine.cameras != cameras:  # new ones have seen it already
             return found
         snapshot, belief = (observations, found.update.rig_from_object[-1:]), found.update.belief
-        if any(self._error_begins(belief, snapshot, camera) for camera in cameras):
+        shifts = {camera: _shift(belief, snapshot, camera) for camera in cameras}
+        if any(self._error_begins(belief, camera, shift) for camera, shift in shifts.items()):
             quarantine.expect_passing()
-        episode = min(self.noise.episode(camera, _shift(belief, snapshot, camera)) for camera in cameras)
+        episode = min(self.noise.episode(camera, shift) for camera, shift in shifts.items())
         if quarantine.observe(observations, seconds, episode):
             with contextlib.suppress(RefusedError):  # undecided, or they do not see enough
                 found = self._diagnose_quarantine(found)
         return replace(found, unsynchronized=quarantine.report_unsynchronized())
 
-    def _error_begins(self, belief: RigBelief, snapshot: Snapshot, camera: int) -> bool:
-        """Tell whether a camera in quarantine saw the object in its place last time, and does not see it there now."""
+    def _error_begins(self, belief: RigBelief, camera: int, shift: float) -> bool:
+        """Tell whether a camera in quarantine, `shift` pixels off now, saw the object in its place last time."""
         least = self.noise.least_shifts[camera]
-        if _shift(belief, snapshot, camera) < least:
+        if shift < least:
             return False
         poses = [pose for _, pose in self._recent.latest(len(self._recent))[0]]
         for earlier in zip(reversed(self.quarantine.seen), reversed(poses[:-1]), strict=False):
