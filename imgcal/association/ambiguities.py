@@ -103,13 +103,23 @@ def displacement(uv: NDArray[np.float64], motion: Ambiguity) -> NDArray[np.float
     return np.median(np.linalg.norm(uv[:, motion.permutation[falls]] - uv[:, falls], axis=-1), axis=1)
 
 
-def conflicts(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]) -> float:
-    """Share of commonly labelled blobs that two labellings (C, N) name differently, up to the object's symmetry.
+def conflicts(
+    obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Share of commonly labelled blobs that labellings name differently, up to the object's symmetry.
 
     Labellings without a common blob conflict completely.
+
+    Args:
+        obj: the calibration object.
+        first: (C, N) blob of each fiducial, -1 = none.
+        second: (..., C, N) likewise.
+
+    Returns:
+        Shares (...), from 0 to 1.
     """
-    common = max(int(common_blobs(first, second).sum()), 1)
-    return min(1 - int(agreed.sum()) / common for agreed in _count_agreements(obj, first, second))
+    common = np.maximum(common_blobs(first, second).sum(-1), 1)
+    return 1 - np.max([agreed.sum(-1) for agreed in _count_agreements(obj, first, second)], axis=0) / common
 
 
 def differ(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]) -> bool:
@@ -129,8 +139,8 @@ def differ(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.
 def _count_agreements(
     obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]
 ) -> list[NDArray[np.int64]]:
-    """Number of blobs that two labellings name alike, for each camera (C,) and symmetry."""
-    return [((first >= 0) & (first == second[:, motion.permutation])).sum(1) for motion in obj.symmetries]
+    """Number of blobs that labellings (C, N) and (..., C, N) name alike, for each camera (..., C) and symmetry."""
+    return [((first >= 0) & (first == second[..., motion.permutation])).sum(-1) for motion in obj.symmetries]
 
 
 def _map_onto(points: NDArray[np.float64], images: NDArray[np.float64], tolerance: float) -> NDArray[np.int64]:
@@ -139,8 +149,8 @@ def _map_onto(points: NDArray[np.float64], images: NDArray[np.float64], toleranc
 
 
 def common_blobs(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Number of blobs that both labellings name, for each camera: (C,)."""
-    named = np.zeros((2, len(first), max(first.max(), second.max()) + 2), dtype=bool)
-    cameras = np.arange(len(first))[:, None]
-    named[0, cameras, first], named[1, cameras, second] = True, True  # label -1 lands in the last column
-    return named[..., :-1].all(0).sum(-1)
+    """Number of blobs that labellings (C, N) and (..., C, N) both name, for each camera: (..., C)."""
+    named = np.zeros((len(first), max(first.max(), second.max(initial=-1)) + 2), dtype=bool)
+    named[np.arange(len(first))[:, None], first] = True
+    named[:, -1] = False  # where label -1 lands
+    return named[np.arange(len(first))[:, None], second].sum(-1)

@@ -205,11 +205,10 @@ def distinct(
     obj: CalibrationObject, rows: NDArray[np.int64], labels: NDArray[np.int64], most: int = VERIFIED
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Keep at most `most` of the fullest labellings (K, C, N) that differ in most labels."""
-    order = np.argsort(-(labels >= 0).sum((1, 2)), kind="stable")
+    left = np.argsort(-(labels >= 0).sum((1, 2)), kind="stable")
     kept: list[int] = []
-    for k in order:
-        if all(conflicts(obj, labels[other], labels[k]) > 0.5 for other in kept):
-            kept.append(int(k))
-        if len(kept) == most:
-            break
+    while len(left) and len(kept) < most:
+        kept.append(int(left[0]))
+        left = left[1:]
+        left = left[conflicts(obj, labels[kept[-1]], labels[left]) > 0.5]
     return rows[kept], labels[kept]

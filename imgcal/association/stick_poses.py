@@ -6,7 +6,7 @@ ends of a stick alike, and hardly changes its length. The whole rig votes on the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import combinations
 
 import numpy as np
@@ -17,6 +17,7 @@ from imgcal.association.hypotheses import Poses
 from imgcal.association.search import distinct
 from imgcal.association.verification import Fits, Scene, refine, start
 from imgcal.association.voting import match, predict_ideal, vote
+from imgcal.medians import median
 
 Array = NDArray[np.float64]
 
@@ -30,6 +31,8 @@ MOST_VOTED = 200
 """Number of the best of these to label."""
 FITTED = 6
 """Number of different labellings to fit: the best one and its rivals."""
+MOST_COMPARED = 1_000_000
+"""Pairs of meetings to compare at once."""
 BEND = 0.02
 """Radians, error of poses from two cameras, even for perfect ones."""
 
@@ -42,6 +45,20 @@ class _Eyes:
     position: Array  # (C, 3) mm
     error: Array  # (C,) rad
     count: NDArray[np.int64]  # (C,) blobs
+
+
+@dataclass(frozen=True)
+class _Meetings:
+    """Points where rays of two cameras nearly meet, one pair of cameras after the other."""
+
+    place: Array  # (P, 3) mm
+    pair: NDArray[np.int64]  # (P,) number of the pair of cameras, ascending
+    blobs: NDArray[np.int64]  # (P, 2) blob of either camera
+    slack: Array  # (P,) relative error of a length between points of this pair
+
+    def select(self, rows: NDArray[np.int64]) -> _Meetings:
+        """Keep the given rows."""
+        return _Meetings(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 def fit_sticks(scene: Scene, seed: int) -> Fits | None:
@@ -89,49 +106,61 @@ def _eyes(scene: Scene) -> tuple[_Eyes, float]:
 def _candidates(scene: Scene, eyes: _Eyes, distance: float, generator: np.random.Generator) -> tuple[Poses, float]:
     """Poses from all pairs of cameras, and their usual distance from the cameras: mm."""
     points = scene.obj.points.double().numpy()
-    pairs = [pair for pair in combinations(range(len(eyes.position)), 2) if eyes.count[list(pair)].min() >= 2]
-    symmetric = len(scene.obj.symmetries) > 1
-    found: list[tuple[Array, Array, int, int]] = []
-    for first, second in pairs:
-        at, blobs, slack = _meetings(eyes, first, second)
-        if len(at) < 2:
-            continue
-        apart = np.linalg.norm(at[:, None] - at, axis=-1)
-        different = (blobs[:, None] != blobs).all(-1)
-        for m, n in combinations(range(len(points)), 2):
-            length = float(np.linalg.norm(points[m] - points[n]))
-            a, b = np.nonzero(different & (np.abs(apart - length) < slack * length))
-            if symmetric and len(points) == 2:
-                a, b = a[a < b], b[a < b]
-            found += [(at[a], at[b], m, n)] if len(a) else []
-    if not found:
-        return Poses(np.empty((0, 3, 3)), np.empty((0, 3))), distance
-    parts = [_poses(points[[m, n]], a, b) for a, b, m, n in found]
-    poses = Poses(np.concatenate([p.rotation for p in parts]), np.concatenate([p.translation for p in parts]))
+    alike = len(scene.obj.symmetries) > 1 and len(points) == 2
+    poses, meetings = Poses(np.empty((0, 3, 3)), np.empty((0, 3))), _meetings(eyes)
+    portion = np.cumsum(np.bincount(meetings.pair) ** 2)[meetings.pair] // MOST_COMPARED
+    for rows in np.split(np.arange(len(portion)), np.flatnonzero(np.diff(portion)) + 1):
+        poses += _poses_at(points, meetings.select(rows), alike)
+    if not len(poses):
+        return poses, distance
     if len(poses) > MOST_POSES:
         poses = poses.select(np.sort(generator.permutation(len(poses))[:MOST_POSES]))
     centre = np.median(poses.rotation @ points.mean(0) + poses.translation, axis=0)
     return poses, float(np.linalg.norm(eyes.position - centre, axis=1).mean())
 
 
-def _meetings(eyes: _Eyes, first: int, second: int) -> tuple[Array, NDArray[np.int64], float]:
-    """Points where rays of two cameras nearly meet: (P, 3), the blobs (P, 2), and the relative error of a length."""
-    d1, d2 = eyes.rays[first, : eyes.count[first], None], eyes.rays[second, None, : eyes.count[second]]
-    base = eyes.position[second] - eyes.position[first]
-    cosine = (d1 * d2).sum(-1)
-    sine = np.maximum(1 - cosine**2, 1e-12)
-    along1 = ((d1 @ base) - (d2 @ base) * cosine) / sine
-    along2 = ((d1 @ base) * cosine - (d2 @ base)) / sine
-    one = eyes.position[first] + along1[..., None] * d1
-    other = eyes.position[second] + along2[..., None] * d2
-    reach = REACH * np.hypot(along1 * eyes.error[first], along2 * eyes.error[second])
-    good = (along1 > 0) & (along2 > 0) & (sine > 1e-3) & (np.linalg.norm(one - other, axis=-1) < reach)
-    i, k = np.nonzero(good)
-    if not len(i):
-        return np.empty((0, 3)), np.empty((0, 2), dtype=np.int64), 0.0
-    steep = float(np.median(sine[good])) ** 0.5
-    error = float(np.hypot(eyes.error[first], eyes.error[second])) / steep
-    return 0.5 * (one + other)[good], np.stack((i, k), 1), max(LEAST_LENGTH_ERROR, REACH * error)
+def _meetings(eyes: _Eyes) -> _Meetings:
+    """Find where rays of any two cameras nearly meet."""
+    cameras, most = eyes.rays.shape[:2]
+    valid = (np.arange(most) < eyes.count[:, None]) & (eyes.count[:, None] >= 2)
+    found = [_Meetings(np.empty((0, 3)), *(np.empty((0, *shape), dtype=np.int64) for shape in ((), (2,))), np.empty(0))]
+    for first in range(cameras - 1):
+        later = slice(first + 1, None)
+        d1, d2 = eyes.rays[first][:, None], eyes.rays[later, None]  # (M, 1, 3), (K, 1, M, 3)
+        base = (eyes.position[later] - eyes.position[first])[:, None, None]
+        cosine, base1, base2 = (d1 * d2).sum(-1), (d1 * base).sum(-1), (d2 * base).sum(-1)
+        sine = np.maximum(1 - cosine**2, 1e-12)
+        along1, along2 = (base1 - base2 * cosine) / sine, (base1 * cosine - base2) / sine
+        one = eyes.position[first] + along1[..., None] * d1
+        other = eyes.position[later, None, None] + along2[..., None] * d2
+        errors = eyes.error[later]
+        reach = REACH * np.hypot(along1 * eyes.error[first], along2 * errors[:, None, None])
+        good = valid[first][:, None] & valid[later, None] & (along1 > 0) & (along2 > 0) & (sine > 1e-3)
+        good &= np.linalg.norm(one - other, axis=-1) < reach
+        steep = np.array([median(values[rows]) for values, rows in zip(sine, good, strict=True)]) ** 0.5
+        slack = np.maximum(LEAST_LENGTH_ERROR, REACH * np.hypot(eyes.error[first], errors) / steep)
+        k, i, j = np.nonzero(good)
+        found.append(_Meetings(0.5 * (one + other)[good], first * cameras + k, np.stack((i, j), 1), slack[k]))
+    return _Meetings(*(np.concatenate([getattr(part, f.name) for part in found]) for f in fields(_Meetings)))
+
+
+def _poses_at(points: Array, meetings: _Meetings, alike: bool) -> Poses:
+    """Poses of a line that take two of its points to two meetings of the same cameras, at the right distance."""
+    _, first, count = np.unique(meetings.pair, return_index=True, return_counts=True)
+    first, count = np.repeat(first, count), np.repeat(count, count)  # of each meeting's pair of cameras
+    a = np.repeat(np.arange(len(count)), count)
+    b = np.arange(len(a)) - np.repeat(np.cumsum(count) - count, count) + first[a]
+    different = (meetings.blobs[a] != meetings.blobs[b]).all(-1) & ((a < b) | (not alike))
+    a, b = a[different], b[different]
+    apart = np.linalg.norm(meetings.place[a] - meetings.place[b], axis=-1)
+    order, poses = [np.empty(0, dtype=np.int64)], Poses(np.empty((0, 3, 3)), np.empty((0, 3)))
+    for pair in combinations(range(len(points)), 2):
+        ends = points[list(pair)]
+        length = float(np.linalg.norm(ends[1] - ends[0]))
+        fits = np.abs(apart - length) < meetings.slack[a] * length
+        poses += _poses(ends, meetings.place[a[fits]], meetings.place[b[fits]])
+        order.append(meetings.pair[a[fits]])
+    return poses.select(np.argsort(np.concatenate(order), kind="stable"))
 
 
 def _poses(points: Array, a: Array, b: Array) -> Poses:
