@@ -33,7 +33,9 @@ MAIN_KIND_SHARE = 0.99
 """A change of all kinds together is reported as its main kind if that one has this share of the log odds: the rest
 shifts the image by a tenth of it at most."""
 LENS_KINDS, LENS_LOG_PRIOR = ("focal_length", "principal_point"), -3.0
-"""Changes of the lens alone, and their prior log odds against a rotation or a shift if the snapshots cannot tell."""
+"""Changes of the lens alone, and their prior log odds against a rotation or a shift: bumps hit the camera."""
+LENS_REST = 2.0
+"""A change of the lens alone is the main kind only if it leaves so many times less unexplained than other kinds."""
 DECIDE_AFTER = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """Numbers of snapshots since a change at which its kind is decided if possible."""
 
@@ -130,15 +132,13 @@ class PendingChange:
         odds: dict[str | None, float] = {None: test.odds({**self.others(camera), camera: None})}
         for kind, forms in FORMS_OF.items():
             found = [test.odds({**self.others(camera), camera: form}) for form in forms]
-            odds[kind] = mean_evidence(found, len(found))
+            odds[kind] = mean_evidence(found, len(found)) + LENS_LOG_PRIOR * (kind in LENS_KINDS)
         best, second = sorted(odds, key=lambda kind: -odds[kind])[:2]
-        # Bumps hit the camera, not the lens.
-        likely = max(CHANGES, key=lambda kind: odds[kind] + LENS_LOG_PRIOR * (kind in LENS_KINDS))
         least = ALL_KINDS_LEAD if best is None else SINGLE_KIND_LEAD if second is None else KIND_LEAD
         if odds[best] - odds[second] >= least:
-            return best, best or (likely if odds[likely] >= MAIN_KIND_SHARE * odds[None] else None)
+            return best, best or _main_kind(odds)
         # Report the most probable kind, but believe that any is possible.
-        return (None, likely if self.overdue else None) if last else None
+        return (None, max(CHANGES, key=lambda kind: odds[kind]) if self.overdue else None) if last else None
 
     def decide_kinds(
         self, test: ChangeTest, changes: Mapping[int, Change], last: bool
@@ -188,6 +188,13 @@ class PendingChange:
         rig = displace(origin.rig, error[:wide].view(first.unit.shape) * first.unit)
         belief = replace(first, rig=rig, object_offset=origin.object_offset + error[wide:], factor=factor)
         return first, belief, information
+
+
+def _main_kind(odds: Mapping[str | None, float]) -> str | None:
+    """The kind that explains nearly all of a change of all kinds together; None = no single kind does."""
+    rest = {kind: odds[None] - odds[kind] for kind in CHANGES}
+    found = [kind for kind in CHANGES if rest[kind] <= (1 - MAIN_KIND_SHARE) * odds[None]]
+    return min(found, key=lambda kind: rest[kind] * (LENS_REST if kind in LENS_KINDS else 1), default=None)
 
 
 def free_cameras(belief: RigBelief, changes: Mapping[int, str | None], jump: float = LARGE) -> RigBelief:

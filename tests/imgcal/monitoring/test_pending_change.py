@@ -69,16 +69,38 @@ def test_a_tilt_that_a_shift_of_the_lens_explains_as_well_is_a_rotation(tilt, pr
     assert since.decide(SimpleNamespace(odds=evidence), 1, last=True)[1] == kind  # type: ignore[arg-type, index]
 
 
-@pytest.mark.parametrize(("alone", "kind"), [(9950.0, "rotation"), (9800.0, None)])
-def test_a_change_of_all_kinds_is_reported_as_its_main_kind_if_there_is_one(alone, kind) -> None:
-    """A lens or a place that was never quite right shows, once the camera has moved."""
+def test_a_shift_of_the_lens_needs_more_evidence_than_a_rotation() -> None:
+    """A camera's mount moves more often than its lens: what explains the labels equally well is a rotation."""
     before, result, _ = zoomed()
     since = PendingChange.of(result, before, 0.0, {1: None})
 
-    def evidence(changes: Mapping[int, str | None]) -> float:
-        return 10_000.0 if changes[1] is None else alone if changes[1] == "rotation" else 0.0
+    def decide(principal_point: float) -> tuple[str | None, str | None] | None:
+        odds = {"rotation": 12.0, "tilt": 12.0, "position": 3.0, "principal_point": principal_point}
+        test = SimpleNamespace(odds=lambda changes: odds.get(changes[1] or "", 5.0))
+        return since.decide(test, 1, last=False)  # type: ignore[arg-type]
 
-    assert since.decide(SimpleNamespace(odds=evidence), 1, last=False) == (None, kind)  # type: ignore[arg-type]
+    assert decide(9.5) == ("rotation", "rotation")
+    assert decide(13.0) is None and decide(19.5) is None
+    assert decide(20.5) == ("principal_point", "principal_point")
+
+
+@pytest.mark.parametrize(
+    ("rotation", "principal_point", "kind"),
+    [
+        (9950.0, 0.0, "rotation"),
+        (9800.0, 0.0, None),
+        (9950.0, 9970.0, "rotation"),  # hardly better
+        (9950.0, 9985.0, "principal_point"),
+        (0.0, 9950.0, "principal_point"),
+    ],
+)
+def test_a_change_of_all_kinds_is_reported_as_its_main_kind_if_there_is_one(rotation, principal_point, kind) -> None:
+    """A lens or a place that was never quite right shows, once the camera has moved."""
+    before, result, _ = zoomed()
+    since = PendingChange.of(result, before, 0.0, {1: None})
+    odds = {None: 10_000.0, "rotation": rotation, "principal_point": principal_point}
+    test = SimpleNamespace(odds=lambda changes: odds.get(changes[1], 0.0))
+    assert since.decide(test, 1, last=False) == (None, kind)  # type: ignore[arg-type]
 
 
 def test_a_camera_that_is_let_free_may_be_anywhere_and_no_other() -> None:
