@@ -69,12 +69,13 @@ class DriftWatch:
         for camera in range(len(self.names)):
             if camera in unsettled:
                 continue
+            if bool((std[camera, :10] < 0.5 * self.std[camera, :10]).any()):
+                restarted.add(camera)  # earlier changes are learning, not drift: its first labels may have been wrong
+                continue
             found = self._largest(camera, change[camera], torch.maximum(self.std, std)[camera], points)
             if found is not None:
                 events.append(self._event(camera, *found, std[camera], time, number))
                 restarted.add(camera)
-            elif bool((std[camera, :10] < 0.5 * self.std[camera, :10]).any()):
-                restarted.add(camera)  # earlier changes may be learning, not drift
         self._begin(restarted, belief, std, time)
         return events
 

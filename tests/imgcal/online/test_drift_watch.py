@@ -57,6 +57,20 @@ def test_a_move_between_two_looks_is_no_drift() -> None:
     assert watch.observe(there, frozenset(), middle, EVERY_SECONDS + 1, 2) == []
 
 
+def test_what_a_first_snapshot_taught_wrongly_is_no_drift() -> None:
+    """A first half-hidden marker moves a camera by many standard deviations; more snapshots correct it."""
+    rig, obj = imgcal.load_rig("U7").to(torch.float64), imgcal.load_object("asymmetric8")
+    sure = torch.full((7, 15), 0.01, dtype=torch.float64)
+    watch, step = DriftWatch(rig.camera_names), torch.zeros(7, 15, dtype=torch.float64)
+    step[2, 6:8] = 12.0
+    first = RigBelief.of_prior(rig.retract(step), obj, 5.0 * sure)
+    settled = RigBelief.of_prior(rig, obj, sure)
+    watch.observe(first, frozenset(), middle, 0.0, 0)
+    assert watch.observe(settled, frozenset(), middle, EVERY_SECONDS + 1, 5) == []
+    later = watch.observe(replace(settled, rig=rig.retract(step)), frozenset(), middle, 2 * EVERY_SECONDS + 2, 9)
+    assert [(event.camera, event.change) for event in later] == [("cam03", "focal_length")]  # known as well as before
+
+
 def test_what_is_not_known_any_more_has_not_drifted() -> None:
     """After a long pause the rig is known less well than before: what it is found to be then is no drift yet."""
     rig, obj = imgcal.load_rig("U7").to(torch.float64), imgcal.load_object("asymmetric8")
