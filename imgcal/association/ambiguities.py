@@ -103,9 +103,7 @@ def displacement(uv: NDArray[np.float64], motion: Ambiguity) -> NDArray[np.float
     return np.median(np.linalg.norm(uv[:, motion.permutation[falls]] - uv[:, falls], axis=-1), axis=1)
 
 
-def conflicts(
-    obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def conflicts(obj: CalibrationObject, first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.float64]:
     """Share of commonly labelled blobs that labellings name differently, up to the object's symmetry.
 
     Labellings without a common blob conflict completely.

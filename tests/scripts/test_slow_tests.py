@@ -20,6 +20,11 @@ def test_the_slowest_are_named_until_the_rest_fits():
     assert slowest(LOG, 0.6) == {"tests/a/test_one.py::test_x": 9.0, "tests/a/test_two.py::test_y": 3.0}
 
 
+def test_a_file_with_a_long_setup_is_one_entry():
+    log = LOG + "20.00s setup    tests/a/test_three.py::test_u\n1.00s call     tests/a/test_three.py::test_v\n"
+    assert slowest(log, 13.0) == {"tests/a/test_three.py": 21.0}
+
+
 def test_every_line_of_the_list_names_a_test_that_is_there():
     root = Path(__file__).parents[2]
     for line in LIST.read_text().splitlines():
