@@ -123,7 +123,8 @@ def _meetings(eyes: _Eyes) -> _Meetings:
     """Find where rays of any two cameras nearly meet."""
     cameras, most = eyes.rays.shape[:2]
     valid = (np.arange(most) < eyes.count[:, None]) & (eyes.count[:, None] >= 2)
-    found = [_Meetings(np.empty((0, 3)), *(np.empty((0, *shape), dtype=np.int64) for shape in ((), (2,))), np.empty(0))]
+    none = np.empty(0, dtype=np.int64)
+    found = [_Meetings(np.empty((0, 3)), none, np.empty((0, 2), dtype=np.int64), np.empty(0))]
     for first in range(cameras - 1):
         later = slice(first + 1, None)
         d1, d2 = eyes.rays[first][:, None], eyes.rays[later, None]  # (M, 1, 3), (K, 1, M, 3)
