@@ -100,7 +100,9 @@ class Dataset:
             lock = FileLock(self.out / LOCK, timeout=0)
             lock.acquire()
         except Timeout as error:
-            raise InputError(f"{self.out}: another run is writing to it, expected to be the only one") from error
+            raise InputError(
+                f"{self.out}: another run is writing to it: wait until it ends, or choose another folder"
+            ) from error
         except OSError as error:
             raise InputError(f"{self.out}: cannot be written: {short_reason(error)}") from error
         writer = Writer(self)

@@ -219,7 +219,7 @@ def _listing(folder: Path) -> list[Path]:
     entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
     for path in entries:
         if not is_file_name(path.name):
-            raise InputError(f"{path}: found a name that is no text, or too long, expected one that can be shown")
+            raise InputError(f"{path}: found a name that is not valid text, or is too long: rename it")
     return sorted(entries, key=lambda path: natural_key(path.name))
 
 

@@ -46,7 +46,7 @@ def sentences(content: ReportContent) -> tuple[str, ...]:
     if content.scale:
         found.append(f"{content.scale[0].upper()}{content.scale[1:]}.")
     if 0 < predicted.seen_share < 0.95:
-        found.append(f"{100 * (1 - predicted.seen_share):.0f} % of the volume are seen by fewer than two cameras.")
+        found.append(f"{100 * (1 - predicted.seen_share):.0f} % of the volume is seen by fewer than two cameras.")
     return tuple(found)
 
 

@@ -61,7 +61,7 @@ class Bag:
             topic = self.topics.get(camera) or (named[0] if len(named) == 1 else None)
             if topic is None and named:
                 raise InputError(
-                    f"{self.path}: found {list_names(named)} for camera {camera}, expected --topic {camera}=..."
+                    f"{self.path}: found {list_names(named)} for camera {camera}, choose one with --topic {camera}=..."
                 )
             if topic is not None and topic not in images:
                 raise InputError(f"{self.path}: found no images of the topic {shorten(topic)}; {there}")
