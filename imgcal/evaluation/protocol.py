@@ -101,7 +101,7 @@ class Scores:
 
     @property
     def re(self) -> Tensor:
-        """RE of all rigs of all trials, pixels."""
+        """RE of all rigs of all trials: (trials * rigs,) pixels."""
         return torch.cat([trial.re for trial in self.trials])
 
     def statistics(self, kind: Literal["re", "held_out"] = "re") -> Statistics:

@@ -143,7 +143,11 @@ class Dataset:
         return keys
 
     def latest(self, columns: Sequence[str] | None = None) -> Any:
-        """Table of the latest result of each row of the manifest."""
+        """Read the latest result of each row of the manifest as an Arrow table; `columns`: only these.
+
+        Raises:
+            InputError: there are no results, or a file cannot be read.
+        """
         import pyarrow as pa
 
         wanted = None if columns is None else [*dict.fromkeys(("item", *columns))]

@@ -189,6 +189,9 @@ def open_input(
     """Open the input of a command: a capture folder, a detections file, or a sample by its name (`sample:O10`).
 
     Arguments as for `open_capture` and `load_detections`.
+
+    Raises:
+        InputError: there is no such file or folder, it holds neither frames nor blobs, or it does not fit the rig.
     """
     path = sample_path(path)
     if path.is_dir():

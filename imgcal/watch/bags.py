@@ -29,7 +29,11 @@ class Bag:
     live: bool = False
 
     def items(self) -> Iterator[Item]:
-        """Yield the images of the cameras' topics."""
+        """Yield the images of the cameras' topics.
+
+        Raises:
+            InputError: the recording cannot be read, or its topics cannot be assigned to the cameras.
+        """
         from rosbags.highlevel import AnyReader  # not in the core
         from rosbags.typesys import Stores, get_typestore
 
