@@ -39,7 +39,7 @@ def test_exceptions_are_named_with_what_helps(content):
     assert words in verdict.found and advice(bad)[0] in verdict.next_steps
 
 
-def test_many_exceptions_are_counted(content):
+def test_all_exceptions_are_named(content):
     (words,) = sentences(with_bad(content, (1, 3, 5, 7), 40))
     assert words.count("px)") == 4
 

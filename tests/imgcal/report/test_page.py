@@ -201,7 +201,8 @@ LOOK = """
     nav.getBoundingClientRect().right;
   const cells = [...page.querySelectorAll(".cameras td")].map((cell) => cell.scrollWidth - cell.clientWidth);
   return {
-    header: header.height, nav: links(page.querySelector("nav")), sideways: page.documentElement.scrollWidth - view.innerWidth,
+    header: header.height, nav: links(page.querySelector("nav")),
+    sideways: page.documentElement.scrollWidth - view.innerWidth,
     drawn: pixels.filter((value, i) => i % 4 === 3 && value > 0).length, canvas: canvas.clientWidth,
     zoomed: overlay.getAttribute("viewBox") !== whole, mark: mark.width, closer: closer.width,
     spill: Math.max(...cells),
