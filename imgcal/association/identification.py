@@ -252,7 +252,7 @@ def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool
         return replace(undecided_at, undecided=undecided)
     order = 1 if known_pose else len(scene.obj.symmetries)
     status: Status = "by_tracking" if known_pose else "ambiguous" if order > 1 else "unique"
-    reason = f"explains {100 * share:.0f} % of what could be seen, margin {margin:.0f}"
+    reason = f"explains {100 * share:.0f} % of the visible markers, margin {margin:.0f}"
     labels, strength = scene.blobs.to_rows(chosen.labels[0]), float(evidence(scene, chosen)[0])
     return Identity(labels, pose, rig, status, order, margin, reason, share, evidence=strength, rival=rival)
 

@@ -115,7 +115,7 @@ def judge(
     if proposal.reason or proposal.rig_from_object is None:
         return refused, blobs
     if proposal.margin < options.least_margin:
-        reason = f"the images tell the object from others by a margin of {proposal.margin:.1f} only, expected "
+        reason = f"the images tell the object from others by a margin of only {proposal.margin:.1f}, expected "
         return replace(refused, reason=f"{reason}{options.least_margin:.0f}"), blobs
     options = replace(options, least_share=min(options.least_share, LEAST_SHARE))
     widened = replace(blobs, sigma=np.hypot(blobs.sigma, error), fiducial=nothing)

@@ -159,7 +159,7 @@ def associate(
         ('unique', True)
     """
     if obj.parts:
-        from imgcal.association.several import associate_several  # it imports this module
+        from imgcal.association.several_objects import associate_several  # it imports this module
 
         labelled = associate_several(detections, rig, obj, options, progress)
         if not labelled.used:

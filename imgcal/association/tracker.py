@@ -275,7 +275,7 @@ def _check_pose(pose: RigidTransform, rig: CameraRig) -> RigidTransform:
     pose = pose.to(rig.focal_length.dtype)
     off = (pose.rotation @ pose.rotation.mT - torch.eye(3, dtype=pose.rotation.dtype)).abs().max()
     if not (bool(off < 1e-3) and bool(torch.det(pose.rotation) > 0) and bool(pose.translation.isfinite().all())):
-        raise InputError("start pose: found no rotation and finite translation, expected those of rig_from_object")
+        raise InputError("start pose: expected a rotation matrix and a finite translation (rig_from_object)")
     return pose
 
 

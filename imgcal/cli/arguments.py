@@ -519,7 +519,9 @@ class Compare:
     def __post_init__(self) -> None:
         """Require models: the parser accepts any number of them."""
         if not self.models:
-            raise InputError("found no models, expected two or more, or with --captures one detector or more")
+            raise InputError(
+                "compare: found no models, expected two or more (or, with --captures, one or more detectors)"
+            )
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,7 @@ class Calibrate(arguments.Calibrate):
         measurer = None if self.measurer is None else LearnedMeasurer.load(self.measurer)
         detector = self._detector(source, measurer)
         if self.trust and self.first_guess == "none":
-            raise InputError(f"--trust: found {shorten(self.trust[0])} without --first-guess, which it is for")
+            raise InputError(f"--trust: found {shorten(self.trust[0])} without --first-guess, expected both")
         named, trusted = self.first_guess, self.trust
         initializer = None if named == "none" else load_initializer(named, rig, obj, trusted=trusted)
         loaded = time.perf_counter()

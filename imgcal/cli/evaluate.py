@@ -127,7 +127,7 @@ def _conditions(models: list[Model], setting: Setting) -> Conditions:
     if models:
         known = models[0].conditions
     elif setting.rig is None or setting.object is None:
-        raise InputError("evaluate: found no model, expected --rig and --object")
+        raise InputError("evaluate: found no model; without one, give --rig and --object")
     else:
         known = Conditions(open_rig(setting.rig), load_object(setting.object))
     poses: PoseRange = known.pose_range

@@ -18,7 +18,7 @@ from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
 from imgcal.io import Frame
 from imgcal.pipeline import EARLIER, Calibration, rms_length
-from imgcal.report import NOT_IDENTIFIED, ReportContent, SnapshotSummary
+from imgcal.report import NOT_IDENTIFIED, UNKNOWN_MARKERS, ReportContent, SnapshotSummary
 from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError
 
 Pictures = Mapping[str, Frame | None]
@@ -82,7 +82,7 @@ def describe(
         title=f"{'Calibration' if calibration.from_scratch else 'Recalibration'} of {rig.name}",
         status="ok",
         reason=_about_object(calibration),
-        identity=calibration.identity if calibration.lights is None else "unknown_markers",
+        identity=calibration.identity if calibration.lights is None else UNKNOWN_MARKERS,
         factory=rig,
         detections=detections,
         labels=detections.fiducial,
@@ -105,6 +105,7 @@ def describe(
         object_points=calibration.points_object.double().numpy(),
         rig_from_object=_poses(calibration),
         frames=tuple(pictures.get(name) for name in rig.camera_names) if pictures else (),
+        frame_snapshots=tuple(np.flatnonzero(labelled.moments == labelled.moments[0]).tolist()),
         chi2_per_dof=float(calibration.chi2_per_dof),
         rms_before=(not calibration.from_scratch and rms_length(calibration.before.residual, seen)) or float("nan"),
         from_scratch=calibration.from_scratch,

@@ -47,7 +47,7 @@ class Train(arguments.Train):
         run.accelerator.end_training()
         if not is_finished(run, run.seconds):
             raise KeyboardInterrupt(
-                f"interrupted and saved at step {run.step}; to go on, repeat the command with --resume"
+                f"interrupted and saved at step {run.step}; to continue, repeat the command with --resume"
             )
         if run.accelerator.is_main_process:
             print(f"{plural(run.step, 'step')}, {run.seconds:.0f} s: {self.out / RESULT}", file=sys.stderr)

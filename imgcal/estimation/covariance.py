@@ -84,7 +84,11 @@ def _by_modes(estimate: Estimate) -> Tensor:
 
 
 def whitened_covariance(solution: Solution) -> Tensor:
-    """Joint covariance of all cameras' whitened offsets: (B, K C, K C)."""
+    """Joint covariance of all cameras' whitened offsets: (B, K C, K C), in prior standard deviations.
+
+    Raises:
+        RefusedError: the observations do not determine the object's pose in every snapshot.
+    """
     equations = solution.equations
     factorization = solution.factorization
     reduced, cameras = factorization.reduced, equations.camera.shape[1]
@@ -441,7 +445,11 @@ def scale_response(estimate: Estimate) -> Tensor:
 
 
 def pose_covariance(estimate: Estimate) -> Tensor:
-    """Covariance of each snapshot's pose: (*B, S, 6, 6), rotation (rad, left, about the centroid) and centroid (mm)."""
+    """Covariance of each snapshot's pose: (*B, S, 6, 6), rotation (rad, left, about the centroid) and centroid (mm).
+
+    Raises:
+        RefusedError: the observations do not determine the pose in every snapshot.
+    """
     equations = estimate.solution.equations
     snapshots = equations.pose.shape[1]
     reduced = factorize(equations, cameras_first=True).reduced

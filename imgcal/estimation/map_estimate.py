@@ -267,7 +267,11 @@ def make_estimate(
 def make_problem(
     observations: Observations, rig: CameraRig, obj: CalibrationObject, prior_std: Tensor | None
 ) -> Problem:
-    """Flatten the batch axes and whiten; see `estimate`."""
+    """Flatten the batch axes and whiten; arguments as for `estimate`.
+
+    Raises:
+        InputError: the observations do not fit the rig and the object, or have `shake`.
+    """
     cameras, fiducials = observations.seen.shape[-2:]
     if (
         cameras != rig.num_cameras

@@ -1,4 +1,7 @@
-"""Robust losses on squared whitened residuals. Each maps d^2 to (loss, derivative of the loss by d^2)."""
+"""Robust losses on squared whitened residuals d^2 of any shape.
+
+Each returns the loss and its derivative by d^2, both of that shape, without unit.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ RobustKernel = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 def squared(d2: Tensor) -> tuple[Tensor, Tensor]:
-    """Plain least squares."""
+    """Plain least squares: the loss is d^2 (any shape), and its derivative one."""
     return d2, torch.ones_like(d2)
 
 

@@ -101,7 +101,7 @@ class Scores:
 
     @property
     def re(self) -> Tensor:
-        """RE of all rigs of all trials, pixels."""
+        """RE of all rigs of all trials: (trials * rigs,) pixels."""
         return torch.cat([trial.re for trial in self.trials])
 
     def statistics(self, kind: Literal["re", "held_out"] = "re") -> Statistics:
@@ -337,12 +337,12 @@ def _measure(name: str, method: Method, batch: Sample, first: int) -> dict[str, 
             least = int(given.seen.any(1).sum(-1).min())
             if least < LEAST_FIDUCIALS:
                 raise InputError(
-                    f"missing: found {batch.conditions.corruption.missing:g}, expected a smaller share: of one rig "
-                    f"{least} fiducials are left, and a pose needs {LEAST_FIDUCIALS}"
+                    f"missing: found {batch.conditions.corruption.missing:g}, expected a smaller share: it leaves "
+                    f"one rig {least} fiducials, and a pose needs {LEAST_FIDUCIALS}"
                 ) from error
             raise RefusedError(
                 f"evaluation: {name}: a system of equations has no solution ({error}), though every rig sees at least "
-                f"{least} different fiducials: an object on one line, or a fault of this method"
+                f"{least} different fiducials: the object lies on one line, or this method has a fault"
             ) from error
         number = len(passes)
         found["alone"].append(errors(passes[-1], truth, given.obj))

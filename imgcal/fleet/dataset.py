@@ -100,7 +100,9 @@ class Dataset:
             lock = FileLock(self.out / LOCK, timeout=0)
             lock.acquire()
         except Timeout as error:
-            raise InputError(f"{self.out}: another run is writing to it, expected to be the only one") from error
+            raise InputError(
+                f"{self.out}: another run is writing to it: wait until it ends, or choose another folder"
+            ) from error
         except OSError as error:
             raise InputError(f"{self.out}: cannot be written: {short_reason(error)}") from error
         writer = Writer(self)
@@ -141,7 +143,11 @@ class Dataset:
         return keys
 
     def latest(self, columns: Sequence[str] | None = None) -> Any:
-        """Table of the latest result of each row of the manifest."""
+        """Read the latest result of each row of the manifest as an Arrow table; `columns`: only these.
+
+        Raises:
+            InputError: there are no results, or a file cannot be read.
+        """
         import pyarrow as pa
 
         wanted = None if columns is None else [*dict.fromkeys(("item", *columns))]

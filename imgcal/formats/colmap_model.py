@@ -83,7 +83,7 @@ class ColmapCamera:
         else:
             focal, centre, ks = (p[0], p[1]), (p[2], p[3]), p[4:]
         if min(focal) <= 0:
-            raise FormatError(f"camera {self.id}: found the focal length {min(focal):g}")
+            raise FormatError(f"camera {self.id}: found the focal length {min(focal):g}, expected a positive one")
         model = "fisheye" if self.model.endswith("FISHEYE") else "opencv"
         return Lens(
             focal, (centre[0] - HALF, centre[1] - HALF), tuple(ks), "fisheye" if model == "fisheye" else "opencv"
@@ -147,8 +147,8 @@ def chosen_rig(names: Sequence[str], wanted: str | None) -> int:
         FormatError: there are several and none is named, or there is none of that name.
     """
     if wanted is None and len(names) > 1:
-        raise FormatError(f"found {len(names)} rigs of several cameras: choose one with --source-rig {names[0]} (of "
-                          f"{', '.join(names[:8])}), to imgcal convert")  # fmt: skip
+        raise FormatError(f"found {len(names)} rigs ({', '.join(names[:8])}): choose one with imgcal convert "
+                          f"--source-rig {names[0]}")  # fmt: skip
     if wanted is not None and wanted not in names:
         raise FormatError(f"--source-rig: found {shorten(wanted)}, expected one of {', '.join(names[:8])}")
     return 0 if wanted is None else list(names).index(wanted)
@@ -207,7 +207,7 @@ def _convert_rig(
             others.append(rig.at[sensor].place(places.seven))
         found.append(known[sensor].camera(names[sensor], pose, *others))
     if len(found) < 2:
-        raise FormatError(f"rig {rig.id}: {name_cameras(lost)} without a pose in it, so that there is no rig")
+        raise FormatError(f"rig {rig.id}: {name_cameras(lost)} without a pose in it; a rig needs two or more")
     return ForeignRig(name, tuple(found), None, f"rig {rig.id} (its reference camera)", tuple(notes), root=root)
 
 

@@ -90,7 +90,9 @@ class TextFile:
             for span, before, after in zip(spans, change.before, change.after, strict=True):
                 if wanted.setdefault(span, (before, after))[1] != after:
                     where = ".".join(map(str, change.keys))
-                    raise FormatError(f"{self.name}: {where}: stands for several values: write it out for each camera")
+                    raise FormatError(
+                        f"{self.name}: {where}: one value in the file stands for several cameras: write it out for each"
+                    )
         tokens = {span: self.text[slice(*span)] for span in wanted}
         new: dict[Span, str] = {}
         for key in {key for key, _ in groups}:

@@ -80,7 +80,7 @@ def _camera(
         left, top = get("left", view), get("top", view)
         width, height = get("right", view) - left + 1, get("bottom", view) - top + 1
     if not 1 <= width <= 2**16 or not 1 <= height <= 2**16:
-        raise FormatError(f"{name}: found an image of {width:g} x {height:g} pixels")
+        raise FormatError(f"{name}: found an image of {width:g} x {height:g} pixels, expected 1 to {2**16}")
     focal = focal_length(get("focalLengthU") / fraction, get("focalLengthV") / fraction, name)
     centre = get("centerPointU") / fraction - left, get("centerPointV") / fraction - top
     word = "tangential" if "tangentialDistortion1" in intrinsic.attributes else "tangental"

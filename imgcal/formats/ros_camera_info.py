@@ -157,7 +157,8 @@ def _info(values: dict[str, Any], document: Document) -> _Info:
     projection = array(p, (3, 4), f"{name}: projection_matrix") if p is not None and any(numbers(p, "P")) else plain
     if projection[0, 0] <= 0 or projection[1, 1] <= 0:
         raise FormatError(
-            f"{name}: projection_matrix: found {projection[0, 0]:g} and {projection[1, 1]:g} on its diagonal"
+            f"{name}: projection_matrix: found the focal lengths {projection[0, 0]:g} and {projection[1, 1]:g}, "
+            "expected positive ones"
         )
     keys: dict[str, tuple[str, ...]] = {}
     for key in "kdrp":

@@ -53,7 +53,7 @@ class RigidTransform:
 
     @classmethod
     def combine(cls, parts: Sequence[RigidTransform], join: Join) -> RigidTransform:
-        """Combine several into one; `join` takes the list of their rotations, then of their translations."""
+        """Combine `parts` into one; `join` takes the list of their rotations, then of their translations."""
         return cls(join([part.rotation for part in parts]), join([part.translation for part in parts]))
 
     def __matmul__(self, other: RigidTransform) -> RigidTransform:

@@ -189,6 +189,9 @@ def open_input(
     """Open the input of a command: a capture folder, a detections file, or a sample by its name (`sample:O10`).
 
     Arguments as for `open_capture` and `load_detections`.
+
+    Raises:
+        InputError: there is no such file or folder, it holds neither frames nor blobs, or it does not fit the rig.
     """
     path = sample_path(path)
     if path.is_dir():
@@ -219,7 +222,7 @@ def _listing(folder: Path) -> list[Path]:
     entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
     for path in entries:
         if not is_file_name(path.name):
-            raise InputError(f"{path}: found a name that is no text, or too long, expected one that can be shown")
+            raise InputError(f"{path}: found a name that is not valid text, or is too long: rename it")
     return sorted(entries, key=lambda path: natural_key(path.name))
 
 

@@ -152,7 +152,11 @@ def write_frame(path: str | Path, frame: Frame) -> None:
 
 
 def write_image(path: str | Path, image: NDArray[np.uint8]) -> None:
-    """Write a colour image (H, W, 3), red first, as PNG in one step."""
+    """Write a colour image (H, W, 3), red first, as PNG in one step.
+
+    Raises:
+        InputError: the image cannot be encoded, or the file cannot be written.
+    """
     encoded, content = cv2.imencode(".png", image[..., ::-1])
     if not encoded:
         raise InputError(f"{path}: an image {image.shape} of {image.dtype} cannot be encoded as PNG")
@@ -204,7 +208,12 @@ class Video:
         self._capture.release()
 
     def read(self, index: int) -> Frame:
-        """Read a frame (H, W); indices must grow from call to call."""
+        """Read a frame (H, W); indices must grow from call to call.
+
+        Raises:
+            InputError: the video ends before its announced length, or is not grey.
+            ValueError: the frame has been passed already.
+        """
         if index < self._next:
             raise ValueError(f"{self.path}: frame {index} after frame {self._next - 1}; a video is read forwards")
         good, image = True, None

@@ -161,7 +161,11 @@ def save_object(obj: CalibrationObject, path: str | Path) -> None:
 
 
 def object_text(obj: CalibrationObject, where: str | Path = "object") -> str:
-    """Make the text that `save_object` writes; errors begin with `where`."""
+    """Make the text that `save_object` writes; errors begin with `where`.
+
+    Raises:
+        InputError: the name of a fiducial could not be read again, or is not unique.
+    """
     if obj.board is not None:
         return board_text(obj)
     names = obj.fiducial_names

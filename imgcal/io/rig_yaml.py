@@ -133,6 +133,9 @@ def rig_text(
 ) -> str:
     """Make the text that `save_rig` writes; errors begin with `where`.
 
+    Raises:
+        InputError: the rig has batch axes, or `full` is given without a covariance matrix.
+
     Examples:
         >>> import imgcal
         >>> rig_text(imgcal.load_rig("T4")).splitlines()[:2]

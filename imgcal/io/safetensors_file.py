@@ -60,7 +60,11 @@ def read_tensors(path: str | Path, file_format: str) -> tuple[dict[str, Tensor],
 
 
 def read_texts(path: str | Path, file_format: str) -> dict[str, str]:
-    """Read only the texts; errors as for `read_tensors`, but damaged tensors go unnoticed."""
+    """Read only the texts of a file that `write_tensors` wrote; damaged tensors go unnoticed.
+
+    Raises:
+        InputError: as for `read_tensors`.
+    """
     path = Path(path)
     check_regular(path)
     if not path.exists() and path == Path(path.stem):

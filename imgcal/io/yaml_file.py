@@ -305,7 +305,11 @@ def _check_format(content: bytes, where: str, file_format: str) -> dict[str, Any
 
 
 def parse_yaml(text: str, where: str) -> Any:
-    """Read a value from YAML text that does not come from a file; errors begin with `where`."""
+    """Read a value from YAML text that does not come from a file; errors begin with `where`.
+
+    Raises:
+        InputError: the text is not valid YAML.
+    """
     try:
         return read_values(text.encode(errors="replace"))
     except yaml.YAMLError as error:

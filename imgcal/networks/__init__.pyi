@@ -6,6 +6,7 @@ from .checkpoint import (
     save_checkpoint,
     warm_start,
 )
+from .compatibility import check_object, check_rig, check_says_rigs
 from .config import (
     PRESETS,
     HueCentroids,
@@ -33,7 +34,6 @@ from .pooled_images import PaperImageNetwork, PooledImageNetwork
 from .randomness import drawing_from
 from .soft_positions import find_soft_positions
 from .tiles import Tiles
-from .training_subject import check_object, check_rig, check_says_rigs
 
 __all__ = [
     "OPSET",

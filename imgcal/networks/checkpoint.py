@@ -26,6 +26,7 @@ from imgcal.io import (
     write_tensors,
 )
 from imgcal.messages import quote, shorten
+from imgcal.networks.compatibility import check_object, check_rig, is_position_training
 from imgcal.networks.config import NetworkSpec, drop_pretrained, is_import_path
 from imgcal.networks.factory import build_network
 from imgcal.networks.infrared import InfraredNetwork
@@ -33,7 +34,6 @@ from imgcal.networks.infrared_checkpoint import INFRARED, MEASURER, read_weights
 from imgcal.networks.measurer import Measurer
 from imgcal.networks.network import Network
 from imgcal.networks.refiner import IterativeRefiner
-from imgcal.networks.training_subject import check_object, check_rig, is_position_training
 from imgcal.types import CalibrationObject, CameraRig
 
 FORMAT = "imgcal-network/1"

@@ -22,7 +22,9 @@ Attending = TypeVar("Attending", "PaperPoints", "TrunkConfig")
 
 def _make_heads_whole(config: Attending) -> Attending:
     if config.encoder == "transformer" and config.width % config.heads:
-        raise ValueError(f"found width {config.width} and {config.heads} heads, expected a multiple of the heads")
+        raise ValueError(
+            f"found width {config.width} and {config.heads} heads, expected a width that is a multiple of the heads"
+        )
     if 13 * config.width**2 * config.depth > MOST_WEIGHTS:  # of either encoder, about
         raise ValueError(f"found width {config.width} and depth {config.depth}, expected a network that fits in memory")
     return config

@@ -95,7 +95,9 @@ class VitEncoder(nn.Module):
     def __init__(self, width: int, size: int, embed_dim: int = 128, depth: int = 4, num_heads: int = 4) -> None:
         """Create the layers for images of `size` pixels; `width` is the map's."""
         if embed_dim % num_heads:
-            raise ValueError(f"found embed_dim {embed_dim} and {num_heads} heads, expected a multiple of the heads")
+            raise ValueError(
+                f"found embed_dim {embed_dim} and {num_heads} heads, expected embed_dim to be a multiple of the heads"
+            )
         super().__init__()
         self.width, self.size = width, size
         side = -(-size // PATCH)

@@ -201,7 +201,7 @@ class ImageQuality:
         self._bad = (self._bad | worse) & ~better
         self._usual[worse] = 0
         for camera in np.flatnonzero(was & ~self._bad.any(0)):
-            message = f"{names[camera]} shows blobs as it used to"
+            message = f"{names[camera]} shows its blobs as before"
             events.append(Event(state.time, state.snapshot, "clean", names[camera], message=message))
         return events
 

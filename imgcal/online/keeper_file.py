@@ -74,7 +74,9 @@ def read_state(path: str | Path) -> tuple[dict[str, Any], StateReader]:
     path = Path(path)
     try:
         if not path.is_file():
-            raise InputError(f"{path}: found no such file, expected the state of a rig that is kept calibrated")
+            raise InputError(
+                f"{path}: no such file, expected the state of a running rig (RigKeeper.save, imgcal watch)"
+            )
         if path.stat().st_size > MOST_BYTES:
             raise InputError(f"{path}: found {path.stat().st_size:,} bytes, expected at most {MOST_BYTES:,}")
         content = path.read_bytes()
@@ -94,7 +96,7 @@ def read_state(path: str | Path) -> tuple[dict[str, Any], StateReader]:
         raise InputError(f'{path}: found format {shorten(repr(found))}, expected "{FORMAT}"')
     state = values.get("state")
     if not isinstance(state, dict):
-        raise InputError(f"{path}: found no state, expected that of a rig that is kept calibrated")
+        raise InputError(f"{path}: found no state of a running rig (RigKeeper.save, imgcal watch)")
     try:
         if _digest(json.dumps(state)) != values.get("sha256"):
             raise ValueError("its sha256 does not match")

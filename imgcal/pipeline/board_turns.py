@@ -46,7 +46,6 @@ def require_one_turn(cameras: CameraRig, obj: CalibrationObject) -> None:
     """Raise `RefusedError` if the board's orientation in several cameras cannot be made consistent."""
     if obj.board is not None and len(obj.board.turns) > 1 and cameras.num_cameras > 1:
         raise RefusedError(
-            f"object: a {obj.board} looks the same turned, so that without a factory calibration the images of several "
-            "cameras do not show which of its points are the same: use a ChArUco board, or one with an even and an odd "
-            "number of squares"
+            f"object: a {obj.board} looks the same when turned, so without a factory calibration its points cannot be "
+            "matched between cameras: use a ChArUco board, or one with an even and an odd number of squares"
         )

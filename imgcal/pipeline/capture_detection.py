@@ -64,7 +64,7 @@ def detect_capture(
 
 
 def read_masks(capture: Capture) -> dict[str, NDArray[np.bool_]]:
-    """Read the cameras' masks, where present: True = ignore this pixel."""
+    """Read the cameras' masks (H, W), where present: True = ignore this pixel."""
     return {camera: mask for camera in capture.camera_names if (mask := capture.mask(camera)) is not None}
 
 

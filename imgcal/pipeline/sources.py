@@ -118,9 +118,12 @@ def _read_memory(source: Frames) -> Callable[[int], Mapping[str, Frame | None]]:
 
 
 def check_frames(frames: object, rig: CameraRig) -> dict[str, Any]:
-    """Return grey frames by camera if all fit the rig's cameras and sizes; otherwise raise an explanation.
+    """Return grey frames by camera, (H, W) each or a list of them.
 
     Frames of three equal channels, as OpenCV reads grey videos, count as grey, as in files.
+
+    Raises:
+        InputError: a camera or an image size is not the rig's, or a frame is not grey.
     """
     if not isinstance(frames, Mapping):
         raise InputError(f"found a {type(frames).__name__}, expected Detections or frames: {{camera name: frame}}")

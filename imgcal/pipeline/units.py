@@ -176,8 +176,8 @@ def _doubt_by_poses(detections: Detections, rig: CameraRig, obj: CalibrationObje
     turn, ratio = float(torch.cat(turns).median()), float(torch.cat(lengths).median())
     if turn > LEAST_TURN:
         return (
-            f"the images show cameras turned to each other by {math.degrees(turn):.0f} deg more or less than the rig "
-            "says; expected rotations in radians that take the rig to the camera (cam_from_rig)"
+            f"the rotations between cameras are {math.degrees(turn):.0f} deg off what the images show; expected "
+            "rotations in radians that take the rig to the camera (cam_from_rig)"
         )
     return _smaller(ratio, LEAST_RATIO)
 
@@ -202,9 +202,9 @@ def _doubt_by_directions(detections: Detections, rig: CameraRig) -> str:
     if not missed or float(torch.cat(missed).median()) < LEAST_TURN:
         return ""
     return (
-        "the directions in which cameras see the object pass each other by "
-        f"{math.degrees(float(torch.cat(missed).median())):.0f} deg, as the rig has them turned; expected rotations in "
-        "radians that take the rig to the camera (cam_from_rig)"
+        "with the rig's rotations, the cameras' lines of sight to the object miss each other by "
+        f"{math.degrees(float(torch.cat(missed).median())):.0f} deg; expected rotations in radians that take the rig "
+        "to the camera (cam_from_rig)"
     )
 
 

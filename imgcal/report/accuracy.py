@@ -9,6 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from imgcal.estimation import MAP_DEPTHS, MAP_SIZE, PredictedError
+from imgcal.messages import list_names
 from imgcal.report import svg
 from imgcal.report.charts import RESIDUAL_CLASSES
 from imgcal.report.content import ReportContent
@@ -16,8 +17,8 @@ from imgcal.report.svg import Array, Axes
 
 WORTH_SAYING = 0.8
 """Of the error in mm: without the exceptions it must be less to be mentioned."""
-MOST_NAMED = 3
-"""Cameras named in the sentence."""
+MOST_ADVISED = 3
+"""Cameras for which more snapshots are advised."""
 MORE_SNAPSHOTS = (5, 10, 20, 30, 50, 100)
 """Numbers that are advised."""
 MAP = len(MAP_DEPTHS) // 2
@@ -37,16 +38,16 @@ def sentences(content: ReportContent) -> tuple[str, ...]:
         words = f"Median predicted error {length(predicted.median_mm)}; 95 % of the volume below {most}; "
         without = float(predicted.mm_without_exceptions.nanmedian())
         if without < WORTH_SAYING * predicted.median_mm:
-            words += f"{length(without)} without {_list_names(names)}; "
+            words += f"{length(without)} without {list_names(names)}; "
     words += f"{'' if words else 'Median predicted error '}in the images {svg.pixels(usual)} px"
     if names:
         worst = [f"{content.cameras[i]} ({svg.pixels(predicted.camera_px[i])} px)" for i in predicted.exceptions]
-        words += f", except through {_list_names(worst)}"
+        words += f", except through {list_names(worst)}"
     found = [words + "."]
     if content.scale:
         found.append(f"{content.scale[0].upper()}{content.scale[1:]}.")
     if 0 < predicted.seen_share < 0.95:
-        found.append(f"{100 * (1 - predicted.seen_share):.0f} % of the volume are seen by fewer than two cameras.")
+        found.append(f"{100 * (1 - predicted.seen_share):.0f} % of the volume is seen by fewer than two cameras.")
     return tuple(found)
 
 
@@ -58,7 +59,7 @@ def advice(content: ReportContent) -> tuple[str, ...]:
     usual = float(np.nanmedian(predicted.camera_px)) if predicted.exceptions else math.nan
     seen = [_snapshots_seen(content, camera) for camera in range(len(content.cameras))]
     steps: dict[int, list[str]] = {}
-    for camera in predicted.exceptions[:MOST_NAMED]:
+    for camera in predicted.exceptions[:MOST_ADVISED]:
         wanted = more_snapshots(seen[camera], int(np.median(seen)), predicted.camera_px[camera] / usual)
         steps.setdefault(wanted, []).append(content.cameras[camera])
     return tuple(f"Take {n} more snapshots in the view of {', '.join(names)}." for n, names in steps.items())
@@ -160,11 +161,6 @@ def _range(values: Array) -> float:
     """The ratio of large values to small ones."""
     known = values[np.isfinite(values)]
     return float(np.quantile(known, 0.95) / max(np.quantile(known, 0.05), 1e-300)) if len(known) else 0.0
-
-
-def _list_names(names: list[str]) -> str:
-    shown = ", ".join(names[:MOST_NAMED])
-    return shown if len(names) <= MOST_NAMED else f"{shown} and {len(names) - MOST_NAMED} more"
 
 
 def _snapshots_seen(content: ReportContent, camera: int) -> int:

@@ -190,9 +190,9 @@ def time_bars(seconds: Mapping[str, float]) -> Markup:
     parts = []
     for i, (stage, value) in enumerate(seconds.items()):
         y = 4 + 22 * i
-        parts.append(svg.text(108, y + 13, svg.shorten_name(stage), kind="label", anchor="end"))
-        parts.append(svg.box(116, y + 2, max(340 * value / largest, 1), 14, "bar after"))
-        parts.append(svg.text(124 + 340 * value / largest, y + 13, duration(value), anchor="start"))
+        parts.append(svg.text(150, y + 13, stage, kind="label", anchor="end"))
+        parts.append(svg.box(158, y + 2, max(300 * value / largest, 1), 14, "bar after"))
+        parts.append(svg.text(166 + 300 * value / largest, y + 13, duration(value), anchor="start"))
     return svg.drawing(560, 8 + 22 * len(seconds), "Time of each stage", *parts)
 
 

@@ -21,6 +21,9 @@ Array = NDArray[np.float64]
 NOT_IDENTIFIED = "identity"
 """Refusals that begin so could not tell which blob is which; the others had labels, which the report does not know."""
 
+UNKNOWN_MARKERS = "unknown_markers"
+"""The identity of a calibration from markers that were never measured: each marker at each moment is a row."""
+
 
 @dataclass(frozen=True)
 class SnapshotSummary:
@@ -69,7 +72,8 @@ class ReportContent:
     object_points: Array | None = None  # (N, 3) mm
     rig_from_object: RigidTransform | None = None  # (S) in the recalibrated rig's frame; nan for rejected snapshots
     frames: tuple[NDArray[np.uint8] | NDArray[np.uint16] | None, ...] = ()  # C grey images (H, W) of one snapshot
-    frame_snapshot: int = 0  # index of that snapshot
+    frame_snapshots: tuple[int, ...] = (0,)
+    """Numbers of that snapshot in `detections`: several where each object, or each unknown marker, has a row."""
     chi2_per_dof: float = float("nan")
     rms_before: float = float("nan")  # pixels, RMS length of the residuals
     rms_after: float = float("nan")
@@ -96,6 +100,11 @@ class ReportContent:
             raise ValueError(f"report: found {len(self.frames)} frames, expected {cameras}, None where there is none")
         if self.detections.camera_names != self.factory.camera_names:
             raise ValueError("report: cameras of the detections differ from those of the rig")
+
+    @property
+    def pictured(self) -> NDArray[np.bool_]:
+        """Mark the blobs of the snapshot that `frames` show: (M,) bool."""
+        return np.isin(self.detections.snapshot, self.frame_snapshots)
 
     @property
     def cameras(self) -> tuple[str, ...]:

@@ -78,7 +78,7 @@ def _webp(frame: Frame, width: int) -> bytes:
 def _overlay(content: ReportContent, camera: int, picture: str | None) -> Markup:
     width, height = (int(x) for x in content.image_size[camera])
     d = content.detections
-    rows = np.flatnonzero((d.camera == camera) & (d.snapshot == content.frame_snapshot))[: blobs_drawn(content)]
+    rows = np.flatnonzero((d.camera == camera) & content.pictured)[: blobs_drawn(content)]
     used = content.used[rows] if content.used.any() else content.labels[rows] >= 0
     parts = [f'<rect class="edge" x="-0.5" y="-0.5" width="{width}" height="{height}"/>']
     if picture is not None:

@@ -15,7 +15,7 @@ from imgcal.live_page import read_asset, render_page, to_json
 from imgcal.messages import plural
 from imgcal.pipeline import MOVED, UNDETERMINED
 from imgcal.report import accuracy, charts, overlay, scene, svg, tables
-from imgcal.report.content import ReportContent
+from imgcal.report.content import UNKNOWN_MARKERS, ReportContent
 from imgcal.report.rig_view import rig_view_script
 from imgcal.report.verdict import judge
 
@@ -159,14 +159,20 @@ def _accuracy(content: ReportContent) -> dict[str, object] | None:
 
 def _rig(content: ReportContent) -> dict[str, object]:
     drawn = scene.describe_scene(content)
-    snapshots, fiducials = scene.choose_fiducials(content)
+    snapshots, _ = scene.choose_fiducials(content)
     return {
         "scene": Markup(to_json(drawn.values)),
         "factors": drawn.factors,
         "start": drawn.start,
-        "snapshots": len(snapshots),
-        "fiducials": len(fiducials),
+        "dots": _dots(content, len(snapshots)) if len(snapshots) else "",
     }
+
+
+def _dots(content: ReportContent, count: int) -> str:
+    """Say what the dots of the rig's drawing are."""
+    if content.identity == UNKNOWN_MARKERS:
+        return plural(count, "marker")
+    return f"the object in {plural(count, 'pose')}"
 
 
 def _overlays(content: ReportContent) -> dict[str, object]:
@@ -178,7 +184,7 @@ def _overlays(content: ReportContent) -> dict[str, object]:
     return {
         "panels": panels,
         "symbols": overlay.SYMBOLS,
-        "snapshot": names[content.frame_snapshot] if content.frame_snapshot < len(names) else "",
+        "snapshot": names[content.frame_snapshots[0]] if names else "",
         "stretched": any(frame is not None for frame in content.frames),
     }
 
@@ -199,8 +205,9 @@ def _subsampling(content: ReportContent) -> list[str]:
     poses = scene.known_poses(content)
     if len(snapshots) and (len(snapshots) < len(poses) or len(fiducials) < total):
         each = f" and {len(fiducials)} of {total} fiducials in each" if total > 1 else ""
-        notes.append(f"The rig shows {len(snapshots)} of {plural(len(poses), 'pose')}{each}.")
+        noun = "marker" if content.identity == UNKNOWN_MARKERS else "pose"
+        notes.append(f"The rig shows {len(snapshots)} of {plural(len(poses), noun)}{each}.")
     d = content.detections
-    if int(d.count_by_camera(d.snapshot == content.frame_snapshot).max()) > overlay.blobs_drawn(content):
+    if int(d.count_by_camera(content.pictured).max()) > overlay.blobs_drawn(content):
         notes.append(f"The overlays show at most {overlay.blobs_drawn(content)} blobs of each camera.")
     return notes

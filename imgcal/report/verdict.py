@@ -12,7 +12,7 @@ from imgcal.messages import list_names
 from imgcal.pipeline import DOUBTFUL, MOVED
 from imgcal.report.accuracy import advice, length, sentences
 from imgcal.report.charts import duration
-from imgcal.report.content import NOT_IDENTIFIED, ReportContent
+from imgcal.report.content import NOT_IDENTIFIED, UNKNOWN_MARKERS, ReportContent
 from imgcal.report.svg import group_digits, pixels
 
 CROWDED = 1.0
@@ -28,7 +28,7 @@ IDENTITY = {
     "unique": "Every fiducial was recognized, and only one labelling explains what the cameras saw.",
     "by_prior": "The given pose decided between look-alike orientations of the object.",
     "by_tracking": "The labels were carried from snapshot to snapshot; the motion excluded look-alike positions.",
-    "unknown_markers": "Nothing was known about the markers; held-out snapshots confirm the rig that they gave.",
+    UNKNOWN_MARKERS: "Nothing was known about the markers; held-out snapshots confirm the rig that they gave.",
     "ambiguous": (
         "The object is symmetric, so its absolute orientation is unknown. All cameras use the same "
         "choice, so the rig is valid."

@@ -35,7 +35,7 @@ class ImageOptions(StrictRecord):
         return resized_pixels(uv, (self.size / image_size.to(uv))[:, None])
 
     def to_sensor(self, uv: Tensor, image_size: Tensor) -> Tensor:
-        """Invert `from_sensor`."""
+        """Take pixels of the image (*B, C, N, 2) to pixels of the sensor: the inverse of `from_sensor`."""
         return resized_pixels(uv, (image_size.to(uv) / self.size)[:, None])
 
 

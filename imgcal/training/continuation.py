@@ -55,7 +55,7 @@ def restore(run: Run, state: TrainingState) -> None:
         raise InputError(f"training: found {run.accelerator.num_processes} processes, expected {expected} as before")
     for key, text in run.task.files.items():
         if values.get("files", {}).get(key, text) != text:
-            raise InputError(f"{key}: its file has changed since the training began, expected the same")
+            raise InputError(f"{key}: its file has changed since the training began; --resume needs the same file")
     run.plain.load_state_dict(tensors["network"])
     if run.average is not None:
         run.average.load_state_dict(tensors["average"])

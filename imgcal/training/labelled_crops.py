@@ -32,7 +32,7 @@ from imgcal.matching import measure_markers
 from imgcal.messages import plural
 from imgcal.networks import Expectation, Tiles, cut_crops, cut_patches
 from imgcal.training.frame_dataset import FrameDataset, PatchDataset
-from imgcal.training.usual_look import fit_to_light, usual_look
+from imgcal.training.marker_appearance import fit_to_light, usual_look
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 
 COPIES = 3

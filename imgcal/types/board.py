@@ -53,7 +53,8 @@ class Board:
             )
         if self.kind in ("charuco", "aprilgrid") and not 0 < self.marker < self.pitch:
             raise InputError(
-                f"board: found markers of {self.marker:g} mm at a distance of {self.pitch:g} mm, expected smaller ones"
+                f"board: found markers of {self.marker:g} mm, expected more than 0 and less than {self.pitch:g} mm, "
+                "the distance between neighbours"
             )
 
     @property

@@ -30,7 +30,7 @@ class Range:
     unit: str
 
     def holds(self, values: Tensor) -> Tensor:
-        """Tell for each value whether it is plausible; NaN is not."""
+        """Tell for each value (any shape) whether it is plausible: bool of that shape; NaN is not."""
         return (values >= self.low) & (values <= self.high)
 
     def __str__(self) -> str:
@@ -62,7 +62,11 @@ PRIOR_POSITION = Range(1e-9, 1e7, "mm")
 
 
 def check_rig(rig: CameraRig) -> None:
-    """Raise `InputError` if a rig has implausible values; files are checked when they are read."""
+    """Check a rig that was not read from a file: files are checked when they are read.
+
+    Raises:
+        InputError: a value is implausible, or the lens models do not fit the coefficients.
+    """
     unknown = [name for name in rig.lens_models if name not in geometry.LENS_MODELS]
     if unknown or len(rig.lens_models) != rig.num_cameras:
         found = f"the lens model {unknown[0]}" if unknown else f"{len(rig.lens_models)} lens models"
@@ -103,7 +107,11 @@ def check_object(obj: CalibrationObject) -> None:
 
 
 def check_observations(observations: Observations) -> None:
-    """Raise `InputError` if a visible fiducial has a standard deviation of zero or less."""
+    """Check the standard deviations of observations.
+
+    Raises:
+        InputError: a visible fiducial has a standard deviation of zero or less.
+    """
     sigma = observations.sigma.expand(observations.seen.shape)
     wrong = observations.seen & (sigma <= 0)
     if bool(wrong.any()):

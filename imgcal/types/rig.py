@@ -369,7 +369,7 @@ class CameraRig:
 
     @classmethod
     def combine(cls, rigs: Sequence[CameraRig], join: Join) -> CameraRig:
-        """Combine several into one; `join` takes the list of focal lengths, and so on. The rest is from the first."""
+        """Combine `rigs` into one; `join` takes the list of focal lengths, and so on. The rest is from the first."""
         return replace(
             rigs[0],
             focal_length=join([rig.focal_length for rig in rigs]),

@@ -46,7 +46,11 @@ class ConvexVolume:
 
     @classmethod
     def box(cls, low: Corner, high: Corner) -> ConvexVolume:
-        """Enclose a box between two opposite corners, mm."""
+        """Enclose a box between two opposite corners, mm.
+
+        Raises:
+            InputError: a coordinate of `low` is not below that of `high`.
+        """
         if any(not a < b for a, b in zip(low, high, strict=True)):
             raise InputError(f"volume: found low {list(low)} and high {list(high)}, expected each low below its high")
         (x, y, z), (u, v, w) = low, high

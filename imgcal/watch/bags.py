@@ -29,7 +29,11 @@ class Bag:
     live: bool = False
 
     def items(self) -> Iterator[Item]:
-        """Yield the images of the cameras' topics."""
+        """Yield the images of the cameras' topics.
+
+        Raises:
+            InputError: the recording cannot be read, or its topics cannot be assigned to the cameras.
+        """
         from rosbags.highlevel import AnyReader  # not in the core
         from rosbags.typesys import Stores, get_typestore
 
@@ -61,7 +65,7 @@ class Bag:
             topic = self.topics.get(camera) or (named[0] if len(named) == 1 else None)
             if topic is None and named:
                 raise InputError(
-                    f"{self.path}: found {list_names(named)} for camera {camera}, expected --topic {camera}=..."
+                    f"{self.path}: found {list_names(named)} for camera {camera}, choose one with --topic {camera}=..."
                 )
             if topic is not None and topic not in images:
                 raise InputError(f"{self.path}: found no images of the topic {shorten(topic)}; {there}")

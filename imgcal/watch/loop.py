@@ -105,9 +105,9 @@ class Progress:
             time, name, logged = float(entry["time"]), entry["name"], entry.get("logged")
             source, rate = entry.get("source"), entry.get("rate")
             if not all(text is None or isinstance(text, str) for text in (name, source)):
-                raise ValueError("a name is no text")
+                raise ValueError("a name is not text")
             if not (logged is None or isinstance(logged, int)):
-                raise ValueError("the length is no number")
+                raise ValueError("the length is not a number")
             return cls(time, name, logged, source, None if rate is None else float(rate))
         except (ValueError, TypeError, KeyError, OverflowError) as error:
             raise InputError(f"{path}: found something that imgcal watch did not write") from error

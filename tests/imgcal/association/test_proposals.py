@@ -175,7 +175,7 @@ def test_a_refused_proposal_gives_way_to_the_one_behind_it(truth, o10, asymmetri
 
     given = replace(blobs_of(truth), snapshot_names=("0", "1"))
     if not behind:
-        with pytest.raises(RefusedError, match=r"margin of 1\.0 only"):
+        with pytest.raises(RefusedError, match=r"margin of only 1\.0"):
             associate(given, o10, asymmetric8, sight=Sight(Wrong(truth), frames, True))
         return
     found = associate(given, o10, asymmetric8, sight=Sight(Wrong(truth), frames, True))

@@ -154,7 +154,7 @@ def test_an_interruption_during_start_up_is_one_line(slow, arguments, tmp_path):
         (["rig"], "expected look-at or cameras after `imgcal rig`; see imgcal rig --help"),
         (["simulate", "--rig", "T4", "--object", "cube8", "--out", "o", "--phi-deg", "9"],
          "--phi-deg: found too few values, expected 2; see imgcal simulate --help"),
-        (["compare"], "found no models, expected two or more, or with --captures one detector or more; "
+        (["compare"], "compare: found no models, expected two or more (or, with --captures, one or more detectors); "
          "see imgcal compare --help"),
     ],
 )  # fmt: skip

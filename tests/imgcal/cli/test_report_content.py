@@ -8,12 +8,16 @@ import torch
 
 import imgcal
 from imgcal.association import associate
-from imgcal.cli.report_content import describe_refusal, summarize_snapshots
+from imgcal.cli.calibrate import trusted_covariance
+from imgcal.cli.outcome import findings
+from imgcal.cli.report_content import describe, describe_refusal, summarize_snapshots
 from imgcal.errors import RefusedError
+from imgcal.estimation import Gauge
 from imgcal.pipeline import EARLIER
 from imgcal.report import SnapshotSummary
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from imgcal.types import MovedCamera, MovedError
+from scripts.benchmarks.lights import LIGHTS, simulate
 
 
 @pytest.fixture(scope="module")
@@ -52,3 +56,12 @@ def test_rows_of_one_snapshot_are_counted_together(seen):
         SnapshotSummary(others[0].name, found[2], 0, "blurred"),
         SnapshotSummary(others[1].name, found[3], 0, "blurred"),
     )
+
+
+def test_a_picture_shows_every_marker_of_its_snapshot():
+    scene = simulate(markers=8, moments=20, drift=0.3, seed=2)
+    result = imgcal.calibrate(scene.detections, scene.factory, LIGHTS)
+    found = findings(result, Gauge.from_majority(result.rig, scene.factory), trusted_covariance(result, 0))
+    content = describe(result, found, scene.factory, {}, {})
+    markers = len(np.unique(content.detections.snapshot[content.pictured]))
+    assert markers == (result.labelled.moments == 0).sum() > 4

@@ -104,7 +104,7 @@ def test_an_interrupted_training_is_saved_and_says_how_to_resume(experiment, tmp
     assert train(experiment, tmp_path / "out") == 130
     assert signal.getsignal(number) == handler
     error = capsys.readouterr().err
-    assert "interrupted and saved at step 7; to go on, repeat the command with --resume" in error
+    assert "interrupted and saved at step 7; to continue, repeat the command with --resume" in error
     load_network(tmp_path / "out" / "model.safetensors")
     assert train(experiment, tmp_path / "out", "--resume") == 0
     assert "from step 7 on" in capsys.readouterr().err

@@ -88,7 +88,7 @@ def test_a_rig_names_cameras_by_the_folders_of_their_images() -> None:
 def test_one_of_several_rigs_is_chosen_by_name() -> None:
     eye = (np.eye(3), np.zeros(3))
     rigs = [ColmapRig(1, {1: eye, 2: pose()}), ColmapRig(5, {2: eye, 1: pose()})]
-    with pytest.raises(FormatError, match=r"found 2 rigs .*: choose one with --source-rig 1 \(of 1, 5\)"):
+    with pytest.raises(FormatError, match=r"found 2 rigs \(1, 5\): choose one with imgcal convert --source-rig 1"):
         rig_from_model("colmap", CAMERAS, [], rigs)
     assert rig_from_model("colmap", CAMERAS, [], rigs, "5").frame == "rig 5 (its reference camera)"
     with pytest.raises(FormatError, match="--source-rig: found 7, expected one of 1, 5"):

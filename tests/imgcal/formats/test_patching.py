@@ -39,7 +39,7 @@ def test_bytes_around_numbers_stay() -> None:
     assert made == content.replace(b"1.00", b"1.50")
     with pytest.raises(FormatError, match=re.escape("a.yaml: a: found 2 plain numbers, expected 3")):
         file.patch([Change(("a",), [1.0, 2.0, 3.0], [1.5, 2.0, 3.0])], 0)
-    with pytest.raises(FormatError, match="stands for several values"):
+    with pytest.raises(FormatError, match="one value in the file stands for several cameras"):
         file.patch([Change(("b",), [1.0], [1.5]), Change(("c",), [1.0], [1.7])], 0)
 
 

@@ -116,7 +116,7 @@ def test_names_that_are_no_text(name: bytes, tmp_path: Path) -> None:
     path = tmp_path / os.fsdecode(name)
     path.parent.mkdir(exist_ok=True)
     path.write_bytes((tmp_path / "frames/a/1.png").read_bytes())
-    with pytest.raises(InputError, match="a name that is no text"):
+    with pytest.raises(InputError, match="a name that is not valid text"):
         open_capture(tmp_path)
 
 

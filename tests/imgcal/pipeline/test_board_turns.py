@@ -25,5 +25,5 @@ def test_images_that_do_not_say_the_turn_of_a_board_agree_about_it():
         turned[rows] = obj.board.turns[image % 4][1][turned[rows]]
     found = settle_turns(replace(seen, fiducial=turned), rig, obj)
     assert float(calibrate(found, rig, obj).rms) < 0.01
-    with pytest.raises(RefusedError, match="looks the same turned"):
+    with pytest.raises(RefusedError, match="looks the same when turned"):
         calibrate_from_scratch(found, rig, obj)

@@ -59,7 +59,7 @@ MISTAKES = {
     "object in centimetres": (object_times(0.1), "the object is .* times too small for the rig, as if it were in cent"),
     "object in inches": (object_times(1 / 25.4), "the object is .* times too small for the rig, as if it were in inch"),
     "object in micrometres": (object_times(1e3), "the rig is .* times too small for the object, as if it were in metr"),
-    "rotations in degrees": (rotations_in_degrees, "(the images show cameras turned|the directions in which cameras)"),
+    "rotations in degrees": (rotations_in_degrees, "(the rotations between cameras|with the rig.s rotations)"),
     "focal length in millimetres": (focal_times(0.0055), "the focal length of camera .* seems to be in millimetres"),
     "focal length as a share": (focal_times(1 / 2048), "the focal length of camera .* seems to be relative to the wid"),
 }

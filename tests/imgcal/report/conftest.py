@@ -129,7 +129,7 @@ def calibrated(
 
 def refused(content: ReportContent) -> ReportContent:
     """Turn a content into that of a refused run on the same images."""
-    rejected = "5 of 8 blobs a camera explained, at least 0.45 of what could be seen needed"
+    rejected = "5 of 8 blobs a camera explained, at least 0.45 of the visible markers needed"
     return replace(
         content, title="O10, refused", status="refused", identity="refused", recalibrated=None,
         reason="identity: no labelling wins clearly: the best two explain 31 and 30 of 80 blobs.",

@@ -37,6 +37,14 @@ def test_layers_hold_the_blobs_of_the_snapshot(content: ReportContent) -> None:
         assert 'viewBox="-0.5 -0.5 2048 1088"' in drawing
 
 
+def test_every_row_of_the_pictured_snapshot_is_drawn(content: ReportContent) -> None:
+    d = content.detections
+    two_objects = replace(content, frame_snapshots=(0, 1))
+    for camera, drawing in enumerate(overlays(two_objects)):
+        rows = (d.camera == camera) & (d.snapshot <= 1) & content.used
+        np.testing.assert_allclose(_layer(drawing, "labelled"), d.uv[rows], atol=0.006)
+
+
 def test_refused_overlay_has_detections_alone(refused_content: ReportContent) -> None:
     for drawing in overlays(refused_content):
         assert re.findall('<g class="(.*?)">', drawing) == ["labelled", "unlabelled"]

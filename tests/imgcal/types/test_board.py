@@ -61,7 +61,7 @@ def test_a_bend_is_a_paraboloid_with_its_deflection_in_the_middle() -> None:
     ("change", "message"),
     [
         ({"columns": 2}, "found 2 columns and 7 rows, expected at least 3"),
-        ({"marker": 30.0}, "found markers of 30 mm at a distance of 30 mm"),
+        ({"marker": 30.0}, "found markers of 30 mm, expected more than 0 and less than 30 mm"),
     ],
 )
 def test_impossible_boards_are_refused(change: dict[str, float], message: str) -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from imgcal.association import Associations, IdentityOptions, PipelineOptions, Tracker, associate
-from imgcal.association.several import place_objects
+from imgcal.association.several_objects import place_objects
 from imgcal.association.tracker import LearntRig
 from imgcal.pipeline import calibrate
 from imgcal.types import CalibrationObject, MovedError
