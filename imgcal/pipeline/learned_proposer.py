@@ -98,7 +98,7 @@ class LearnedProposer:
         best = self._around(there, turns_deg=())
         if not self._convinces(best, snapshot):  # rotations cost more than the finder
             starts = [snapshot, there] if snapshot.candidates else [there]
-            best = max((self._around(start) for start in starts), key=lambda proposal: len(proposal.detections))
+            best = max((self._around(start) for start in starts), key=_count_measured)
         return replace(best, otherwise=lambda: replace(found, found_by=finder.name))
 
     def _search_origin(self, snapshot: Snapshot) -> Proposal | None:
@@ -120,7 +120,7 @@ class LearnedProposer:
             return False
         points = proposal.rig_from_object.apply(snapshot.obj.points)
         in_view = int(snapshot.rig.project(points).visible.sum())
-        return len(proposal.detections) > CONVINCING * in_view
+        return _count_measured(proposal) > CONVINCING * in_view
 
     def _around(self, snapshot: Snapshot, turns_deg: tuple[float, ...] = TURNS_DEG) -> Proposal:
         """Search around the candidates and, if they show too little, at these rotations of the best."""
@@ -357,6 +357,11 @@ class _View:
         uv, sigma, radius = (values[0].numpy() for values in (observations.uv, observations.sigma, expected.radius))
         rows = proposal_rows(uv, sigma, seen.numpy(), radius, snapshot.blobs)
         return Proposal(rows, poses[0], margin)
+
+
+def _count_measured(proposal: Proposal) -> int:
+    """Count the fiducials with an accurate position. A wrong pose shows vague ones, up to half of those in view."""
+    return int((proposal.detections.sigma < LARGEST_REACH).sum())
 
 
 def _mask_frame(frame: np.ndarray | None, mask: np.ndarray | None) -> np.ndarray | None:
