@@ -68,8 +68,9 @@ def calibrate(
         progress: wraps the loop over snapshots, for a progress bar.
         detector: what finds the fiducials in frames: `classical` (blobs), `matched` (a matched filter for frames in
             which blobs fail), `auto` (the filter if blobs are not sufficient, or the calibration from them is
-            refused), or a `Proposer`; a `Sight` brings frames that are not in memory. Blobs that contradict count,
-            blobs decide if a proposer finds nothing, and identification and all checks apply as usual.
+            refused), `learned` or another network (and where the calibration from it is refused, the filter), or a
+            `Proposer`; a `Sight` brings frames that are not in memory. Blobs that contradict count, blobs decide if a
+            proposer finds nothing, and identification and all checks apply as usual.
         measurer: measures the blobs of frames again (`LearnedMeasurer.load`): half-hidden and unevenly lit markers;
             also those that `learned` finds.
 
