@@ -58,7 +58,8 @@ LEAST_SIGMA = 0.1  # crop pixels: limit of the network's accuracy
 ROBUST = EstimationOptions(loss="cauchy", threshold=2.0, max_iterations=30, tolerance=1e-2)
 MODEL_ERROR = 0.3  # px: error of a measurement beyond its own sigma
 OUTLIER = 5.0  # standard deviations from the fit at which a claim is dropped
-LARGEST_SIGMA = 20.0  # px: a claim with a larger sigma is too vague
+LARGEST_SIGMA = 20.0  # px: a claim with a larger sigma is too vague to be searched for again
+VAGUE = 3.0  # px: minimum sigma at which a fiducial is not proposed
 TILES_AT_ONCE = 8  # more would not fit into the caches and the memory
 STEPS = 9  # compared displacements of a camera: none, and the lattice steps around it
 SAME_PLACE = 4.0  # crop pixels within which two displacements give the same place
@@ -340,20 +341,25 @@ class _View:
         return fitted.rig, fitted.rig_from_object
 
     def proposal(self, looks: NetworkPass, fitted: Fit | None) -> Proposal:
-        """Measure the fiducials that agree with the fitted rig and pose, as labelled blobs."""
+        """Measure the fiducials that agree with the fitted rig and pose, as labelled blobs.
+
+        Claims that stay vague are left out: an adapted network makes them anywhere in frames of noise.
+        """
         snapshot, observations = self.snapshot, self.observations(looks)
-        margin = min(looks.margin, self.most)
+        margin, disagree = min(looks.margin, self.most), "found hardly any fiducials that agree with one pose"
         for gate in GATES:
             if fitted is None:
                 break
             observations = self.measure(looks, self.expected(*fitted), gate)
             fitted = self.fit(looks, observations)
         if fitted is None:
-            return Proposal.decline(snapshot, "found hardly any fiducials that agree with one pose", margin)
+            return Proposal.decline(snapshot, disagree, margin)
         rig, poses = fitted
         expected = self.expected(rig, poses)
         off = (expected.uv - observations.uv).norm(dim=-1) / (observations.sigma.square() + MODEL_ERROR**2).sqrt()
-        seen = (observations.seen & (off < OUTLIER))[0]
+        seen = (observations.seen & (off < OUTLIER) & (observations.sigma < VAGUE))[0]
+        if int(seen.sum()) < LEAST_CLAIMS:
+            return Proposal.decline(snapshot, disagree, margin)
         uv, sigma, radius = (values[0].numpy() for values in (observations.uv, observations.sigma, expected.radius))
         rows = proposal_rows(uv, sigma, seen.numpy(), radius, snapshot.blobs)
         return Proposal(rows, poses[0], margin)

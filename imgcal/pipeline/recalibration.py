@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from imgcal.association import Associations, PipelineOptions, Progress, associate
+from imgcal.association import Associations, PipelineOptions, Progress, Sight, associate
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.geometry import RigidTransform
@@ -26,6 +26,7 @@ from imgcal.pipeline.initialization import Initializer
 from imgcal.pipeline.label_counts import LabelCounts, count_labels
 from imgcal.pipeline.labelled_capture import arrange_labels
 from imgcal.pipeline.learned_measurer import LearnedMeasurer
+from imgcal.pipeline.learned_proposer import LearnedProposer
 from imgcal.pipeline.lights import add_lights, find_lights
 from imgcal.pipeline.repeats import Repeats, drop_repeats, name_repeats, require_own_images
 from imgcal.pipeline.sources import Detector, Frames, check_frames, find_blobs, make_sight
@@ -67,8 +68,9 @@ def calibrate(
         progress: wraps the loop over snapshots, for a progress bar.
         detector: what finds the fiducials in frames: `classical` (blobs), `matched` (a matched filter for frames in
             which blobs fail), `auto` (the filter if blobs are not sufficient, or the calibration from them is
-            refused), or a `Proposer`; a `Sight` brings frames that are not in memory. Blobs that contradict count,
-            blobs decide if a proposer finds nothing, and identification and all checks apply as usual.
+            refused), `learned` or another network (and where the calibration from it is refused, the filter), or a
+            `Proposer`; a `Sight` brings frames that are not in memory. Blobs that contradict count, blobs decide if a
+            proposer finds nothing, and identification and all checks apply as usual.
         measurer: measures the blobs of frames again (`LearnedMeasurer.load`): half-hidden and unevenly lit markers;
             also those that `learned` finds.
 
@@ -116,12 +118,10 @@ def calibrate(
                 with contextlib.suppress(RefusedError):
                     fit = fit_steady(lit, given, rig, obj, options)
     except RefusedError as error:
-        if sight is not None and labelled is not None and sight.where_blobs_fail and _rests_on_blobs(labelled):
-            # Blobs gave a pose, but the calibration failed.
+        if sight is not None and labelled is not None and (other := _next_sight(sight, labelled)) is not None:
             with contextlib.suppress(RefusedError):
-                sight = replace(sight, where_blobs_fail=False)
                 return calibrate(
-                    detections, rig, obj, options, initializer=initializer, progress=progress, detector=sight
+                    detections, rig, obj, options, initializer=initializer, progress=progress, detector=other
                 )
         # The extent of the view says nothing for a light, and little for a stick.
         if obj.pose_rank == 6 and not obj.parts:
@@ -221,10 +221,18 @@ def fit_with_timing(
     return fit
 
 
-def _rests_on_blobs(labelled: Associations) -> bool:
-    """Tell whether some snapshot was identified from blobs alone, without a look at its frames."""
-    snapshots = (labelled.snapshots[number] for number in labelled.used)
-    return any(snapshot.found_by == "classical" and snapshot.status != "coded" for snapshot in snapshots)
+def _next_sight(sight: Sight, labelled: Associations) -> Sight | None:
+    """Return what to try if the calibration from these labels is refused: frames after blobs, a network's finder after
+    the network; None = nothing else.
+    """
+    snapshots = [labelled.snapshots[number] for number in labelled.used]
+    made_by = {snapshot.found_by for snapshot in snapshots if snapshot.status != "coded"}
+    if sight.where_blobs_fail and "classical" in made_by:
+        return replace(sight, where_blobs_fail=False)
+    proposer = sight.proposer
+    if isinstance(proposer, LearnedProposer) and proposer.finder is not None and proposer.name in made_by:
+        return replace(sight, proposer=proposer.finder)
+    return None
 
 
 def require_same_moments(

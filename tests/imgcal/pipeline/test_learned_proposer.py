@@ -150,6 +150,40 @@ def test_a_finder_is_asked_where_the_known_pose_shows_nothing(known: bool) -> No
     assert np.abs(found.detections.uv - expected).max() < 0.1
 
 
+class Guessing(Knowing):
+    """Also claims, vaguely, every fiducial that it does not see: in the middle of its window."""
+
+    def search(self, features: Tensor, queries: Queries, window: int | None = None) -> Evidence:
+        found = super().search(features, queries, window)
+        offset = queries.place[:, :, None, None] - found.cells
+        guessed = (offset.abs() <= 1).all(-1) & (found.present < 0)[..., None, None]
+        vague = sure_of(guessed, offset, found.cells)
+        return Evidence(
+            found.logits + vague.logits, torch.where(guessed[..., None], offset, found.offset),
+            torch.where(guessed, 0.0, found.log_sigma), found.present.maximum(vague.present), found.cells,
+        )  # fmt: skip
+
+
+def test_vague_claims_at_a_wrong_pose_do_not_count_against_the_finder() -> None:
+    made = scene(2.0)
+    (near,) = made.snapshot.candidates
+    turn = rotation_from_vector(torch.tensor([1.2, -1.5, 0.6], dtype=torch.float64))
+    away = replace(made.snapshot, candidates=(RigidTransform(turn @ near.rotation, near.translation),))
+    guessing = Guessing(made.place, torch.ones(made.place.shape[:-1], dtype=torch.bool))
+    alone = LearnedProposer(guessing, Blind())
+    found = replace(alone, finder=Finder(near)).propose(away).detections
+    expected = made.truth.uv[0].numpy()[found.camera, found.fiducial]
+    assert len(found) == 32
+    assert np.abs(found.uv - expected).max() < 0.1
+
+
+def test_vague_claims_alone_are_no_proposal() -> None:
+    made = scene()
+    nothing = torch.zeros(made.place.shape[:-1], dtype=torch.bool)
+    proposal = LearnedProposer(Guessing(made.place, nothing), Blind()).propose(made.snapshot)
+    assert proposal.reason == "found hardly any fiducials that agree with one pose"
+
+
 @pytest.fixture(scope="module")
 def dim() -> tuple[Truth, Snapshot]:
     """A snapshot in low light, of a rig whose pose is believed to be turned by eight degrees."""

@@ -7,7 +7,8 @@ import torch
 from imgcal.association import Proposal, Sight, proposal_rows
 from imgcal.errors import RefusedError
 from imgcal.estimation import relative_covariance
-from imgcal.pipeline import calibrate
+from imgcal.networks import InfraredNetwork
+from imgcal.pipeline import LearnedProposer, calibrate
 from imgcal.synthesis import PhysicalDrift, Truth, simulate_truth, true_detections
 
 
@@ -102,3 +103,22 @@ def test_where_a_calibration_from_blobs_is_refused_the_frames_are_looked_at(o10,
     assert dict(
         calibrate(replace(seen, fiducial=np.full(len(seen), -1)), o10, asymmetric8, detector=sight).detectors
     ) == {"classical": 2}
+
+
+class WithoutCamera3(LearnedProposer):
+    """Proposes the truth, but nothing in one camera: every snapshot is identified, and no rig can be calibrated."""
+
+    def propose(self, snapshot):
+        assert self.finder is not None
+        whole = self.finder.propose(snapshot)
+        return replace(whole, detections=whole.detections.select(whole.detections.camera != 3))
+
+
+def test_where_a_calibration_from_a_network_is_refused_its_finder_decides(o10, asymmetric8):
+    truth = simulate_truth(o10, asymmetric8, 2, torch.Generator().manual_seed(0), PhysicalDrift())
+    blobs = true_detections(truth)
+    blobs = replace(blobs, fiducial=np.full(len(blobs), -1)).select(blobs.camera != 3)
+    network = WithoutCamera3(InfraredNetwork(), finder=Oracle(truth))
+    sight = Sight(network, lambda number: {"number": np.full((1, 1), number)}, where_blobs_fail=False)
+    result = calibrate(blobs, o10, asymmetric8, detector=sight)
+    assert dict(result.detectors) == {"oracle": 2}
