@@ -31,7 +31,7 @@ from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, EstimationOptions, estimate, robust_std
 from imgcal.geometry import RigidTransform
 from imgcal.messages import name_cameras
-from imgcal.pipeline.turned_images import find_turned_image
+from imgcal.pipeline.turned_images import compare_turns
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
 
 HELD_OUT = 4
@@ -284,13 +284,14 @@ def _require_upright_images(agreement: Agreement, detections: Detections, factor
     Raises:
         RefusedError: names the camera.
     """
-    for camera in np.flatnonzero(agreement.judged & ~agreement.agrees).tolist():
+    bad = np.flatnonzero(agreement.judged & ~agreement.agrees).tolist()
+    for camera in bad if len(bad) <= agreement.agrees.sum() else []:
         others = detections.select(detections.camera != camera)
         lights = associate_lights(others, rig, even_error(rig), least_cameras=min(3, rig.num_cameras - 1))
         image = factory.project(torch.from_numpy(lights.point))
         seen = image.visible[camera].numpy()
-        turned = find_turned_image(detections, factory, camera, lights.moment[seen], image.uv[camera].numpy()[seen])
-        if turned is not None:
+        turned = compare_turns(detections, factory, camera, lights.moment[seen], image.uv[camera].numpy()[seen])
+        if turned is not None and not turned.upright:
             raise turned.refusal()
 
 

@@ -16,8 +16,9 @@ from imgcal.errors import RefusedError
 from imgcal.pipeline.labelled_capture import arrange_labels
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 
+UPRIGHT = "as it is"
 WAYS = {
-    (False, False, False): "as it is",
+    (False, False, False): UPRIGHT,
     (False, True, True): "turned by 180 degrees",
     (False, True, False): "mirrored left to right",
     (False, False, True): "mirrored top to bottom",
@@ -37,19 +38,26 @@ LEAST_SHARE = 0.4
 """Minimum share of them with a blob once the image is turned ..."""
 LARGEST_OTHER = 0.5
 """... and maximum ratio of the same for any other way, the image as it is included, to that."""
+LEAST_LABELLED = 0.5
+"""Minimum share of the snapshots in which the object was found: few may be mistaken."""
 MOST_SNAPSHOTS = 60
 """Maximum number of snapshots to compare."""
 
 
 @dataclass(frozen=True)
-class TurnedImage:
-    """A camera whose image fits the others once it is turned or mirrored."""
+class ImageTurn:
+    """A camera whose image fits the others in one way: as it is, or once it is turned or mirrored."""
 
     camera: str
-    way: str  # how it is turned
+    way: str  # of `WAYS`
     places: int  # markers that the other cameras put into its image
     found: int  # blobs there
     found_turned: int  # blobs there if the image is turned
+
+    @property
+    def upright(self) -> bool:
+        """Whether it fits as it is."""
+        return self.way == UPRIGHT
 
     def refusal(self) -> RefusedError:
         """Say so."""
@@ -82,16 +90,21 @@ def require_upright_images(
     seen = image.visible.numpy() & arranged.labelled.columns(obj)
     moments = arranged.labelled.moments[arranged.labelled.used]
     uv = image.uv.numpy()
+    if len(moments) < LEAST_LABELLED * len(arranged.labelled.snapshots):
+        return
+    images = []
     for camera in range(rig.num_cameras):
         row, fiducial = np.nonzero(seen[:, camera])
-        found = find_turned_image(detections, rig, camera, moments[row], uv[row, camera, fiducial])
-        if found is not None:
-            raise found.refusal() from error
+        images.append(compare_turns(detections, rig, camera, moments[row], uv[row, camera, fiducial]))
+    known = [image for image in images if image is not None]
+    turned = [image for image in known if not image.upright]
+    if turned and 2 * len(turned) <= len(known):  # otherwise, the places are wrong
+        raise turned[0].refusal() from error
 
 
-def find_turned_image(
+def compare_turns(
     detections: Detections, rig: CameraRig, camera: int, moments: NDArray[np.int64], uv: NDArray[np.float64]
-) -> TurnedImage | None:
+) -> ImageTurn | None:
     """Compare the blobs of one camera, turned in all ways, with markers that the other cameras find.
 
     Args:
@@ -102,7 +115,7 @@ def find_turned_image(
         uv: (P, 2) px, their places in the image.
 
     Returns:
-        None if the image is upright, or too little is known.
+        How the image fits; None if no way fits, or several do.
     """
     size = rig.image_size[camera].double().numpy()
     spread = float(image_error(rig, (rig.prior or RigPrior()).std(rig))[camera])
@@ -119,11 +132,11 @@ def find_turned_image(
         return None
     counts = np.array([_count_found(pairs, way, size - 1, reach) for way in WAYS])
     best = int(counts.argmax())
-    if best == 0 or counts[best] < LEAST_SHARE * places:
+    if counts[best] < LEAST_SHARE * places:
         return None
     if np.delete(counts, best).max() > LARGEST_OTHER * counts[best]:
         return None
-    return TurnedImage(rig.camera_names[camera], list(WAYS.values())[best], places, int(counts[0]), int(counts[best]))
+    return ImageTurn(rig.camera_names[camera], list(WAYS.values())[best], places, int(counts[0]), int(counts[best]))
 
 
 def _count_found(

@@ -136,3 +136,13 @@ def test_blobs_without_a_label_that_are_where_fiducials_should_be_are_no_witness
     found = fit_labelled(bare, rig, obj).tally
     assert found.labelled[:3, CAMERA].sum() == 0 and found.placed[:3, CAMERA].sum() > 6
     assert found.unexplained[:3, CAMERA].sum() == 0
+
+
+def test_nobody_is_blamed_if_all_images_are_turned():
+    rig, obj, truth = damage.wand_in_a_room(8)
+    table = damage.blobs(truth)
+    for camera in range(rig.num_cameras):
+        table = damage.mirrored(table, rig, camera, "both")
+    with pytest.raises(RefusedError) as refused:
+        calibrate(table, rig, obj)
+    assert "once the image is" not in str(refused.value)
