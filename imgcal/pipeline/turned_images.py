@@ -6,14 +6,16 @@ The other cameras say where the markers are in its image. In a turned image they
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from imgcal.association import Associations, image_error
 from imgcal.errors import RefusedError
-from imgcal.pipeline.labelled_capture import arrange_labels
+from imgcal.estimation import has_poses, initial_pose
+from imgcal.pipeline.labelled_capture import LabelledCapture, arrange_labels
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 
 UPRIGHT = "as it is"
@@ -34,7 +36,7 @@ FINER = 0.25
 """The same once the image has been shifted as a whole, as a share."""
 LEAST_PLACES = 8
 """Minimum number of markers that the others put into an image."""
-LEAST_SHARE = 0.4
+LEAST_SHARE = 0.5
 """Minimum share of them with a blob once the image is turned ..."""
 LARGEST_OTHER = 0.5
 """... and maximum ratio of the same for any other way, the image as it is included, to that."""
@@ -84,14 +86,34 @@ def require_upright_images(
     Raises:
         RefusedError: names the camera.
     """
-    arranged = arrange_labels(labelled, rig, obj)
+    try:
+        arranged = arrange_labels(labelled, rig, obj)
+    except RefusedError:  # no snapshot is left
+        return
+    if len(arranged.labelled.used) < LEAST_LABELLED * len(arranged.labelled.snapshots):
+        return
+    _require_upright(error, detections, rig, obj, arranged)
+    if (detections.fiducial >= 0).any() and obj.pose_rank == 6 and not obj.parts:
+        # Labels of a turned image fit, too: take the object's poses from the other cameras alone.
+        for camera in range(rig.num_cameras):
+            others = arranged.observations.seen.clone()
+            others[:, camera] = False
+            posed = has_poses(others.numpy(), obj.points)
+            if posed.sum() >= LEAST_LABELLED * len(posed):
+                rest = arranged.drop_snapshots(np.flatnonzero(~posed).tolist(), rig, obj)
+                poses = initial_pose(replace(rest.observations, seen=others[torch.from_numpy(posed)]), rig, obj)
+                _require_upright(error, detections, rig, obj, replace(rest, poses=poses))
+
+
+def _require_upright(
+    error: RefusedError, detections: Detections, rig: CameraRig, obj: CalibrationObject, arranged: LabelledCapture
+) -> None:
+    """Replace a refusal if a camera is turned, by the object's poses in a labelled capture."""
     points = arranged.poses.apply(obj.points.to(rig.focal_length))
     image = rig.expand(len(points)).project_values(points, obj.radius)
     seen = image.visible.numpy() & arranged.labelled.columns(obj)
     moments = arranged.labelled.moments[arranged.labelled.used]
     uv = image.uv.numpy()
-    if len(moments) < LEAST_LABELLED * len(arranged.labelled.snapshots):
-        return
     images = []
     for camera in range(rig.num_cameras):
         row, fiducial = np.nonzero(seen[:, camera])

@@ -51,6 +51,13 @@ def test_a_camera_whose_image_is_not_what_it_is_said_to_be_is_refused_by_name(ki
         calibrate(table, rig, obj, options)
 
 
+def test_labels_do_not_hide_that_an_image_is_turned():
+    rig, obj, truth = damage.wand_in_a_room(8)
+    table = damage.mirrored(damage.blobs(truth, labelled=True), rig, CAMERA, "both")
+    with pytest.raises(RefusedError, match=r"^camera cam04: .*once the image is turned by 180 degrees"):
+        calibrate(table, rig, obj)
+
+
 @pytest.mark.parametrize("how", ["lens", "place", "swapped"])
 @pytest.mark.parametrize("kind", MAKE)
 def test_an_upright_image_is_not_called_turned(kind, how):
