@@ -8,6 +8,7 @@ import math
 import os
 import platform
 import re
+import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -54,6 +55,12 @@ def surroundings(device: str = "cpu") -> dict[str, Any]:
     """Entries at the top of every result file: machine, threads, load."""
     load = round(os.getloadavg()[0], 2)  # well above zero: the machine was busy, so times are too long
     return {"machine": machine(device), "threads": torch.get_num_threads(), "load_average": load}
+
+
+def commit() -> str:
+    """Short hash of the commit whose code is measured; empty outside a repository."""
+    asked = ["git", "rev-parse", "--short=8", "HEAD"]
+    return subprocess.run(asked, cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
 
 
 def write_json(path: Path, result: dict[str, Any]) -> None:

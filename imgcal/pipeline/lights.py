@@ -31,6 +31,7 @@ from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, EstimationOptions, estimate, robust_std
 from imgcal.geometry import RigidTransform
 from imgcal.messages import name_cameras
+from imgcal.pipeline.turned_images import compare_turns
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
 
 HELD_OUT = 4
@@ -257,14 +258,16 @@ def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject
     factory = measure_agreement(detections, rig)  # no moment took part in it
     if bool(factory.agrees.all()):
         return rig, factory, 0
-    best = factory if factory.judged.any() else None
+    best, best_rig = factory if factory.judged.any() else None, rig
     for start in range(STARTS):
         random = torch.randn(std.shape, generator=generator, dtype=std.dtype)
         trial, agreement = _try_start(detections, rig, rig.retract(SPREAD[start] * random * std), obj, start)
         if trial is not None and agreement is not None and bool(agreement.agrees.all()):
             return trial, agreement, start + 1
         if agreement is not None and (best is None or agreement.score > best.score):
-            best = agreement
+            best, best_rig = agreement, trial or rig
+    if best is not None:
+        _require_upright_images(best, detections, rig, best_rig)
     wider = "if cameras may have moved farther than the rig's prior says, "
     raise _refusal(
         best,
@@ -273,6 +276,23 @@ def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject
         command=f"show fewer markers at once, or one light alone; {wider}write larger values under `prior` in the rig "
         "file, or carry one light around and use --cameras",
     )
+
+
+def _require_upright_images(agreement: Agreement, detections: Detections, factory: CameraRig, rig: CameraRig) -> None:
+    """Refuse if a camera that does not agree with the others would do so if its image were turned.
+
+    Raises:
+        RefusedError: names the camera.
+    """
+    bad = np.flatnonzero(agreement.judged & ~agreement.agrees).tolist()
+    for camera in bad if len(bad) <= agreement.agrees.sum() else []:
+        others = detections.select(detections.camera != camera)
+        lights = associate_lights(others, rig, even_error(rig), least_cameras=min(3, rig.num_cameras - 1))
+        image = factory.project(torch.from_numpy(lights.point))
+        seen = image.visible[camera].numpy()
+        turned = compare_turns(detections, factory, camera, lights.moment[seen], image.uv[camera].numpy()[seen])
+        if turned is not None and not turned.upright:
+            raise turned.refusal()
 
 
 def _try_start(

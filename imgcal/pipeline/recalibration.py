@@ -31,6 +31,7 @@ from imgcal.pipeline.lights import add_lights, find_lights
 from imgcal.pipeline.repeats import Repeats, drop_repeats, name_repeats, require_own_images
 from imgcal.pipeline.sources import Detector, Frames, check_frames, find_blobs, make_sight
 from imgcal.pipeline.synchronization import NOTICEABLE, find_unsynchronized
+from imgcal.pipeline.turned_images import require_upright_images
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import (
     CalibrationObject,
@@ -127,6 +128,7 @@ def calibrate(
         if obj.pose_rank == 6 and not obj.parts:
             require_units(error, detections, rig, obj)
         if labelled is not None:
+            require_upright_images(error, detections, labelled, rig, obj)
             require_same_moments(error, detections, labelled, rig, obj, options)
         raise
     seconds = {

@@ -28,7 +28,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.messages import list_names
 from imgcal.synthesis import PhysicalDrift, simulate_volume
 from scripts.benchmarks.wand_recording import CALIBRATED, calibrated, recording
-from scripts.output import ROOT, WORK, command, make_folder, read_json, surroundings, write_json
+from scripts.output import ROOT, WORK, command, commit, make_folder, read_json, surroundings, write_json
 
 RESULT, DONE = ROOT / "docs" / "benchmarks" / "lights.json", WORK / "lights.jsonl"
 LIGHTS = CalibrationObject.unknown()
@@ -243,7 +243,7 @@ def run(case: dict[str, Any]) -> dict[str, Any]:
     """Simulate and examine one case."""
     stick = STICKS.get(case["target"], ())
     markers = len(stick) or int(case["target"].split()[0])
-    return case | examine(simulate(markers, case["moments"], case["drift"], case["seed"], stick))
+    return case | {"commit": commit()} | examine(simulate(markers, case["moments"], case["drift"], case["seed"], stick))
 
 
 def bound(seeds: int) -> Iterable[dict[str, Any]]:

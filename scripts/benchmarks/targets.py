@@ -22,7 +22,7 @@ from imgcal.pipeline import Calibration
 from imgcal.synthesis import PhysicalDrift, simulate_volume, true_detections
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 from renderers import palette
-from scripts.output import ROOT, command, read_json, surroundings, write_json
+from scripts.output import ROOT, command, commit, read_json, surroundings, write_json
 
 HIDDEN, FALSE, NOISE = 0.25, 3, 0.1
 """Share of hidden markers; false blobs per camera; noise, px."""
@@ -127,7 +127,8 @@ def outcome(scene: str, drift: float, seed: int) -> dict[str, Any]:
     factory, truth, blobs = capture(objects, moments, drift, seed)
     known = [obj for obj in objects if obj.num_fiducials > 1]
     given = known if len(known) == len(objects) else [*known, load_object("lights")]
-    values: dict[str, Any] = {"scene": scene, "drift": drift, "seed": seed, "factory_mm": error_mm(factory, truth)[0]}
+    values: dict[str, Any] = {"scene": scene, "drift": drift, "seed": seed, "commit": commit()}
+    values["factory_mm"] = error_mm(factory, truth)[0]
     started = time.process_time()
     try:
         found = calibrate(replace(blobs, fiducial=np.full(len(blobs), -1)), factory, given)

@@ -14,6 +14,12 @@ CAMERA = 3
 BLIND = PipelineOptions(
     blind_cameras=True
 )  # a camera without any label would be refused otherwise, as one that sees nothing
+WAYS = {
+    "u": "mirrored left to right",
+    "v": "mirrored top to bottom",
+    "both": "turned by 180 degrees",
+    "turned": "turned by 90 degrees",
+}
 MAKE = {"room": damage.wand_in_a_room, "ring": damage.object_before_a_ring}
 
 
@@ -39,8 +45,25 @@ def wrong(kind, how):
 def test_a_camera_whose_image_is_not_what_it_is_said_to_be_is_refused_by_name(kind, how, options):
     table, rig, obj = wrong(kind, how)
     told = r"the other cameras put \d+ fiducials|its frames show what the other cameras see one snapshot earlier"
+    if how in WAYS:
+        told = rf"the other cameras put \d+ fiducials.*once the image is {WAYS[how]}"
     with pytest.raises(RefusedError, match=rf"^cameras? .*cam04.*: .*({told}).*rig\.select"):
         calibrate(table, rig, obj, options)
+
+
+def test_labels_do_not_hide_that_an_image_is_turned():
+    rig, obj, truth = damage.wand_in_a_room(8)
+    table = damage.mirrored(damage.blobs(truth, labelled=True), rig, CAMERA, "both")
+    with pytest.raises(RefusedError, match=r"^camera cam04: .*once the image is turned by 180 degrees"):
+        calibrate(table, rig, obj)
+
+
+@pytest.mark.parametrize("how", ["lens", "place", "swapped"])
+@pytest.mark.parametrize("kind", MAKE)
+def test_an_upright_image_is_not_called_turned(kind, how):
+    with pytest.raises(RefusedError) as refused:
+        calibrate(*wrong(kind, how))
+    assert "once the image is" not in str(refused.value)
 
 
 @pytest.mark.parametrize("crowd", [0, 5, 40])
@@ -120,3 +143,13 @@ def test_blobs_without_a_label_that_are_where_fiducials_should_be_are_no_witness
     found = fit_labelled(bare, rig, obj).tally
     assert found.labelled[:3, CAMERA].sum() == 0 and found.placed[:3, CAMERA].sum() > 6
     assert found.unexplained[:3, CAMERA].sum() == 0
+
+
+def test_nobody_is_blamed_if_all_images_are_turned():
+    rig, obj, truth = damage.wand_in_a_room(8)
+    table = damage.blobs(truth)
+    for camera in range(rig.num_cameras):
+        table = damage.mirrored(table, rig, camera, "both")
+    with pytest.raises(RefusedError) as refused:
+        calibrate(table, rig, obj)
+    assert "once the image is" not in str(refused.value)

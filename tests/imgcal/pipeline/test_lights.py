@@ -11,6 +11,7 @@ from imgcal import InputError, RefusedError
 from imgcal.association import associate
 from imgcal.geometry import rotation_from_vector
 from imgcal.pipeline.motion_check import _prepend_earlier
+from scripts.benchmarks import camera_faults
 from scripts.benchmarks.lights import LIGHTS, Scene, simulate, triangulation_error
 from tests.imgcal.association.stick_scenes import BODY, capture, several
 
@@ -110,6 +111,12 @@ def test_a_camera_of_another_moment_is_refused(scene: Scene) -> None:
     snapshot = np.where(late, (scene.detections.snapshot + 1) % 24, scene.detections.snapshot)
     with pytest.raises(RefusedError, match=r"unknown markers: camera .*cam06"):
         imgcal.calibrate(replace(scene.detections, snapshot=snapshot), scene.factory, LIGHTS)
+
+
+def test_a_camera_whose_image_is_turned_is_named(scene: Scene) -> None:
+    turned = camera_faults.mirrored(scene.detections, scene.factory, 5, "both")
+    with pytest.raises(RefusedError, match=r"^camera cam06: .*once the image is turned by 180 degrees"):
+        imgcal.calibrate(turned, scene.factory, LIGHTS)
 
 
 def test_few_snapshots_are_refused(scene: Scene) -> None:
