@@ -179,5 +179,5 @@ def test_a_singular_system_is_not_blamed_on_fiducials_that_are_there(conditions)
 
 
 def test_a_singular_system_for_want_of_fiducials_is_said_to_be_one(conditions):
-    with pytest.raises(InputError, match=r"missing: found 0.9, .* fiducials are left"):
+    with pytest.raises(InputError, match=r"missing: found 0.9, .* it leaves one rig 2 fiducials"):
         evaluate({"broken": Method(singular)}, conditions(missing=0.9), Protocol(count=9, trials=1))
