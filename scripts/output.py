@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -57,8 +58,9 @@ def surroundings(device: str = "cpu") -> dict[str, Any]:
     return {"machine": machine(device), "threads": torch.get_num_threads(), "load_average": load}
 
 
+@cache
 def commit() -> str:
-    """Short hash of the commit whose code is measured; empty outside a repository."""
+    """Short hash of the commit at the first call, whose code is measured; empty outside a repository."""
     asked = ["git", "rev-parse", "--short=8", "HEAD"]
     return subprocess.run(asked, cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
 
