@@ -113,9 +113,10 @@ class Scores:
         return f"{right:.1f} | {wrong:.1f} | {self.off:.2f} | {int(self.decided.sum())} of {len(self.decided)}"
 
     def is_better(self, other: Scores) -> bool:
-        """Tell whether this is better than `other` on the same snapshots by more than its uncertainty, and as exact.
+        """Tell whether this is better than `other` on the same snapshots by more than its uncertainty.
 
-        The light may have changed since most snapshots were kept, so it must not be worse on the latest, either.
+        It must be more often right and as exact, or as often right and more exact. The light may have changed since
+        most snapshots were kept, so it must not be worse on the latest, either.
 
         Examples:
             >>> scores = lambda right: Scores(*(np.full(4, n) for n in (8, right, 8, 0.1)), np.full(4, True))
@@ -123,11 +124,23 @@ class Scores:
             (True, False)
         """
         gain = self.quality - other.quality
-        sigma = gain.std(ddof=1) / np.sqrt(len(gain))
-        exact = self.off < EXACT or not other.right.any() or self.off < LESS_EXACT * other.off
         latest = gain[-max(len(gain) // LATEST, 1) :]
-        better = gain.mean() > SIGMAS * sigma and latest.mean() >= 0
-        return bool(better and exact and self.decided.sum() >= other.decided.sum())
+        if latest.mean() < 0 or self.decided.sum() < other.decided.sum():
+            return False
+        exact = self.off < EXACT or not other.right.any() or self.off < LESS_EXACT * other.off
+        closer = LESS_EXACT * max(self.off, EXACT) < other.off and _is_positive(self._log_ratio(other))
+        return bool((_is_positive(gain) and exact) or (gain.mean() >= 0 and closer))
+
+    def _log_ratio(self, other: Scores) -> NDArray[np.float64]:
+        """Log of how many times nearer this is than `other`, in each snapshot in which both are right somewhere."""
+        both = (self.right > 0) & (other.right > 0)
+        mine, others = (np.maximum(np.sqrt(each.squared[both] / each.right[both]), EXACT) for each in (self, other))
+        return np.log(others / mine)
+
+
+def _is_positive(values: NDArray[np.float64]) -> bool:
+    """Tell whether the mean of values exceeds zero by more than its uncertainty."""
+    return len(values) > 1 and bool(values.mean() > SIGMAS * values.std(ddof=1) / np.sqrt(len(values)))
 
 
 class Learner:

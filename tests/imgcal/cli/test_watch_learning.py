@@ -179,6 +179,15 @@ def test_a_gain_must_be_larger_than_its_uncertainty():
     assert not scores(8, 8, off=2.0).is_better(scores(6, 6, off=1.0))  # a measurer that learnt wrong places
     assert scores(8, 8, off=1.1).is_better(scores(6, 6, off=1.0))
     assert scores(8, 8, off=3.0).is_better(scores(0, 0, claimed=0))
+    # As right, and nearer to the markers.
+    assert scores(8, 8, 8, 8, off=0.2).is_better(scores(8, 8, 8, 8, off=2.0))
+    assert scores(8, 8, 8, 8, off=0.2).is_better(scores(8, 8, 7, 8, off=2.0))
+    assert not scores(8, 8, 8, 8, off=0.9).is_better(scores(8, 8, 8, 8, off=1.0))
+    assert not scores(8, 8, 8, 8, off=0.05).is_better(scores(8, 8, 8, 8, off=0.2))  # both are exact
+    assert not scores(7, 7, 7, 7, off=0.2).is_better(scores(8, 8, 8, 8, off=2.0))
+    assert not scores(8, 8, 8, 8, off=0.2, decided=False).is_better(scores(8, 8, 8, 8, off=2.0))
+    once = scores(8, 8, 8, 8, off=np.array((2.0, 2.0, 2.0, 3.5)))
+    assert not scores(8, 8, 8, 8, off=np.array((2.0, 2.1, 1.9, 0.5))).is_better(once)  # in one snapshot only
     # The light has changed: better before, worse now.
     assert not scores(8, 8, 8, 8, 8, 6).is_better(scores(5, 6, 5, 6, 8, 8))
     assert scores(8, 8, 8, 8, 7, 8).is_better(scores(5, 6, 5, 6, 7, 8))
