@@ -33,15 +33,16 @@ from imgcal.fleet import StoredResults, workers
 from imgcal.io import MODEL
 from imgcal.matching import MatchedFilter
 from imgcal.networks import Evidence, InfraredNetwork, Queries, load_infrared, load_measurer
+from imgcal.pipeline import LearnedMeasurer
 from imgcal.pipeline.learned_proposer import LearnedProposer
 from imgcal.pipeline.sources import Detector
 from imgcal.synthesis import DIFFICULTIES, FrameModel
-from imgcal.training import HELD_OUT, TRAIN
+from imgcal.training import HELD_OUT, HELD_OUT_PATCHES, TRAIN, TRAIN_PATCHES
 from imgcal.training.labelled_crops import cut_labelled
 from imgcal.types import CameraRig, Detections
 from scripts.output import RESULTS, ROOT, WORK, command, fill, machine, markdown, read_json, surroundings, write_json
 from scripts.results import degraded_captures as captures
-from scripts.results import infrared
+from scripts.results import infrared, measurer
 from scripts.results.degradations import DEGRADATIONS
 from tests.captures.sets import dot_grid
 
@@ -53,6 +54,7 @@ ADAPT = {
     "grid": (),
 }  # cameras used for training; views, for the grid
 REST = {"dots": ("cam2", "cam3"), "cavity": ("cam4",), "grid": ("cam",)}
+MEASURER = "measurer"
 ENCODERS = {"ir-cnn": "cnn", "ir-vit": "vit", "ir-vit-stem": "vit-stem"}
 SEEDS = (0, 1, 2)
 KEY = ("captures", "kind", "level", "detector")  # everything that a result depends on
@@ -90,15 +92,19 @@ def prepare(runs: Path) -> None:
             rig = given.rig.select([given.rig.camera_names.index(camera) for camera in ADAPT[name]])
         found = imgcal.calibrate(frames, rig, given.obj, detection=given.detection)
         blobs = imgcal.detect(frames, given.detection)
-        crops, _ = cut_labelled(
+        crops, patches = cut_labelled(
             lambda s, frames=frames: {camera: each[s] for camera, each in frames.items()},  # type: ignore[misc]
             blobs, found.rig, given.obj, detection=given.detection,
         )  # fmt: skip
-        held_out = torch.arange(len(crops)) % EVERY == EVERY - 1
         folder = runs / "data" / name
         folder.mkdir(parents=True, exist_ok=True)
-        crops.select(~held_out).save(folder / TRAIN, {"set": name})
-        crops.select(held_out).save(folder / HELD_OUT, {"set": name})
+        for samples, train_file, held_out_file in (
+            (crops, TRAIN, HELD_OUT),
+            (patches, TRAIN_PATCHES, HELD_OUT_PATCHES),
+        ):
+            held_out = torch.arange(len(samples)) % EVERY == EVERY - 1
+            samples.select(~held_out).save(folder / train_file, {"set": name})
+            samples.select(held_out).save(folder / held_out_file, {"set": name})
         print(f"{name}: {len(crops)} crops, {int(crops.seen.sum())} markers", flush=True)
 
 
@@ -116,6 +122,12 @@ def trainings(runs: Path, encoders: Iterable[str], seeds: Iterable[int]) -> list
     return made
 
 
+def measurer_trainings(runs: Path) -> list[list[str]]:
+    """Arguments of `imgcal train` for each adaptation of the measurer."""
+    return [["measurer-cnn", "--from", str(runs / "data" / name), "--out", str(adapted(runs, name, MEASURER, seed)),
+             "--set", f"training.seed={seed}"] for name in captures.SETS for seed in SEEDS]  # fmt: skip
+
+
 def adapted(runs: Path, name: str, encoder: str, seed: int) -> Path:
     """Folder of an adaptation."""
     return runs / f"{name}-{encoder}-{seed}"
@@ -128,8 +140,8 @@ def train(runs: Path, cores: int) -> None:
         if encoder != "ir-cnn" and not (runs / encoder / MODEL).is_file():
             todo.append(["ir-cnn", "--out", str(runs / encoder), "--set", f"network.encoder={ENCODERS[encoder]}"])
     run_trainings(todo, cores)
-    run_trainings([each for each in trainings(runs, ENCODERS, SEEDS)
-                   if not (Path(each[4]) / MODEL).is_file()], cores)  # fmt: skip
+    adaptations = [*trainings(runs, ENCODERS, SEEDS), *measurer_trainings(runs)]
+    run_trainings([each for each in adaptations if not (Path(each[4]) / MODEL).is_file()], cores)
 
 
 def run_trainings(todo: list[list[str]], cores: int) -> None:
@@ -316,6 +328,38 @@ def _share(row: dict[str, float]) -> str:
     return f"{row['right_percent']:.1f} / {row['wrong_percent']:.1f}"
 
 
+def measure_measurers(runs: Path, count: int) -> None:
+    """Measure the fitted ellipse, the shipped and the adapted measurers on rendered frames of the named levels."""
+    torch.set_num_threads(1)
+    networks = {"shipped": shipped_measurer()} | {
+        f"adapted to {name}, seed {seed}": load_measurer(adapted(runs, name, MEASURER, seed) / MODEL).network
+        for name in captures.SETS for seed in SEEDS
+    }  # fmt: skip
+    rows: dict[str, dict[str, Any]] = {}
+    for level in DIFFICULTIES:
+        views = list(measurer.snapshots(level, count))
+        methods = {"ellipse": None} | {name: LearnedMeasurer(network) for name, network in networks.items()}
+        found = {name: measurer.judged(views, method, alone=False) for name, method in methods.items()}
+        keys = ("rms_px", "median_px", "p90_px")
+        rows[level] = {name: {key: each[key] for key in keys} for name, each in found.items()}
+        print(level, {name: each["rms_px"] for name, each in found.items()}, flush=True)
+    write_json(JSON, read_json(JSON) | {"measurers": rows, "measurers_snapshots": count})
+
+
+def tables_of_measurers(levels: dict[str, dict[str, dict[str, float]]]) -> str:
+    """RMS and median error by level; of adapted measurers, the mean over seeds."""
+
+    def cell(row: dict[str, dict[str, float]], names: list[str]) -> str:
+        return " / ".join(f"{np.mean([row[name][key] for name in names]):.3g}" for key in ("rms_px", "median_px"))
+
+    columns = {"ellipse": ["ellipse"], "shipped": ["shipped"]} | {
+        f"adapted to {title}": [f"adapted to {name}, seed {seed}" for seed in SEEDS]
+        for name, title in captures.SETS.items()
+    }
+    lines = [[level, *(cell(row, names) for names in columns.values())] for level, row in levels.items()]
+    return markdown(["RMS / median error, px", *columns], lines)
+
+
 def calibrate_simulated(runs: Path) -> tuple[Outcome, ...]:
     """Calibrate simulated captures of all levels with the matched filter, the shipped and the adapted networks."""
     levels = {name: FrameModel(difficulty=each) for name, each in (infrared.HARDER | DIFFICULTIES).items()}
@@ -353,7 +397,7 @@ def counts(outcomes: Sequence[Outcome]) -> str:
 
 def main(
     runs: Path,
-    steps: tuple[str, ...] = ("prepare", "train", "measure", "levels", "calibrations", "page"),
+    steps: tuple[str, ...] = ("prepare", "train", "measure", "levels", "measurers", "calibrations", "page"),
     cores: int = 1,
     only: tuple[str, ...] = (),
     device: str = "cpu",
@@ -363,7 +407,7 @@ def main(
 
     Args:
         runs: folder of data sets and training runs.
-        steps: prepare, train, measure, levels, calibrations, page.
+        steps: prepare, train, measure, levels, measurers, calibrations, page.
         cores: processes at once.
         only: detectors to measure; none = all.
         device: of the query networks.
@@ -377,6 +421,8 @@ def main(
         measure(runs, cores, cases(runs, only or detectors(), device))
     if "levels" in steps:
         measure_levels(runs, count)
+    if "measurers" in steps:
+        measure_measurers(runs, count)
     if "calibrations" in steps:
         outcomes = [asdict(one) for one in calibrate_simulated(runs)]
         write_json(JSON, read_json(JSON) | {"calibrations": outcomes, "calibrations_measured_on": surroundings()})
@@ -385,6 +431,7 @@ def main(
         fill(PAGE, {
             "own frames": tables(found["outcomes"]),
             "own frames levels": tables_of_levels(found["levels"]),
+            "own frames measurers": tables_of_measurers(found["measurers"]),
             "own frames calibrations": tables_of_calibrations([Outcome(**row) for row in found["calibrations"]]),
         })  # fmt: skip
 
