@@ -9,11 +9,10 @@ estimate from all. For independent residuals, the difference would have the cova
 
 where H_b is a block's information about the (whitened) parameters with its poses marginalized, and 1 that of the prior.
 The squared differences over these variances, averaged over the parameters of a camera, are the factor by which the
-noise part of its covariance is too small. One factor for all its parameters preserves their correlations. Cameras
-differ widely, but few blocks determine a camera's factor only roughly: its own average is weighted against that of all
-cameras by how well the blocks determine it (empirical Bayes). Below the average it counts at most half, because errors
-come in episodes, and the camera's next one may be yet to come. Leaving a block out, rather than summing the scores of
-the residuals, accounts for the leverage of a block on the fit.
+noise part of its covariance is too small. One factor for all its parameters preserves their correlations. A camera that
+scatters more than the average gets its own factor: lenses differ widely. One that scatters less gets the mean of both:
+errors come in episodes, and its next one may be yet to come. Leaving a block out, rather than summing the scores of the
+residuals, accounts for the leverage of a block on the fit.
 
 Source: the delete-block jackknife (Kunsch, Annals of Statistics 1989), studentized by its value for independent noise,
 as the bias-reduced cluster-robust covariances are (Bell and McCaffrey, Survey Methodology 2002). Errors that are
@@ -45,10 +44,8 @@ MANY_BLOCKS = 32
 """Blocks at first (up to twice as many): each costs a factorization; they are then joined two by two."""
 SCATTER_SIGMAS = 3.0
 """Standard deviations by which the scatter must exceed its value for independent noise."""
-CAMERA_SPREAD = 0.5
-"""Standard deviation of the cameras' scatters about their average, relative to it, as in ten recorded cameras."""
-MOST_BELOW = 0.5
-"""Largest weight of a camera's own scatter where it is below the average."""
+CALM = 0.5
+"""Weight of a camera's own scatter below the average over all cameras; the average has the remaining weight."""
 OVERLAP = 2 / 3
 """Variance of the average over heavily overlapping blocks, relative to that over disjoint ones."""
 WORTH_MEASURING = 2.0
@@ -141,7 +138,7 @@ class Scatter(NamedTuple):
 
     average: float
     deviation: float  # standard deviation of the average, for independent noise
-    by_camera: Tensor  # (C,) weighted mean of a camera's own average and that of all cameras
+    by_camera: Tensor  # (C,) a camera's own average; below that of all cameras, the mean of both
 
 
 def _scatter(information: Tensor, pull: Tensor, joined: int, shape: torch.Size) -> Scatter:
@@ -170,15 +167,11 @@ def _scatter(information: Tensor, pull: Tensor, joined: int, shape: torch.Size) 
         return Scatter(1.0, 1.0, torch.ones(shape[0], dtype=pull.dtype, device=pull.device))
     scale = torch.where(known, variance.clamp_min(LEAST_SAID).rsqrt(), 0.0) / known.sum() ** 0.5
     ratio = (torch.stack(change) * scale).square().sum(0)
-    average, share = float(ratio.sum()), (known.view(shape).sum(1) / known.sum()).clamp_min(1e-9)
-    squares = torch.zeros_like(covariance)
-    for block in expected:
-        squares += (block * scale[:, None] * scale).square()
-    squares = squares.view(*shape, *shape).sum((1, 3)) * (2 * max(OVERLAP * joined, 1.0))  # (C, C)
-    weight = CAMERA_SPREAD**2 / (CAMERA_SPREAD**2 + squares.diagonal() / share.square())
-    own = torch.where(known.view(shape).any(1), ratio.view(shape).sum(1) / share, average)
-    weight = torch.where(own < average, weight.clamp_max(MOST_BELOW), weight)
-    return Scatter(average, float(squares.sum()) ** 0.5, average + weight * (own - average))
+    average, share = float(ratio.sum()), known.view(shape).sum(1) / known.sum()
+    own = torch.where(share > 0, ratio.view(shape).sum(1) / share.clamp_min(1e-9), average)
+    squares = sum(float((block * scale[:, None] * scale).square().sum()) for block in expected)
+    deviation = (2 * max(OVERLAP * joined, 1.0) * squares) ** 0.5
+    return Scatter(average, deviation, torch.where(own < average, CALM * own + (1 - CALM) * average, own))
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ def test_the_camera_whose_lens_is_bad_gets_the_larger_factor(simulate) -> None:
     assert factor[0] > 1.2 * factor[1:].max()
 
 
-def test_many_blocks_determine_the_factor_of_a_noisy_camera(simulate) -> None:
+def test_a_noisy_camera_gets_a_factor_of_its_own(simulate) -> None:
     factors = []
     for seed in range(3):
         case = simulate(snapshots=192, cameras=5, seed=seed)
