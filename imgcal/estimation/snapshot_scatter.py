@@ -10,7 +10,7 @@ estimate from all. For independent residuals, the difference would have the cova
 where H_b is a block's information about the (whitened) parameters with its poses marginalized, and 1 that of the prior.
 The squared differences over these variances, averaged over the parameters of a camera, are the factor by which the
 noise part of its covariance is too small. One factor for all its parameters preserves their correlations. A camera that
-scatters more than the average gets its own factor: lenses differ widely. One that scatters less gets the mean of both:
+scatters more than the average gets its own factor: lenses differ widely. One that scatters less gets a value in between:
 errors come in episodes, and its next one may be yet to come. Leaving a block out, rather than summing the scores of the
 residuals, accounts for the leverage of a block on the fit.
 
@@ -44,7 +44,7 @@ MANY_BLOCKS = 32
 """Blocks at first (up to twice as many): each costs a factorization; they are then joined two by two."""
 SCATTER_SIGMAS = 3.0
 """Standard deviations by which the scatter must exceed its value for independent noise."""
-CALM = 0.5
+CALM = 0.75
 """Weight of a camera's own scatter below the average over all cameras; the average has the remaining weight."""
 OVERLAP = 2 / 3
 """Variance of the average over heavily overlapping blocks, relative to that over disjoint ones."""
@@ -138,7 +138,7 @@ class Scatter(NamedTuple):
 
     average: float
     deviation: float  # standard deviation of the average, for independent noise
-    by_camera: Tensor  # (C,) a camera's own average; below that of all cameras, the mean of both
+    by_camera: Tensor  # (C,) a camera's own average; below that of all cameras, a value in between
 
 
 def _scatter(information: Tensor, pull: Tensor, joined: int, shape: torch.Size) -> Scatter:
