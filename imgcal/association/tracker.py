@@ -124,7 +124,7 @@ class Tracker:
 
     def accept(self, name: str, labels: NDArray[np.int64]) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
         """Accept the labels that came with a snapshot."""
-        few = self._too_few(name, labels)
+        few = self._refuse_too_few(name, labels)
         return few or SnapshotIdentity(name, "coded", "labelled in the input", 1, None), labels
 
     def decide(
@@ -177,13 +177,13 @@ class Tracker:
         labels, pose = identity.labels, identity.rig_from_object
         if not identity.accepted:
             return SnapshotIdentity(name, "refused", identity.reason, identity.alternatives, None), labels
-        if (few := self._too_few(name, labels)) is not None:
+        if (few := self._refuse_too_few(name, labels)) is not None:
             return few, labels
         assert pose is not None  # an accepted identity has one
         self._remember(name, blobs, labels, pose)
         return SnapshotIdentity(name, identity.status, identity.reason, identity.alternatives, pose), labels
 
-    def _too_few(self, name: str, labels: NDArray[np.int64]) -> SnapshotIdentity | None:
+    def _refuse_too_few(self, name: str, labels: NDArray[np.int64]) -> SnapshotIdentity | None:
         """Refuse a snapshot with too few fiducials; None = it has enough."""
         shown = len(np.unique(labels[labels >= 0]))
         least = self.options.least_fiducials

@@ -149,7 +149,7 @@ def settle_labels(scene: Scene, fits: Fits, rounds: int = 4) -> Fits:
     return fits
 
 
-def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
+def drop_uncertain_labels(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
     """Drop uncertain labels: those that a false blob or another fiducial may explain about as well.
 
     Args:

@@ -195,7 +195,7 @@ def minimize(problem: Problem, start: State, options: EstimationOptions) -> leve
             slow, levenberg_marquardt.select_rows(first.state, rows), replace(options, max_iterations=left)
         )
         spent += further.iterations
-        second = levenberg_marquardt.better(second, further)
+        second = levenberg_marquardt.choose_better(second, further)
     return levenberg_marquardt.replace_rows(first, rows, second, spent)
 
 

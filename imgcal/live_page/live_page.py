@@ -162,7 +162,7 @@ class LivePage:
             self._events.extend(state.events)
             self._news.notify()
 
-    def tell(self, event: Event) -> None:
+    def publish_event(self, event: Event) -> None:
         """Show an event that came with no state; returns at once."""
         with self._news:
             self._events.append(event)
@@ -280,10 +280,10 @@ class LivePage:
             try:
                 if ended:
                     raise BrokenPipeError("the server has ended")
-                self._pass_on(("answer", partial(dict, answer)) for answer in answers)
-                self._pass_on(courier.messages(latest, events))
+                self._send_all(("answer", partial(dict, answer)) for answer in answers)
+                self._send_all(courier.messages(latest, events))
                 if self._viewers and pictured is not None:
-                    self._pass_on(courier.pictures(*pictured))
+                    self._send_all(courier.pictures(*pictured))
             except OSError:
                 with self._news:
                     self._latest = self._latest or last
@@ -307,7 +307,7 @@ class LivePage:
         news = self._latest is not None or bool(self._events) or bool(self._answers)
         return news or self._closing or self._ended is self._pipe
 
-    def _pass_on(self, messages: Iterator[Message]) -> None:
+    def _send_all(self, messages: Iterator[Message]) -> None:
         """Send messages; report a failure once, and send the others."""
         assert self._pipe is not None
         for kind, make in messages:

@@ -350,7 +350,7 @@ class RigMonitor:
         anywhere = dict.fromkeys(cameras)
         before = free_cameras(case.before, anywhere, JUMPS[-1])
         if new:
-            before = self._anywhere(self._moved_early | set(cameras))
+            before = self._factory_with_free(self._moved_early | set(cameras))
         result = self._restart(before, [(drop_cameras(one, cameras), pose) for one, pose in case.latest], pauses)
         if new:
             self.known_since = self.filter.count - case.count
@@ -368,7 +368,7 @@ class RigMonitor:
     def _beginning(self) -> RigBelief | None:
         """What the factory says, where the latest snapshots are all that is known beside it."""
         everything = self.filter.count - self.known_since == len(self._recent)
-        return self._anywhere(self._moved_early) if everything else None
+        return self._factory_with_free(self._moved_early) if everything else None
 
     def _adopt(self, case: Case, verdict: Verdict, new: bool = False) -> MonitorUpdate:
         """Learn a case's snapshots again by the best explanation; `new`: the filter has not absorbed them before.
@@ -427,11 +427,11 @@ class RigMonitor:
                 earlier = [(drop_cameras(one, misfit), pose) for one, pose in case.snapshots[: -case.count]]
                 return MonitorUpdate(self._restart(self._beginning, [*earlier, *case.latest], case.pauses))
         early = self._moved_early | free.keys()
-        before = self._anywhere(early) if forget else free_cameras(case.before, free, jump)
+        before = self._factory_with_free(early) if forget else free_cameras(case.before, free, jump)
         result = self._restart(before, case.latest, case.pauses[-case.count :])
         if horizon is not None:
             self._moved_early = early
-            horizon.free(self._anywhere(early), free)
+            horizon.free(self._factory_with_free(early), free)
         number, new = self.filter.count - case.count, dict[int, Change]()
         for camera, kind in free.items():
             if forget or (kind is None and camera not in self.open):
@@ -446,7 +446,7 @@ class RigMonitor:
         self._moved_at |= dict.fromkeys(new, self.filter.count)
         return MonitorUpdate(result, tuple(new.values()))
 
-    def _anywhere(self, cameras: Collection[int]) -> RigBelief:
+    def _factory_with_free(self, cameras: Collection[int]) -> RigBelief:
         """The factory calibration with some cameras unconstrained."""
         return free_cameras(self._prior, dict.fromkeys(sorted(cameras)), JUMPS[-1])
 
@@ -565,7 +565,7 @@ class RigMonitor:
             self._recent.rebase(belief, information)
             with contextlib.suppress(RefusedError):
                 belief = self._restart(first, *self._recent.latest(pending.count)).belief
-            self.filter.suppose(first, age_belief(belief, pending.seconds, self.filter.walk))
+            self.filter.replace_beliefs(first, age_belief(belief, pending.seconds, self.filter.walk))
         self.open = {camera: change for camera, change in self.open.items() if camera not in kinds}
         if not self.open:
             self._pending = None

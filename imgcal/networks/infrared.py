@@ -80,7 +80,7 @@ class InfraredNetwork(nn.Module):
     """Compute evidence from crops and queries."""
 
     def __init__(self, config: InfraredConfig = InfraredConfig()) -> None:
-        """Create an untrained network; weights come from torch's default generators (see `drawing_from`)."""
+        """Create an untrained network; weights come from torch's default generators (see `use_generators`)."""
         super().__init__()
         self.config = config
         width = config.channels

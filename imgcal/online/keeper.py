@@ -26,7 +26,7 @@ from imgcal.online.drift_watch import SETTLED_SNAPSHOTS
 from imgcal.online.events import Event, snapshot_name
 from imgcal.online.foreign_object import ForeignObject
 from imgcal.online.image_quality import ImageQuality
-from imgcal.online.keeper_file import KeeperFile, read_state, unusable
+from imgcal.online.keeper_file import KeeperFile, read_state, unusable_error
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.labelling import Labelling
 from imgcal.online.object_checks import object_event
@@ -402,7 +402,7 @@ class RigKeeper:
                 if test.name in found["tests"]:
                     test.restored(reader.read_plain(found["tests"][test.name], f"tests.{test.name}"))
         except (ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
-            raise unusable(path, error) from error
+            raise unusable_error(path, error) from error
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         return keeper

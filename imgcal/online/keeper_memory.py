@@ -145,7 +145,7 @@ class KeeperMemory:
     def obj_now(self) -> CalibrationObject:
         """The object as currently estimated."""
         known = self.belief.obj  # with tolerances, even if an exact object has changed
-        return self.obj if known.exact else replace(self.obj.taken_as_exact(), points=self.belief.points_object)
+        return self.obj if known.exact else replace(self.obj.as_exact(), points=self.belief.points_object)
 
     @property
     def surroundings(self) -> Surroundings | None:

@@ -169,7 +169,7 @@ class Calibration:
         return estimate(
             self.observations,
             self.factory,
-            self.obj.taken_as_exact(),
+            self.obj.as_exact(),
             self.rig_from_object,
             prior_std=torch.zeros_like(self.estimate.problem.prior_std[0]),
         )
@@ -191,7 +191,7 @@ class Calibration:
         board, bend = self.obj.board, self.bend
         if board is not None and bend is not None:
             board = replace(board, bend=(bend.x, bend.y), warp=max(bend.x_sigma, bend.y_sigma))
-        return replace(self.obj.taken_as_exact(), points=self.points_object.detach(), board=board)
+        return replace(self.obj.as_exact(), points=self.points_object.detach(), board=board)
 
     @property
     def displaced(self) -> tuple[FiducialOffset, ...]:

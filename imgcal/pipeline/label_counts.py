@@ -81,7 +81,7 @@ def count_labels(
         obj: N fiducials.
         rig: as estimated; None = not yet, and unlabelled blobs count as being in the wrong place.
     """
-    labelled = replace(labelled, detections=labelled.repeated(obj))
+    labelled = replace(labelled, detections=labelled.repeat_unlabelled(obj))
     detections, used = labelled.detections, labelled.used
     shape = (len(labelled.snapshots), factory.num_cameras)
 

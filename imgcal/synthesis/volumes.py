@@ -50,11 +50,11 @@ def sample_path(
     """
     duration = (count - 1) / hand.rate
 
-    def drawn_turns(number: int) -> Floats:
+    def draw_turns(number: int) -> Floats:
         return TURNS * torch.randn(number, 3, generator=generator, dtype=torch.float64).numpy()
 
     places = _spline(lambda number: sample_volume(volume, number, generator).numpy(), _lengths, hand.speed, duration)
-    turns = _spline(drawn_turns, _angles, math.radians(hand.turning), duration)
+    turns = _spline(draw_turns, _angles, math.radians(hand.turning), duration)
     times = np.arange(count) / hand.rate
 
     def at(times: Floats) -> RigidTransform:
@@ -145,15 +145,15 @@ def sample_volume(volume: ConvexVolume, count: int, generator: torch.Generator) 
     """
     corners = torch.tensor((volume.low, volume.high), dtype=torch.float64)
 
-    def in_box(number: int) -> Tensor:
+    def draw_in_box(number: int) -> Tensor:
         unit = torch.rand(number, 3, generator=generator, dtype=torch.float64)
         return torch.lerp(corners[0], corners[1], unit)
 
     if volume.is_box:
-        return in_box(count)
+        return draw_in_box(count)
     found = torch.empty(0, 3, dtype=torch.float64)
     while len(found) < count:
-        places = in_box(max(2 * (count - len(found)), 64))
+        places = draw_in_box(max(2 * (count - len(found)), 64))
         found = torch.cat((found, places[torch.from_numpy(volume.contains(places.numpy()))]))
     return found[:count]
 

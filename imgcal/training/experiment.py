@@ -76,7 +76,7 @@ class TrainingConfig(StrictModel):
     save_every: Count = 500  # steps between two states to resume from
 
     @model_validator(mode="after")
-    def _ends(self) -> TrainingConfig:
+    def _check_limits(self) -> TrainingConfig:
         if self.steps is None and self.minutes is None:
             raise ValueError("found neither `steps` nor `minutes`, expected one of them")
         if self.patience is not None and not self.validation_rigs:

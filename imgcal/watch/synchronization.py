@@ -182,7 +182,7 @@ class Synchronizer:
     def release_due(self, now: float) -> tuple[TimedSnapshot, ...]:
         """Release snapshots that are due; call this now and then while nothing comes."""
         done: list[TimedSnapshot] = []
-        while self._pending and self._may_go(self._pending[0], now):
+        while self._pending and self._is_complete(self._pending[0], now):
             done.append(self._has_continued(self._pending.pop(0)))
         return self._drop_unsynchronized(done)
 
@@ -234,7 +234,7 @@ class Synchronizer:
         self._pending.insert(later[0] if name is None and later else len(self._pending), new)
         return new
 
-    def _may_go(self, pending: _Pending, now: float) -> bool:
+    def _is_complete(self, pending: _Pending, now: float) -> bool:
         if len(self._pending) > MOST_PENDING or all(
             name in pending.exposures or not self._is_due(name, pending) for name in self._active_cameras()
         ):

@@ -41,7 +41,7 @@ class PageOfLists:
     def publish(self, state, frames):
         self.published.append((state.snapshot, set(frames)))
 
-    def tell(self, event):
+    def publish_event(self, event):
         self.told.append(event)
 
     def commands(self):
