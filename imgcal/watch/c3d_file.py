@@ -140,7 +140,7 @@ def _parameters(labels: Sequence[str], rate: float, scale: float, frames: int) -
             **_labels("LABELS", labels),
             **_labels("DESCRIPTIONS", labels),  # some readers need them
         },
-        "ANALOG": {"USED": _integers(0), "GEN_SCALE": _real(1.0), "RATE": _reals(0.0)},
+        "ANALOG": {"USED": _integers(0), "GEN_SCALE": _real(1.0), "RATE": _real(0.0)},
         "TRIAL": {
             "ACTUAL_START_FIELD": _integers(1, 0),
             "ACTUAL_END_FIELD": _integers(frames, 0),

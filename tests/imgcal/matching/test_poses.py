@@ -12,6 +12,7 @@ from imgcal.matching.poses import (
     Scene,
     all_turns,
     distinct_turns,
+    search_one_camera,
     turn_object,
     turns_around,
 )
