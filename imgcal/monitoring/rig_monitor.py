@@ -53,7 +53,7 @@ NEW_SHARE = 0.25
 WRONG_LABEL, LEAST_BEFORE = 10.0, 2
 """Standard deviations beyond which a label is wrong, and fewest snapshots of a camera before its change: where hardly
 anything is known yet, wrong labels in its first snapshots, for example of half-hidden markers, look like a move."""
-SETTLED_SNAPSHOTS, LEAST_AGAIN = 16, 8
+RECENT_MOVE, LEAST_AGAIN = 16, 8
 """A second move of a camera within so many snapshots is doubted, and so many snapshots are needed to decide: a late
 camera seems to have moved in any two successive snapshots, but not in eight."""
 
@@ -338,7 +338,7 @@ class RigMonitor:
 
     def _moved_lately(self, camera: int) -> bool:
         """Tell whether a move of a camera was reported recently."""
-        return camera in self._moved_at and self.filter.count - self._moved_at[camera] < SETTLED_SNAPSHOTS
+        return camera in self._moved_at and self.filter.count - self._moved_at[camera] < RECENT_MOVE
 
     def _doubt(self, case: Case, cameras: Sequence[int]) -> MonitorUpdate:
         """Quarantine cameras that seem to move again and again: two snapshots cannot tell why, eight can.
