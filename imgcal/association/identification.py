@@ -120,7 +120,20 @@ def track(
     *,
     pose_known: bool = True,
 ) -> Identity:
-    """Label the blobs of one snapshot near a pose; arguments as in `identify`; `pose_known`: it is not a mere guess."""
+    """Label the blobs of one snapshot near one pose.
+
+    Args:
+        detections: as for `identify`.
+        rig: as for `identify`.
+        obj: as for `identify`.
+        std: (C, K) as for `identify`.
+        rig_from_object: () the pose, mm.
+        options: as for `identify`.
+        pose_known: False = the pose is a mere guess: the labelling must beat all rotations of the object.
+
+    Raises:
+        InputError: see `identify`.
+    """
     return _track(Scene(gather(detections, rig), obj, rig, std), rig_from_object, options, pose_known)
 
 
@@ -159,7 +172,7 @@ def relocalize(
     std: Tensor,
     options: IdentityOptions = IdentityOptions(),
 ) -> Identity:
-    """Label the blobs of one snapshot without a known pose; arguments as in `identify`."""
+    """Label the blobs of one snapshot without a known pose; arguments and errors as for `identify`, std (C, K)."""
     return _relocalize(Scene(gather(detections, rig), obj, rig, std), options)
 
 

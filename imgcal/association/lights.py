@@ -58,7 +58,7 @@ class Lights:
         return len(self.row)
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Lights:
-        """Keep the given rows (mask or indices)."""
+        """Keep some of the R markers, given as a mask (R,) or as indices."""
         return Lights(self.row[rows], self.moment[rows], self.point[rows], self.odds[rows], self.margin[rows])
 
     @cached_property

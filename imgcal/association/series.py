@@ -387,7 +387,7 @@ def match_to_rig(detections: Detections, rig: CameraRig) -> Detections:
 def accepted_observations(
     labelled: Associations, rig: CameraRig, obj: CalibrationObject
 ) -> tuple[Observations, RigidTransform | None]:
-    """Observations of the accepted snapshots, and their poses if all are known."""
+    """Observations (U, C, N) of the U accepted snapshots, and rig_from_object (U,); None = some pose is unknown."""
     used = labelled.used
     detections = labelled.detections
     rows = detections.fiducial >= 0

@@ -323,7 +323,7 @@ def object_prior_std(obj: CalibrationObject) -> Tensor:
 
 
 def initial_state(problem: Problem, rig_from_object: RigidTransform, initial_rig: CameraRig | None) -> State:
-    """Convert a first guess to a state of the problem."""
+    """Convert a first guess, poses (B, S) in mm and rigs (B) or None, to a state of the problem."""
     count, snapshots = problem.uv.shape[:2]
     rotation = rig_from_object.rotation.detach().to(problem.uv).reshape(count, snapshots, 3, 3)
     translation = rig_from_object.translation.detach().to(problem.uv).reshape(count, snapshots, 3)

@@ -47,14 +47,14 @@ class Given:
 
     @property
     def uv(self) -> Tensor:
-        """(B, C, N, 2) pixels."""
+        """Pixels of the fiducials: (B, C, N, 2). Raises `ValueError` if the views hold no points."""
         if self.views.uv is None:
             raise ValueError("views hold no points")
         return self.views.uv
 
     @property
     def seen(self) -> Tensor:
-        """(B, C, N) bool."""
+        """Which fiducials are seen: (B, C, N) bool. Raises `ValueError` if the views hold no points."""
         if self.views.seen is None:
             raise ValueError("views hold no points")
         return self.views.seen
@@ -220,7 +220,7 @@ def network_method(network: Network, batch: int | None = None) -> Method:
 def refine_by_positions(
     prediction: Prediction, sightings: Positions, factory: CameraRig, obj: CalibrationObject, prior_std: Tensor
 ) -> Prediction:
-    """Refine on the positions that an image network has found, each with the sigma that it predicts; Cauchy's loss."""
+    """Refine (B) predictions on the positions of an image network with their predicted sigmas; prior_std (C, K)."""
     return make_prediction(_fit_to_positions(prediction, sightings, factory, obj, prior_std))
 
 

@@ -210,7 +210,7 @@ class RecentSnapshots:
         return [entry.seconds for entry in list(self._seen)[-age:]]
 
     def screen(self) -> NDArray[np.float64]:
-        """Score each camera since each of `SCREENED_AGES`: (ages, C); see `screen`."""
+        """Score the change of each camera since each of `SCREENED_AGES`: (ages, C), the largest of any kind."""
         scores = np.empty((len(SCREENED_AGES), len(self._change)))
         known = (self._at, self._change.contiguous().numpy(), PARTS)
         screen(self._ring, self._totals, self._next, len(self), *known, SCREENED_AGES, scores)

@@ -124,7 +124,7 @@ class RigFilter:
     def follow(
         self, observations: Observations, rig_from_object: RigidTransform, seconds: float = 0.0
     ) -> MeasurementUpdate:
-        """Do the work of `update`, except that the caller must call `relinearize` when `due`."""
+        """Do the work of `update`, except that the caller must call `relinearize` when `due`; arguments as for it."""
         horizon, alone = self.horizon, None
         if horizon is not None and horizon.snapshots == 1 and self._early:
             alone = horizon.remove(self.belief, seen_cameras(self._early), observations.seen[0].any(-1), self._first)

@@ -47,7 +47,7 @@ class Queries:
     asked: Tensor  # (P, N) bool: expected in view
 
     def select(self, rows: Tensor) -> Queries:
-        """Select crops by row."""
+        """Select some of the P crops by mask (P,) or indices."""
         return Queries(self.place[rows], self.radius[rows], self.depth[rows], self.asked[rows])
 
     def geometry(self, size: int) -> Tensor:

@@ -164,7 +164,7 @@ class KeeperMemory:
 
     @property
     def unsettled(self) -> frozenset[int]:
-        """Cameras whose drift is not measured: those that moved, are lost or do not fit; at first all of a factory rig."""
+        """Cameras whose drift is not measured: moved, lost or off; at first all of a rig with its factory values."""
         filtered = self.monitor.filter
         if not filtered.calibrated and filtered.count < DRIFT_FROM:
             return frozenset(range(self.prior.num_cameras))

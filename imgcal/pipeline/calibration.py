@@ -132,7 +132,7 @@ class Calibration:
 
     @property
     def poses_by_object(self) -> Mapping[str, Mapping[str, RigidTransform]]:
-        """rig_from_object by object name and snapshot name, in the frame of the object's file."""
+        """rig_from_object () by object name and snapshot name, mm, in the frame of the object's file."""
         rows, poses, parts = self.labelled.used, self.rig_from_object, self.obj.each
         found: dict[str, dict[str, RigidTransform]] = {part.name: {} for part in parts}
         for row, part, rotation, translation in zip(

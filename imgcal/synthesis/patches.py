@@ -36,7 +36,7 @@ class Patches:
     kind: Tensor  # (M,) BlobKind
 
     def select(self, rows: Tensor) -> Patches:
-        """Keep some patches."""
+        """Keep some of the M patches, by a mask (M,) or indices."""
         return Patches(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 

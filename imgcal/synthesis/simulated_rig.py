@@ -76,7 +76,7 @@ class SimulatedRig:
         self._base = self._base.retract(step)
 
     def pose(self, seconds: float) -> RigidTransform:
-        """Where the object is carried: rig_from_object."""
+        """Where the object is after some seconds: rig_from_object (), mm."""
         sway = [math.sin(2 * math.pi * seconds / period + k) for k, period in enumerate(PERIODS)]
         turn = [most * math.sin(2 * math.pi * seconds / period + 2 * k) for k, (most, period) in enumerate(TURNS)]
         rotation = rotation_from_vector(torch.tensor(turn, dtype=torch.float64))

@@ -391,7 +391,7 @@ class CameraRig:
         return self.map_tensors(lambda tensor, axes: tensor.reshape(*batch, *tensor.shape[-axes:]))
 
     def map_tensors(self, function: Callable[[Tensor, int], Tensor]) -> CameraRig:
-        """Apply `function(tensor, number of its axes that are not batch)` to every tensor that has batch axes."""
+        """Apply `function(tensor, number of its last axes that are not batch)` to every tensor with batch axes *B."""
         return replace(
             self,
             focal_length=function(self.focal_length, 2),

@@ -54,12 +54,12 @@ class TimedSnapshot:
     name: str | None = None  # if the source names snapshots
 
     def frames(self, camera_names: tuple[str, ...]) -> dict[str, Frame | None]:
-        """Frame of each camera; None = no frame, or blobs."""
+        """Frame (H, W) of each camera; None = no frame, or blobs."""
         contents = {name: self.exposures[name].content for name in camera_names if name in self.exposures}
         return {name: None if isinstance(found := contents.get(name), CameraBlobs) else found for name in camera_names}
 
     def source(self, camera_names: tuple[str, ...]) -> dict[str, Frame | None] | Detections:
-        """Input for a keeper: frames by camera, or blobs if the source sends those."""
+        """Input for a keeper: frames (H, W) by camera, or blobs if the source sends those."""
         given = [
             (camera, content)
             for camera, name in enumerate(camera_names)
