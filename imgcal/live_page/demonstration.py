@@ -127,4 +127,4 @@ class Demonstration:
                 self.paused = command.name == "pause"
             case "factory", _:
                 with contextlib.suppress(RefusedError):  # before the first snapshot it is the factory's
-                    self.page.publish_event(self.keeper.accept_as_factory())
+                    self.page.tell(self.keeper.accept_as_factory())

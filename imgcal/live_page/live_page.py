@@ -162,7 +162,7 @@ class LivePage:
             self._events.extend(state.events)
             self._news.notify()
 
-    def publish_event(self, event: Event) -> None:
+    def tell(self, event: Event) -> None:
         """Show an event that came with no state; returns at once."""
         with self._news:
             self._events.append(event)

@@ -71,7 +71,7 @@ class Page(Protocol):
     def publish(self, state: RigState, frames: Mapping[str, Frame | None] | None) -> None:
         """Take the state after a snapshot, and its frames (H, W) by camera if there are any; must return at once."""
 
-    def publish_event(self, event: Event) -> None:
+    def tell(self, event: Event) -> None:
         """Take an event without a snapshot; must return at once."""
 
     def commands(self) -> Iterable[Any]:
@@ -254,7 +254,7 @@ class Watch:
         if self.tally.latest is not None and event.kind in IN_HISTORY:
             self._keep(self.tally.latest)
         if self._page is not None and (self.tally.latest is None or event not in self.tally.latest.events):
-            self._page.publish_event(event)  # other events come with their state
+            self._page.tell(event)  # other events come with their state
         self._told(event)
 
     def save(self) -> None:

@@ -73,4 +73,4 @@ def test_windows_are_no_larger_than_the_image_asks_for() -> None:
 
 def test_no_splats_leave_images_black() -> None:
     assert not drawn(splats(2, 0), SIZE)[0].any()
-    assert additive_splatting_cpu.drawn(splats(0), SIZE)[0].shape == (0, 3, *SIZE)
+    assert additive_splatting_cpu.draw_new(splats(0), SIZE)[0].shape == (0, 3, *SIZE)

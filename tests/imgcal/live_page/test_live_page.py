@@ -45,7 +45,7 @@ def test_the_server_is_started_again_where_it_ended(served, o10, asymmetric8):
 
 def test_a_server_that_ends_while_nothing_comes_is_started_again_with_what_it_knew(o10, asymmetric8):
     with LivePage(o10, asymmetric8, Address(port=0)) as page:
-        page.publish_event(alarm("cam02"))  # shown without any state
+        page.tell(alarm("cam02"))  # shown without any state
         page.publish(made_state(o10, asymmetric8, 7))
         reader = Stream(page)
         assert reader.wait("events", lambda content: content)[0]["camera"] == "cam02"
@@ -118,7 +118,7 @@ def test_events_that_wait_are_bounded(o10, asymmetric8):
     page = LivePage(o10, asymmetric8, Address(port=0))
     page.close()
     for _ in range(module.MOST_EVENTS + 10):
-        page.publish_event(alarm("cam01"))
+        page.tell(alarm("cam01"))
     assert len(page._events) == module.MOST_EVENTS
 
 
@@ -176,7 +176,7 @@ def test_a_command_that_the_loop_never_gets_is_shown_as_done_nowhere(o10, asymme
     monkeypatch.setattr(module, "MOST_COMMANDS", 1)
     told = []
     with LivePage(o10, asymmetric8, Address(port=0), actions=ACTIONS, problem=told.append) as page:
-        page.publish_event(alarm("cam02"))
+        page.tell(alarm("cam02"))
         reader, client = Stream(page), Client(page)
         reader.wait("events", lambda content: content)
         assert client.command({"name": "warm"})[0] == 200

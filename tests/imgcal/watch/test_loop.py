@@ -41,7 +41,7 @@ class PageOfLists:
     def publish(self, state, frames):
         self.published.append((state.snapshot, set(frames)))
 
-    def publish_event(self, event):
+    def tell(self, event):
         self.told.append(event)
 
     def commands(self):
