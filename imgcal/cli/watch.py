@@ -71,7 +71,7 @@ from imgcal.watch import Watch as Loop
 MARKER_SUFFIXES, TABLE_SUFFIXES = (".c3d", ".trc"), (".csv", ".jsonl")
 POSE_OUTPUTS = "FILE.csv, FILE.jsonl, FILE.c3d, FILE.trc, tcp://HOST:PORT or igtl://[HOST:]PORT"
 BLOBS_ONLY = (BlobTable, JsonLines, LabStreaming, Qualisys)
-LEARNING_CODE = "from imgcal.cli.watch_learning import main; main()"
+LEARNING_CODE = "from imgcal.cli.learning_process import main; main()"
 USUAL_RATE = 30.0  # snapshots a second of a table of blobs
 
 # What kind of input an option is for.

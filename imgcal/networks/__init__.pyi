@@ -1,12 +1,14 @@
 from .checkpoint import (
     Checkpoint,
+    check_object,
+    check_rig,
+    check_says_rigs,
     load_checkpoint,
     load_network,
     read_subject,
     save_checkpoint,
     warm_start,
 )
-from .compatibility import check_object, check_rig, check_says_rigs
 from .config import (
     PRESETS,
     HueCentroids,
