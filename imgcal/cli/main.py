@@ -29,7 +29,7 @@ from imgcal.machine import without_garbage_collection
 from imgcal.messages import one_line, quote, shorten
 
 ONE_OF = {"calibrate": ("--rig", "--cameras")}
-"""Options of which a command needs one; the parser knows each as optional."""
+"""Groups of options, one of which a command needs; the parser knows each as optional."""
 
 SEVERAL_OBJECTS = ("simulate", "calibrate", "score")
 """Commands whose `--object` may be several."""

@@ -109,7 +109,7 @@ def compare_detectors(
 def judge(result: Calibration, truth: CameraRig, seed: int = 0) -> tuple[bool, float, float, float]:
     """Compare a calibration with the true rig at random points of its working volume.
 
-    Both rigs are laid upon one another by the rigid motion that makes their difference smallest, as for
+    Both rigs are aligned by the rigid motion that makes their difference smallest, as for
     `predicted_error`. A calibration is wrong where the error that 5 % of the points exceed is larger than `WRONG_PX`
     and than `WRONG_RATIO` times the one that it claims.
 

@@ -25,7 +25,7 @@ LEAST_RISE = 3.0
 """Times the error of the untouched network, that each spoilt output must reach at least."""
 
 Spoil = Callable[[Tensor, int], Tensor]
-"""Replaces an encoder's output (rows, ...), of which each of so many rigs has equally many rows."""
+"""Replaces an encoder's output (rows, ...); arguments: output, and number of rigs, which have equally many rows."""
 
 
 @dataclass(frozen=True)

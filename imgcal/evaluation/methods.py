@@ -43,7 +43,7 @@ class Given:
     sigma: float  # pixels, noise of the points
     degradation: Degradation = Degradation()  # what happens to images, beside what has happened to the points
     seed: int = 0  # of that
-    drawn: dict[ImageOptions, Tensor] = field(default_factory=dict)  # images, as far as somebody has asked for them
+    drawn: dict[ImageOptions, Tensor] = field(default_factory=dict)  # images that were asked for
 
     @property
     def uv(self) -> Tensor:

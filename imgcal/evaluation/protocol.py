@@ -29,7 +29,7 @@ LEAST_SIGMA = 0.02  # pixels: what exact points are believed to
 STAGES = ("alone", "refined", "one_pass")
 
 Progress = Callable[[int], None]
-"""Called with a number of rigs whenever so many more have been given to a method."""
+"""Called with the number of rigs that were just given to a method."""
 
 
 @dataclass(frozen=True)

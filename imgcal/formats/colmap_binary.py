@@ -47,7 +47,7 @@ class _Reader:
         return values
 
     def count(self, smallest: int) -> int:
-        """A number of records of at least so many bytes each."""
+        """Read a number of records, each of at least `smallest` bytes."""
         (count,) = self.read("Q")
         self.need(count * smallest)
         return int(count)

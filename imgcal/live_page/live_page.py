@@ -216,7 +216,7 @@ class LivePage:
         theirs.close()
         self._pipe = ours
         with self._news:
-            greeting = frame_message("greeting", self._greeting)  # with what people were told and did so far
+            greeting = frame_message("greeting", self._greeting)  # with the events and commands so far
             self._answers.clear()  # whom they were for has gone
         threading.Thread(target=self._listen, args=(ours,), name="live page commands", daemon=True).start()
         ours.sendall(greeting)

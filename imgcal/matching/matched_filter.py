@@ -27,7 +27,7 @@ SURE_CAMERA = 2.0  # smallest log odds of a camera that counts for this comparis
 CLEAR = 40.0  # log odds between the best pose and the best distinct one at which the search ends
 FINE_CLIMBS = (0.03, 0.012)
 """Radians: steps on the finest maps."""
-MOST_RIVALS = 4  # fitted as well if the best pose does not stand out by far
+MOST_RIVALS = 4  # fitted as well if the best pose does not stand out clearly
 PARALLAX = 60.0  # px: how far a pose from one camera may be off in the others
 NEARLY = 0.07  # rad: a pose rotated further than this from the known ones gets new windows
 WORTHWHILE = 0.6  # of the frames' area: larger windows are not worth it
@@ -80,7 +80,7 @@ class View:
         return cls(scene, frames, dark, fine, response, fine.pool(_coarsest_cell(scene)), close)
 
     def proposal(self, found: Ranked, snapshot: Snapshot) -> Proposal:
-        """Fit and measure the best pose, and its rivals if it does not stand out by far."""
+        """Fit and measure the best pose, and its rivals if it does not stand out clearly."""
         scene = self.scene
         margin, rivals = pose_margin(found, self.close)
         result = self._fit(found.best(1)) if margin > 0 else None

@@ -30,7 +30,7 @@ from imgcal.monitoring.snapshot_information import SnapshotInformation, add_bloc
 from imgcal.types import CameraRig, Observations
 
 KEPT_SNAPSHOTS = 64
-"""A change must show within so many snapshots: one second at 60 a second."""
+"""Number of snapshots within which a change must show: one second at 60 a second."""
 MOST_BASES = 8
 """Maximum number of times that the belief may have aged within them."""
 SCREENED_AGES = np.array((2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64))

@@ -42,10 +42,10 @@ from imgcal.monitoring.unsynchronized_cameras import drop_cameras
 from imgcal.types import Observations
 
 FEW_SNAPSHOTS = 16
-"""With at most so many snapshots before a change, the earlier knowledge is unreliable: it bends by more than its stated
-uncertainty, and the wrong camera would be blamed. It is then forgotten ..."""
+"""With at most this many snapshots before a change, the earlier knowledge is unreliable: it bends by more than its
+stated uncertainty, and the wrong camera would be blamed. It is then forgotten ..."""
 OBJECT_SNAPSHOTS = 8
-"""... and a change of the object is not considered before so many snapshots have been absorbed."""
+"""... and a change of the object is not considered before this many snapshots have been absorbed."""
 UNDECIDED_SNAPSHOTS = 16
 """Snapshots for which a camera stays in doubt that seemed to have moved without a decision."""
 NEW_SHARE = 0.25
@@ -54,7 +54,7 @@ WRONG_LABEL, LEAST_BEFORE = 10.0, 2
 """Standard deviations beyond which a label is wrong, and fewest snapshots of a camera before its change: where hardly
 anything is known yet, wrong labels in its first snapshots, for example of half-hidden markers, look like a move."""
 RECENT_MOVE, LEAST_AGAIN = 16, 8
-"""A second move of a camera within so many snapshots is doubted, and so many snapshots are needed to decide: a late
+"""A second move of a camera within the first number of snapshots is doubted, and takes the second to decide: a late
 camera seems to have moved in any two successive snapshots, but not in eight."""
 
 

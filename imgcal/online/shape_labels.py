@@ -21,11 +21,11 @@ Array = NDArray[np.float64]
 GATE = 4.0
 """Maximum error of a distance, in standard deviations."""
 LENGTH_ERROR = 1e-3
-"""Error of an object's distances, relative: nobody measures them better."""
+"""Relative error of an object's distances: they cannot be measured better."""
 LEAST_MARKERS = {5: 3, 6: 4}
 """Markers that an object needs, by the rank of its pose; all if it has fewer."""
 FLAT = 1.0
-"""mm: extent across a plane below which an object is as good as its mirror image."""
+"""mm: extent across a plane below which an object equals its mirror image."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ DRAWS = 20_000
 TURNS = 1.5
 """Radians, standard deviation of each component of the rotation vectors between which an object turns."""
 TRIALS, FINE = 64, 16
-"""Controls of a spline of which the speed is measured, and steps from control to control."""
+"""Controls of the spline whose speed is measured, and steps from control to control."""
 MOST_CONTROLS = 1_000_000
 OUTER = 0.05
 """Share of what is seen that is left out at each side of a volume that is looked for."""

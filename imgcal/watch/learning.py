@@ -39,7 +39,7 @@ SUBJECTS = ("ir-cnn", "measurer-cnn")
 """The networks that are adapted together: one finds the markers, the other measures their centres."""
 LEARNING, DATASET, ADAPTED, CANDIDATE, ADAPTED_CARD = "learning", "dataset", "adapted", "candidate", "README.md"
 TURN = 5
-"""Of so many stretches of time in a row, the last is held out."""
+"""Number of stretches of time in a row of which the last is held out."""
 APART = 0.1
 """RMS motion of the object's points between two kept snapshots, in radii of the object, at least."""
 LARGEST_LAG = 0.5
@@ -96,7 +96,7 @@ class Moment:
 
 @dataclass(frozen=True)
 class LearningTask:
-    """What the process is told at its start."""
+    """What the process needs to know at its start."""
 
     folder: Path
     obj: CalibrationObject

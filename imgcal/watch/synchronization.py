@@ -20,7 +20,7 @@ MOST_PENDING = 32
 OUT_AFTER = 10
 """Successive snapshots without a camera after which it is no longer waited for."""
 INTERVALS, LEAST_INTERVALS = 8, 3
-"""Number of intervals between exposures of a camera whose median predicts its next one; until there are so many, it is
+"""Number of intervals between exposures of a camera whose median predicts its next one; with fewer, it is
 always due."""
 BEGINNING = 3.0
 """Time (s) to wait for a camera with few exposures: it may send once a second."""
