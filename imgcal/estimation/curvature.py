@@ -78,13 +78,13 @@ def _mean_square(estimate: Estimate, quantity: Callable[[CameraRig, Tensor], Ten
     factorization = solution.factorization
     x = _draw(factorization, solution.state, pairs)
     follow = _follow(problem, solution.state, factorization, x)
-    there, back = quantity(*_step_rigs(problem, solution.state, _both_ways(x), follow)).chunk(2, dim=1)
+    there, back = quantity(*_step_rigs(problem, solution.state, _add_negatives(x), follow)).chunk(2, dim=1)
     even = 0.5 * (there + back)
     result = even.mT @ even / pairs
     return result.reshape(*estimate.chi2.shape, *result.shape[1:])
 
 
-def _both_ways(x: Step) -> Step:
+def _add_negatives(x: Step) -> Step:
     """Concatenate steps (B, K, ...) and their negatives: (B, 2 K, ...)."""
     return x.map(lambda part: torch.cat((part, -part), dim=1))
 
@@ -153,7 +153,7 @@ def _follow(problem: Problem, state: State, factorization: Factorization, x: Ste
     together = max(AT_ONCE, POINTS_AT_ONCE // at.residual[..., 0, :].numel())
     for first in range(0, x.camera.shape[1], together):
         some = Step(*(part if part is None else part[:, first : first + together] for part in x))  # type: ignore[arg-type]
-        there, back = _residual(problem, state, _both_ways(some)).chunk(2, dim=1)
+        there, back = _residual(problem, state, _add_negatives(some)).chunk(2, dim=1)
         bend = 0.5 * (there + back) - at.residual.unsqueeze(1)  # (B, K, S, C, 2, N)
         right = -torch.einsum("bscirn,bkscrn->bksci", by_rig, bend)
         camera, pose, own = right[..., :-POSE_PARAMETERS].sum(2), right[..., -POSE_PARAMETERS:].sum(3), None

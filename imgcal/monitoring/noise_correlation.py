@@ -49,7 +49,7 @@ SMOOTHING = 0.1
 
 # Persistent and passing errors.
 EPISODE, EPISODE_SECONDS = 2.0, 1.0
-"""How long a passing error may last: correlation times, and at least so many seconds. On the recorded wand, the mean
+"""How long a passing error may last: correlation times, and at least this many seconds. On the recorded wand, the mean
 shift of a camera over 0.8 s reaches 6 times its usual persistent error, and 3.5 times over 1.5 s."""
 LARGEST, LARGE_EPISODE_SECONDS = 10.0, 0.4
 """Errors larger than this many times the usual persistent error last no longer than those seconds. A target at the edge
