@@ -35,9 +35,10 @@ MEMORY_SNAPSHOTS = 1024
 """Number of latest snapshots used to measure correlation times ..."""
 FIRST_MEASUREMENTS, MEASUREMENT_INTERVAL = (48, 64, 96), 128
 """... counts of snapshots at which they are first measured, and the interval after that."""
-USUAL, USUAL_SECONDS, USUAL_SNAPSHOTS = 0.4, 0.1, 256
-"""Autocorrelation of the errors of infrared cameras at short intervals, its decay time (s, to 1/e), and the number of
-snapshots until which a calibrated rig is assumed to have no less: fewer snapshots cannot tell."""
+LONGEST, LONGEST_SECONDS, LONGEST_SNAPSHOTS = 0.97, 0.2, 256
+"""Autocorrelation of the errors at short intervals, and its decay time (s, to 1/e), of the worst of ten recorded infrared
+cameras, and the number of snapshots until which each camera of a calibrated rig is assumed to be like it. Fewer
+snapshots cannot tell, and a camera's error that is absorbed as if it were independent noise stays for long."""
 
 # Time between snapshots.
 FASTEST, SLOWEST = 1 / 60, 1.0
@@ -108,9 +109,9 @@ class NoiseCorrelation:
         if seconds > PAUSE * (self.interval or FASTEST):
             self.off = torch.full_like(self.off, math.nan)
 
-    def expect_usual(self) -> None:
-        """Assume the usual correlation at this rate until enough snapshots have been taken."""
-        self.usual = usual_time(self.interval) if self.taken < USUAL_SNAPSHOTS else 1.0
+    def expect_longest(self) -> None:
+        """Assume the longest correlation at this rate until enough snapshots have been taken."""
+        self.usual = longest_time(self.interval) if self.taken < LONGEST_SNAPSHOTS else 1.0
         if self.taken < FIRST_MEASUREMENTS[0]:
             self.time = torch.full_like(self.time, self.usual)
 
@@ -208,11 +209,11 @@ class NoiseCorrelation:
         self.scale = torch.from_numpy(np.maximum(usual / MEDIAN, LEAST_LASTING))
 
 
-def usual_time(seconds: float) -> float:
-    """Correlation time, in snapshots, of usual errors for snapshots that are `seconds` apart.
+def longest_time(seconds: float) -> float:
+    """Correlation time, in snapshots, of the longest errors to expect, for snapshots that are `seconds` apart.
 
     Examples:
-        >>> [round(usual_time(seconds), 2) for seconds in (1 / 60, 0.1, 1.0)]
-        [5.41, 1.47, 1.0]
+        >>> [round(longest_time(seconds), 2) for seconds in (1 / 60, 0.1, 1.0)]
+        [23.32, 3.99, 1.01]
     """
-    return 1 + 2 * USUAL / math.expm1(min((seconds or FASTEST) / USUAL_SECONDS, 50.0))
+    return 1 + 2 * LONGEST / math.expm1(min((seconds or FASTEST) / LONGEST_SECONDS, 50.0))

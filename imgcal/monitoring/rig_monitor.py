@@ -144,7 +144,7 @@ class RigMonitor:
         given = observations
         self.noise.pass_time(seconds)
         if self.filter.calibrated:
-            self.noise.expect_usual()
+            self.noise.expect_longest()
         observations = self.noise.weigh(self.shaking.apply_to(observations))
         new = [camera for camera in moved if camera not in self.quarantine.cameras]
         if new:
