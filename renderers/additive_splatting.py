@@ -16,7 +16,7 @@ class Splats(NamedTuple):
     colours: Tensor  # (B, N, K)
     visible: Tensor  # (B, N) bool; invisible splats may hold anything
 
-    def drawn(self) -> "Splats":
+    def drop_undrawable(self) -> "Splats":
         """Replace splats that are invisible or not finite by ones that draw nothing.
 
         Multiplying by zero is not enough: NaN times zero is still NaN, in the image and in the gradient.
@@ -62,7 +62,7 @@ def splat_additively(splats: Splats, image_size: tuple[int, int], out: Tensor | 
         (B, K, H, W) images on black.
 
     """
-    uv, sizes, weight, colours, _ = splats.drawn()
+    uv, sizes, weight, colours, _ = splats.drop_undrawable()
     height, width = image_size
     along_u = profile(uv[..., 0], sizes, 0, width)  # (B, N, W)
     along_v = profile(uv[..., 1], sizes, 0, height)  # (B, N, H)

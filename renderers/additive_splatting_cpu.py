@@ -32,7 +32,7 @@ NOWHERE = -(2**31)  # window start of splats that are not drawn
 FAST = {"contract", "reassoc", "nsz"}
 
 
-def drawn(splats: Splats, image_size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+def draw_new(splats: Splats, image_size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
     """Draw splats into new images (B, K, H, W); return the images, then what `draw` returns."""
     kind = np.float64 if splats.uv.dtype == torch.float64 else np.float32
     # NumPy asks Linux for huge pages: a large new tensor spends most of its time on faults of small pages.

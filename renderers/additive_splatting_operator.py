@@ -41,7 +41,7 @@ class _Added(torch.autograd.Function):
 
     @staticmethod
     def forward(*inputs: Any) -> tuple[Tensor, ...]:
-        return additive_splatting_cpu.drawn(Splats(*inputs[:5]), inputs[5:])
+        return additive_splatting_cpu.draw_new(Splats(*inputs[:5]), inputs[5:])
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -64,8 +64,8 @@ class _Added(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        folded = _folded(info.batch_size, in_dims[:5], inputs[:5])
-        return _unfolded(info.batch_size, _Added.apply(*folded, *inputs[5:]))
+        folded = _fold(info.batch_size, in_dims[:5], inputs[:5])
+        return _unfold(info.batch_size, _Added.apply(*folded, *inputs[5:]))
 
 
 class _AddedPlainly(torch.autograd.Function):
@@ -113,8 +113,8 @@ class _Gradients(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Tensor) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        folded = _folded(info.batch_size, in_dims, inputs)
-        return _unfolded(info.batch_size, _Gradients.apply(*folded))
+        folded = _fold(info.batch_size, in_dims, inputs)
+        return _unfold(info.batch_size, _Gradients.apply(*folded))
 
 
 @torch.library.custom_op(
@@ -127,7 +127,7 @@ def add_splats(
     uv: Tensor, sizes: Tensor, weight: Tensor, colours: Tensor, visible: Tensor, height: int, width: int
 ) -> Tensor:
     """Draw splats: (B, K, height, width), see `additive_splatting.splat_additively`."""
-    return additive_splatting_cpu.drawn(Splats(uv, sizes, weight, colours, visible), (height, width))[0]
+    return additive_splatting_cpu.draw_new(Splats(uv, sizes, weight, colours, visible), (height, width))[0]
 
 
 @torch.library.custom_op(
@@ -173,13 +173,13 @@ add_splats_gradients.register_autograd(_add_splats_gradients_backward, setup_con
 
 @add_splats.register_vmap
 def _(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> tuple[Tensor, int]:
-    folded = _folded(info.batch_size, in_dims[:5], inputs[:5])
+    folded = _fold(info.batch_size, in_dims[:5], inputs[:5])
     return add_splats(*folded, *inputs[5:]).unflatten(0, (info.batch_size, -1)), 0
 
 
 @add_splats_gradients.register_vmap
 def _(info: Any, in_dims: tuple[int | None, ...], *inputs: Tensor) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-    return _unfolded(info.batch_size, add_splats_gradients(*_folded(info.batch_size, in_dims, inputs)))
+    return _unfold(info.batch_size, add_splats_gradients(*_fold(info.batch_size, in_dims, inputs)))
 
 
 def _images_by(visible: Tensor, image_size: tuple[int, int]) -> Function:
@@ -216,7 +216,7 @@ def _tangent(function: Function, primals: Sequence[Tensor], tangents: Sequence[T
     return push(tuple(filled))[0]
 
 
-def _folded(size: int, in_dims: Sequence[int | None], tensors: Sequence[Tensor]) -> list[Tensor]:
+def _fold(size: int, in_dims: Sequence[int | None], tensors: Sequence[Tensor]) -> list[Tensor]:
     """Fold the mapped axis into the first: (B, ...) each."""
     moved = (
         x.expand(size, *x.shape) if axis is None else x.movedim(axis, 0)
@@ -225,5 +225,5 @@ def _folded(size: int, in_dims: Sequence[int | None], tensors: Sequence[Tensor])
     return [x.flatten(0, 1) for x in moved]
 
 
-def _unfolded(size: int, tensors: Sequence[Tensor]) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+def _unfold(size: int, tensors: Sequence[Tensor]) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
     return tuple(x.unflatten(0, (size, len(x) // max(size, 1))) for x in tensors), (0,) * len(tensors)

@@ -78,7 +78,7 @@ def _keep_cached(compiled: Any) -> Any:
             return compile_now(signature)
         # Numba's own lock comes first, as it does for a function that is compiled on behalf of another: threads that
         # took the two in different orders would wait for each other.
-        with global_compiler_lock, _alone(name):
+        with global_compiler_lock, _lock(name):
             return compile_now(signature)
 
     compiled.compile = compile_alone
@@ -86,7 +86,7 @@ def _keep_cached(compiled: Any) -> Any:
 
 
 @contextlib.contextmanager
-def _alone(name: str) -> Iterator[None]:
+def _lock(name: str) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):  # a file system without locks, or a folder that cannot be written
             if fcntl and cache_folder():

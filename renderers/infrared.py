@@ -131,7 +131,7 @@ def _composite(
     most = count if extent is not None else int(drawn.sum(-1).max()) if drawn.numel() else 0
     if most == 0:
         return blobs.uv.new_zeros(images, count)
-    ordered, order, shown = _nearest_first(blobs, drawn, images, most)
+    ordered, order, shown = _sort_by_depth(blobs, drawn, images, most)
     alpha, light, rows, columns = _windows(ordered, image_size, blur, largest)
     alpha = alpha * shown[..., None, None]
     light = None if light is None else light * shown[..., None, None]
@@ -199,7 +199,7 @@ def _largest(blobs: Spots, half: Tensor, drawn: Tensor) -> tuple[float, float, f
     return radius, along_u, along_v
 
 
-def _nearest_first(blobs: Spots, drawn: Tensor, images: int, most: int) -> tuple[Spots, Tensor, Tensor]:
+def _sort_by_depth(blobs: Spots, drawn: Tensor, images: int, most: int) -> tuple[Spots, Tensor, Tensor]:
     """Sort the blobs of each image by depth; those that are not drawn come last, as invisible unit discs.
 
     Returns:

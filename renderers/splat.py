@@ -92,7 +92,7 @@ def splat(
             _check_out(out, shape, uv.device, splats)
         if compositing == "add":
             return _add(splats, shape, out)
-        composed = _over(splats.drawn(), _reach(size), image_size, depth).reshape(shape)
+        composed = _over(splats.drop_undrawable(), _reach(size), image_size, depth).reshape(shape)
         return composed if out is None else out.copy_(composed)
 
 

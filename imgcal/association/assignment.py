@@ -89,7 +89,7 @@ def assign(cost: NDArray[np.floating], gate: float) -> NDArray[np.int64]:
     flat = cost.reshape(-1, fiducials, blobs)
     labels = np.full(flat.shape[:2], -1, dtype=np.int64)
     # If all cheapest blobs differ, they are the optimum. Only the rest needs the full search.
-    for b in np.flatnonzero(_cheapest(flat, gate, labels)):
+    for b in np.flatnonzero(_assign_cheapest(flat, gate, labels)):
         possible = flat[b] < gate
         rows, columns = np.flatnonzero(possible.any(1)), np.flatnonzero(possible.any(0))
         part = np.minimum(flat[b][np.ix_(rows, columns)], gate)
@@ -101,7 +101,7 @@ def assign(cost: NDArray[np.floating], gate: float) -> NDArray[np.int64]:
 
 
 @njit(cache=True)
-def _cheapest(cost, gate, labels):
+def _assign_cheapest(cost, gate, labels):
     """Give each fiducial its cheapest blob, and return where two would share one: (B,)."""
     contested, taken = np.empty(len(cost), np.bool_), np.empty(cost.shape[2], np.bool_)
     for b in range(len(cost)):

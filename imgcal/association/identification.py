@@ -33,7 +33,7 @@ from imgcal.association.verification import (
     STAGES,
     Fits,
     Scene,
-    certain,
+    drop_uncertain_labels,
     evidence,
     fit_and_label,
     is_settled,
@@ -120,7 +120,20 @@ def track(
     *,
     pose_known: bool = True,
 ) -> Identity:
-    """Label the blobs of one snapshot near a pose; arguments as in `identify`; `pose_known`: it is not a mere guess."""
+    """Label the blobs of one snapshot near one pose.
+
+    Args:
+        detections: as for `identify`.
+        rig: as for `identify`.
+        obj: as for `identify`.
+        std: (C, K) as for `identify`.
+        rig_from_object: () the pose, mm.
+        options: as for `identify`.
+        pose_known: False = the pose is a mere guess: the labelling must beat all rotations of the object.
+
+    Raises:
+        InputError: see `identify`.
+    """
     return _track(Scene(gather(detections, rig), obj, rig, std), rig_from_object, options, pose_known)
 
 
@@ -129,7 +142,7 @@ def _track(scene: Scene, rig_from_object: RigidTransform, options: IdentityOptio
     if obj.pose_rank < 6:  # its last pose says little: without a pattern it easily fits something else
         return _relocalize(scene, options)
     if scene.blobs.uv[..., 0].size * obj.num_fiducials > MOST_PAIRS:
-        return _refuse(scene, _too_many(scene))
+        return _refuse(scene, _explain_too_many_blobs(scene))
     poses = _one_snapshot(rig_from_object)
     predicted = predict_ideal(rig, obj.points.numpy(), poses)
     distance = float(np.median(_distances(rig, poses, obj)))
@@ -145,7 +158,7 @@ def _track(scene: Scene, rig_from_object: RigidTransform, options: IdentityOptio
     before, fits = fits.labels, fit_and_label(scene, fits, STAGES[0])
     share = max(_share(scene, fits.select(np.array([k])), options) for k in range(len(attempts)))
     if share < options.least_share:  # the object is elsewhere: further fits would not find it
-        return _refuse(scene, _too_little(obj.name, share, share, options.least_share))
+        return _refuse(scene, _explain_too_few_labels(obj.name, share, share, options.least_share))
     stages = () if is_settled(before, fits) else STAGES[1:]
     if len(attempts) > 1 and np.array_equal(*fits.labels):
         fits = fits.select(np.array([0]))
@@ -159,7 +172,7 @@ def relocalize(
     std: Tensor,
     options: IdentityOptions = IdentityOptions(),
 ) -> Identity:
-    """Label the blobs of one snapshot without a known pose; arguments as in `identify`."""
+    """Label the blobs of one snapshot without a known pose; arguments and errors as for `identify`, std (C, K)."""
     return _relocalize(Scene(gather(detections, rig), obj, rig, std), options)
 
 
@@ -187,7 +200,7 @@ def _relocalize(scene: Scene, options: IdentityOptions) -> Identity:
         if scene.blobs.count[camera] <= most or len(likely_blobs(scene.blobs, camera, outer)) <= most
     ]
     if not hopeful or scene.blobs.uv[..., 0].size * obj.num_fiducials > MOST_PAIRS:
-        return _refuse(scene, _too_many(scene))
+        return _refuse(scene, _explain_too_many_blobs(scene))
     bounds = _bounds(scene, scene.rig.working_distance or _guess_distance(scene), pose_known=False)
     generator = np.random.default_rng(options.seed)
     search = Search(scene, hopeful, bounds, alone=not options.others_in_view)
@@ -222,19 +235,19 @@ def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool
     if scene.obj.pose_rank < 6:
         least_share *= STICK_SHARE
     best = settle_labels(scene, _best(scene, fits, 1))
-    chosen = certain(scene, best, *odds)
+    chosen = drop_uncertain_labels(scene, best, *odds)
     share, refusal, margin, rival = _share(scene, chosen, options), None, -np.inf, None
     if share >= least_share:
         settled, margin = _against_motions(scene, best, known_pose)
         mine = fits
         if options.others_in_view:
-            beside = _beside(settled, fits)
+            beside = _uses_other_blobs(settled, fits)
             mine = fits.select(np.flatnonzero(~beside))
             if beside.any():
-                rival = _nearly_as_good(scene, settled, fits.select(np.flatnonzero(beside)), options.least_margin)
+                rival = _runner_up(scene, settled, fits.select(np.flatnonzero(beside)), options.least_margin)
         margin = min(margin, _margin(scene, settled, mine))
         if settled is not best:
-            chosen = certain(scene, settled, *odds)
+            chosen = drop_uncertain_labels(scene, settled, *odds)
             share = _share(scene, chosen, options)
         if margin < options.least_margin:
             refusal = (
@@ -242,7 +255,7 @@ def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool
                 f"{options.least_margin:.0f}; show more of the object, to more cameras"
             )
     if share < least_share:
-        refusal = _too_little(scene.obj.name, _share(scene, best, options), share, least_share)
+        refusal = _explain_too_few_labels(scene.obj.name, _share(scene, best, options), share, least_share)
     elif options.others_in_view and refusal is None and scene.rig.num_cameras > 1 and _cameras(chosen) < 2:
         refusal = "only one camera sees it, and other objects may be in view"
     rig, pose = rig_and_pose(scene, chosen, 0)
@@ -257,7 +270,7 @@ def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool
     return Identity(labels, pose, rig, status, order, margin, reason, share, evidence=strength, rival=rival)
 
 
-def _too_little(name: str, fitted: float, certain_share: float, least: float) -> str:
+def _explain_too_few_labels(name: str, fitted: float, certain_share: float, least: float) -> str:
     """Say why too few labels are certain: nothing fits, or the fit is ambiguous."""
     if fitted >= least:
         return (
@@ -289,13 +302,13 @@ def _cameras(fits: Fits) -> int:
     return int((fits.labels[0] >= 0).any(1).sum())
 
 
-def _beside(best: Fits, others: Fits) -> NDArray[np.bool_]:
+def _uses_other_blobs(best: Fits, others: Fits) -> NDArray[np.bool_]:
     """Tell which labellings (K,) use other blobs than the best one: they may be another object."""
     shared = np.array([common_blobs(best.labels[0], labels).sum() for labels in others.labels])
     return shared <= MOST_SHARED * np.maximum((others.labels >= 0).sum((1, 2)), 1)
 
 
-def _nearly_as_good(scene: Scene, best: Fits, others: Fits, least: float) -> NDArray[np.int64] | None:
+def _runner_up(scene: Scene, best: Fits, others: Fits, least: float) -> NDArray[np.int64] | None:
     """Labels (M,) of the best of other labellings; None if it is worse by `least` log odds."""
     strength = evidence(scene, others)
     row = int(strength.argmax())
@@ -430,7 +443,7 @@ def _one_snapshot(pose: RigidTransform) -> Poses:
     return Poses(pose.rotation.numpy()[None], pose.translation.numpy()[None])
 
 
-def _too_many(scene: Scene) -> str:
+def _explain_too_many_blobs(scene: Scene) -> str:
     name = scene.rig.camera_names[int(scene.blobs.count.argmax())]
     return (
         f"too many blobs: found {scene.blobs.count.max()} in camera {name}, where an object of "

@@ -58,7 +58,7 @@ class Lights:
         return len(self.row)
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Lights:
-        """Keep the given rows (mask or indices)."""
+        """Keep some of the R markers, given as a mask (R,) or as indices."""
         return Lights(self.row[rows], self.moment[rows], self.point[rows], self.odds[rows], self.margin[rows])
 
     @cached_property
@@ -289,7 +289,7 @@ def background_rows(detections: Detections) -> NDArray[np.bool_]:
         if moments < LEAST_MOMENTS:
             continue
         least = SHARE_OF_MOMENTS * moments
-        # A circle lies in four cells at most; in none of most images do so many blobs share one.
+        # A circle lies in four cells at most; hardly any image has so many blobs in one.
         cell = np.floor(uv / (2.001 * STILL)) @ (1.0, 2.0**24)
         if np.unique(cell, return_counts=True)[1].max() < least / 4:
             continue

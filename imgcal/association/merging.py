@@ -97,11 +97,13 @@ def merging_distance(labelled: Associations, rows: NDArray[np.int64]) -> NDArray
     reach, camera = 2 * detections.radius[rows] + BLUR, detections.camera[rows]
     unknown = np.isnan(reach)
     if unknown.any():
-        reach[unknown] = _closest(detections.select(detections.fiducial >= 0), camera.max() + 1)[camera[unknown]]
+        reach[unknown] = _closest_distances(detections.select(detections.fiducial >= 0), camera.max() + 1)[
+            camera[unknown]
+        ]
     return reach
 
 
-def _closest(blobs: Detections, cameras: int) -> NDArray[np.float64]:
+def _closest_distances(blobs: Detections, cameras: int) -> NDArray[np.float64]:
     """Smallest distance (px) of two blobs in one frame of each camera (C,), at most `MOST_REACH`."""
     closest = np.full(cameras, MOST_REACH)
     some = blobs.camera < cameras

@@ -116,11 +116,11 @@ def _compare_alone(scene: Scene) -> _Compared:
     poses = Poses(found.rotation.numpy(), found.translation.numpy())
     fitted = _minimize(scene, start(scene, poses, labels))
     if scene.obj.planar:
-        fitted = _better(fitted, _minimize(scene, start(scene, _mirror(scene, poses), labels)))
+        fitted = _choose_better(fitted, _minimize(scene, start(scene, _mirror(scene, poses), labels)))
     return fitted
 
 
-def _better(first: _Compared, second: _Compared) -> _Compared:
+def _choose_better(first: _Compared, second: _Compared) -> _Compared:
     """The better of two fits of each labelling."""
     other = second.cost < first.cost
     a, b, take = first.fits.state, second.fits.state, torch.from_numpy(other)

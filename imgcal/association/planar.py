@@ -59,7 +59,7 @@ def planar_poses(blobs: PaddedBlobs, rig: CameraRig, camera: int, obj: Calibrati
     """
     focal = float(rig.focal_length[camera].mean())
     count = blobs.count[camera]
-    ordinary = _ordinary(blobs.radius[camera, :count])
+    ordinary = _has_usual_radius(blobs.radius[camera, :count])
     every = blobs.ideal[camera, :count][ordinary].astype(np.float64) / focal
     points = obj.points.double().cpu().numpy()
     centroid = points.mean(0)
@@ -90,7 +90,7 @@ def _whole_homographies(flat: Floats, seen: Floats) -> list[Floats]:
     return homographies
 
 
-def _ordinary(radius: Floats) -> NDArray[np.bool_]:
+def _has_usual_radius(radius: Floats) -> NDArray[np.bool_]:
     """Mark blobs of about the usual radius, or of unknown radius."""
     if np.isnan(radius).all():
         return np.ones(len(radius), dtype=bool)

@@ -96,7 +96,7 @@ class Associations:
             self.detections, snapshot=moments[self.detections.snapshot], snapshot_names=tuple(names.values())
         )
 
-    def repeated(self, obj: CalibrationObject) -> Detections:
+    def repeat_unlabelled(self, obj: CalibrationObject) -> Detections:
         """The detections, with unlabelled blobs repeated in the row of every known object of their snapshot."""
         detections, moments = self.detections, self.moments
         known = np.array([not obj.each[snapshot.part].unknown_markers for snapshot in self.snapshots])
@@ -163,7 +163,7 @@ def associate(
 
         labelled = associate_several(detections, rig, obj, options, progress)
         if not labelled.used:
-            raise RefusedError(f"identity: {_why(labelled.snapshots)}")
+            raise RefusedError(f"identity: {_most_frequent_reason(labelled.snapshots)}")
         return labelled
     count = len(detections.snapshot_names)
     if obj.pose_rank < 6:
@@ -179,7 +179,7 @@ def associate(
     snapshots = tuple(series.results[s][0] for s in range(count))
     labelled = Associations(_label_blobs(detections, series.rows, series.results, series.looked), snapshots)
     if not labelled.used:
-        raise RefusedError(f"identity: {_why(snapshots)}")
+        raise RefusedError(f"identity: {_most_frequent_reason(snapshots)}")
     return labelled
 
 
@@ -204,21 +204,21 @@ class _Series:
         """Decide each snapshot, as long as this is promising."""
         patience = Patience(self.count)
         for number, s in enumerate(order):
-            if self.coded[s] or patience.tries(number, self.tracker.in_vain):
+            if self.coded[s] or patience.allows(number, self.tracker.in_vain):
                 self.decide(s, self._expected_pose(s))
             else:
-                self._not_tried(s)
+                self._mark_not_tried(s)
 
     def retry_incomplete(self, accepted: NDArray[np.int64]) -> None:
         """Try incomplete snapshots again, with the rig estimated from the accepted ones."""
-        incomplete = [s for s in range(self.count) if not self.coded[s] and self._incomplete(s)]
+        incomplete = [s for s in range(self.count) if not self.coded[s] and self._is_incomplete(s)]
         patience, tracker = Patience(len(incomplete)), self.tracker
         tracker.in_vain, tracker.looks_in_vain = 0, 0
         # Start with those nearest to accepted snapshots: they most probably show the object.
         for number, s in enumerate(sorted(incomplete, key=lambda s: _gap(s, accepted))):
             before = self.results[s]
             first, known_rig = before[0], self.rigs.get(s) is tracker.rig
-            if patience.tries(number, tracker.in_vain):
+            if patience.allows(number, tracker.in_vain):
                 tracker.pose = self._nearest_pose(s, accepted) or tracker.pose
                 # With the same rig, another search for a pose would find as little as the first.
                 self.decide(s, search=first.status != "refused" or not known_rig)
@@ -268,7 +268,7 @@ class _Series:
         name, blobs = self.detections.snapshot_names[s], self.detections.select(self.rows[s])
         if self.tracker.looks_in_vain >= MOST_LOOKS_IN_VAIN:
             if sight.where_blobs_fail:
-                self._not_tried(s)
+                self._mark_not_tried(s)
             else:
                 self.looked.pop(s, None)
                 self.results[s] = self.tracker.decide(blobs, name)
@@ -276,11 +276,11 @@ class _Series:
         snapshot, labels, self.looked[s] = self.tracker.look(sight, s, blobs, name)
         self.results[s] = snapshot, labels
 
-    def _not_tried(self, s: int) -> None:
+    def _mark_not_tried(self, s: int) -> None:
         name = self.detections.snapshot_names[s]
         self.results[s] = SnapshotIdentity(name, "refused", NOT_TRIED, 0, None), np.full_like(self.rows[s], -1)
 
-    def _incomplete(self, s: int) -> bool:
+    def _is_incomplete(self, s: int) -> bool:
         """Tell whether another try may help.
 
         It may where the snapshot was refused, where a camera has as many blobs as a pattern and no label, and where a
@@ -295,7 +295,7 @@ class _Series:
         return bool((blobs[labelled == 0] >= least).any())
 
 
-def _why(snapshots: Sequence[SnapshotIdentity]) -> str:
+def _most_frequent_reason(snapshots: Sequence[SnapshotIdentity]) -> str:
     """Say why no snapshot could be decided: the most frequent reason."""
     if not snapshots:
         return "found no snapshot"
@@ -356,7 +356,7 @@ class Patience:
     first_left_out: int = -1
     stride: int = 1
 
-    def tries(self, number: int, in_vain: int) -> bool:
+    def allows(self, number: int, in_vain: int) -> bool:
         """Tell whether to try the next snapshot after `in_vain` hypotheses without success."""
         if in_vain <= MOST_IN_VAIN:
             self.first_left_out = -1
@@ -387,7 +387,7 @@ def match_to_rig(detections: Detections, rig: CameraRig) -> Detections:
 def accepted_observations(
     labelled: Associations, rig: CameraRig, obj: CalibrationObject
 ) -> tuple[Observations, RigidTransform | None]:
-    """Observations of the accepted snapshots, and their poses if all are known."""
+    """Observations (U, C, N) of the U accepted snapshots, and rig_from_object (U,); None = some pose is unknown."""
     used = labelled.used
     detections = labelled.detections
     rows = detections.fiducial >= 0

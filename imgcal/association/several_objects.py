@@ -94,7 +94,7 @@ class _Capture:
             if self.coded[s]:
                 found, reason = self._accept_labels(s)
             else:
-                hopeful = [p for p, t in enumerate(self.trackers) if patience[p].tries(number, t.in_vain)]
+                hopeful = [p for p, t in enumerate(self.trackers) if patience[p].allows(number, t.in_vain)]
                 if hopeful:
                     found, reason = place_objects(self.trackers, hopeful, self.detections.select(self.rows[s]), name, s)
             if len(found) > len(self.found[s]) or not self.reasons[s]:

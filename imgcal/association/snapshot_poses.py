@@ -37,7 +37,7 @@ def fit_snapshot_poses(
     fixed = torch.zeros(rig.num_cameras, rig.num_parameters, dtype=rig.distortion.dtype)
     start = None if poses is None else poses.reshape(-1, 1)
     rigs = rig.expand(len(each.seen))
-    fit = estimate(each, rigs, obj.taken_as_exact(), start, prior_std=fixed, options=options)
+    fit = estimate(each, rigs, obj.as_exact(), start, prior_std=fixed, options=options)
     return fit.rig_from_object.reshape(-1), fit.converged
 
 

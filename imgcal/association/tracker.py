@@ -123,14 +123,24 @@ class Tracker:
         self.learnt.prior_std = prior_std
 
     def accept(self, name: str, labels: NDArray[np.int64]) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
-        """Accept the labels that came with a snapshot."""
-        few = self._too_few(name, labels)
+        """Accept the labels (M,) that came with the M blobs of a snapshot, and return them with the decision."""
+        few = self._refuse_too_few(name, labels)
         return few or SnapshotIdentity(name, "coded", "labelled in the input", 1, None), labels
 
     def decide(
         self, blobs: Detections, name: str, expected: RigidTransform | None = None, search: bool = True
     ) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
-        """Label the blobs of one snapshot; `expected` and `search` as for `propose`."""
+        """Label the blobs of one snapshot.
+
+        Args:
+            blobs: M of one snapshot.
+            name: of the snapshot.
+            expected: () as for `propose`.
+            search: as for `propose`.
+
+        Returns:
+            The decision, and the labels (M,); -1 = none.
+        """
         return self._conclude(self._adopt(self.propose(blobs, expected, search)), blobs, name)
 
     def look(
@@ -177,13 +187,13 @@ class Tracker:
         labels, pose = identity.labels, identity.rig_from_object
         if not identity.accepted:
             return SnapshotIdentity(name, "refused", identity.reason, identity.alternatives, None), labels
-        if (few := self._too_few(name, labels)) is not None:
+        if (few := self._refuse_too_few(name, labels)) is not None:
             return few, labels
         assert pose is not None  # an accepted identity has one
         self._remember(name, blobs, labels, pose)
         return SnapshotIdentity(name, identity.status, identity.reason, identity.alternatives, pose), labels
 
-    def _too_few(self, name: str, labels: NDArray[np.int64]) -> SnapshotIdentity | None:
+    def _refuse_too_few(self, name: str, labels: NDArray[np.int64]) -> SnapshotIdentity | None:
         """Refuse a snapshot with too few fiducials; None = it has enough."""
         shown = len(np.unique(labels[labels >= 0]))
         least = self.options.least_fiducials
@@ -222,7 +232,7 @@ class Tracker:
         return identify(blobs, self.rig, self.obj, self.prior_std, known, options, guesses, search=search)
 
     def conclude(self, proposed: Identity, blobs: Detections, name: str) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
-        """Update the state with the result of `propose` for these blobs."""
+        """Update the state with the result of `propose` for these M blobs; return the decision and the labels (M,)."""
         return self._conclude(self._adopt(proposed), blobs, name)
 
     def _adopt(self, found: Identity) -> Identity:

@@ -129,12 +129,12 @@ def refine(scene: Scene, fits: Fits, stages: tuple[float, ...] = STAGES) -> Fits
 
 
 def is_settled(before: NDArray[np.int64], fits: Fits) -> bool:
-    """Tell whether more stages would change nothing: labels are those of before, and their own errors explain all."""
+    """Tell whether more stages would change nothing: the labels stay, and their own errors explain all residuals."""
     return np.array_equal(before, fits.labels) and not fits.sigma.any()
 
 
 def fit_and_label(scene: Scene, fits: Fits, sigma: float) -> Fits:
-    """Fit with an error of `sigma` px beyond the blobs' own, and label anew."""
+    """Fit with an error of `sigma` px beyond the blobs' own, and label again."""
     fits = fit(scene, replace(fits, sigma=np.full(len(fits.labels), sigma)))
     return replace(fits, sigma=_residual_sigma(scene, fits), labels=_assign(fits))
 
@@ -149,7 +149,7 @@ def settle_labels(scene: Scene, fits: Fits, rounds: int = 4) -> Fits:
     return fits
 
 
-def certain(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
+def drop_uncertain_labels(scene: Scene, fits: Fits, odds: float, least_odds: float) -> Fits:
     """Drop uncertain labels: those that a false blob or another fiducial may explain about as well.
 
     Args:

@@ -102,7 +102,7 @@ def _vote_one(predicted, ideal, number, width, gate, windows, count, shift):
     for c in range(len(predicted)):
         most, best_i, best_j = 0, 0, 0
         if 4 * fiducials * number[c] > windows.size:
-            most, best_i, best_j = _fullest_of_many(windows, predicted[c], ideal[c], number[c], width, gate)
+            most, best_i, best_j = _fullest_window_of_many(windows, predicted[c], ideal[c], number[c], width, gate)
             count[c] = min(most, fiducials)
             shift[c, 0], shift[c, 1] = best_i * width - gate, best_j * width - gate
             continue
@@ -128,7 +128,7 @@ def _vote_one(predicted, ideal, number, width, gate, windows, count, shift):
 
 
 @njit(cache=True)
-def _fullest_of_many(windows, predicted, ideal, number, width, gate):
+def _fullest_window_of_many(windows, predicted, ideal, number, width, gate):
     """Do the same for one camera with more votes than windows: count each vote once, and then add the neighbours.
 
     Returns:

@@ -45,7 +45,7 @@ class Fleet(arguments.Fleet):
         if self.cores is not None and self.cores < 1:
             raise InputError(f"--cores: found {self.cores}, expected at least 1")
         manifest.check()
-        with dataset.written():
+        with dataset.open_writer():
             pass  # it can be written, and no other run is using it
         settings = Settings(self.blind_cameras, self.detector, self.seconds, self.memory_mb, self.keep_rigs)
         started = time.perf_counter()

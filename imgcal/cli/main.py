@@ -29,7 +29,7 @@ from imgcal.machine import without_garbage_collection
 from imgcal.messages import one_line, quote, shorten
 
 ONE_OF = {"calibrate": ("--rig", "--cameras")}
-"""Options of which a command needs one; the parser knows each as optional."""
+"""Groups of options, one of which a command needs; the parser knows each as optional."""
 
 SEVERAL_OBJECTS = ("simulate", "calibrate", "score")
 """Commands whose `--object` may be several."""
@@ -114,7 +114,7 @@ def _parse(arguments: list[str], stack: contextlib.ExitStack | None) -> Runnable
         print(f"imgcal {imgcal.__version__}")
         raise SystemExit(DONE)
     if first in COMMANDS:
-        options = _objects_last(first, arguments[1:])
+        options = _move_objects_last(first, arguments[1:])
         if {"-h", "--help"} & {*options}:
             _join_help_lines()
         given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=options)
@@ -134,7 +134,7 @@ def _parse(arguments: list[str], stack: contextlib.ExitStack | None) -> Runnable
     return tyro.cli(commands, prog="imgcal", description=DESCRIPTION, args=arguments)
 
 
-def _objects_last(command: str, arguments: list[str]) -> list[str]:
+def _move_objects_last(command: str, arguments: list[str]) -> list[str]:
     """Move the names of objects to the end, where nothing else can be taken for one more.
 
     Several may follow `--object` where the input stands first. Elsewhere what follows the first name is the input.
@@ -227,7 +227,7 @@ def _shorten(problem: str, arguments: list[str]) -> str:
                 return f"unexpected argument `{quote(word)}`"
             close = difflib.get_close_matches(word, kinds.split(), 1)
             return f"unknown `imgcal {command} {quote(word)}`" + (
-                f"; did you mean `{close[0]}`?" if close else f", expected {_one_of(kinds.split())}"
+                f"; did you mean `{close[0]}`?" if close else f", expected {_list_alternatives(kinds.split())}"
             )
         option = options[0].split()[0]
         close = [near[0]] if near else difflib.get_close_matches(option.partition("=")[0], list_options(command), 1)
@@ -246,9 +246,9 @@ def _shorten(problem: str, arguments: list[str]) -> str:
         close = difflib.get_close_matches(choice[1], known, 1)
         hint = f"; did you mean {close[0]}?" if close else ""
         option = f"{choice[2]}: " if choice[2].startswith("-") else ""
-        return f"{option}found {shorten(choice[1])}, expected {_one_of(known)}{hint}"
+        return f"{option}found {shorten(choice[1])}, expected {_list_alternatives(known)}{hint}"
     if group := re.match(r"Expected one of \{(.*)\}", problem):
-        return f"expected {_one_of(group[1].split(', '))} after `imgcal {command}`"
+        return f"expected {_list_alternatives(group[1].split(', '))} after `imgcal {command}`"
     if short := re.search(r"Missing value for argument '(\S+)'\. Expected (\d+) values", problem):
         return f"{short[1]}: found too few values, expected {short[2]}"
     if count := re.search(
@@ -265,7 +265,7 @@ def _shorten(problem: str, arguments: list[str]) -> str:
     return re.sub(r"\[/?[a-z ]+\]|^Error parsing \w+: ", "", problem)
 
 
-def _one_of(words: list[str]) -> str:
+def _list_alternatives(words: list[str]) -> str:
     return f"{', '.join(words[:-1])} or {words[-1]}" if len(words) > 1 else words[0]
 
 

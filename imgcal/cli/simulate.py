@@ -116,11 +116,13 @@ class Simulate(arguments.Simulate):
         truths: list[Truth] = []
         for part in obj.each:
             truths.append(
-                self._truth_of(truths[0].rig if truths else rig, part, generator, None if truths else self._drift())
+                self._simulate_truth(
+                    truths[0].rig if truths else rig, part, generator, None if truths else self._drift()
+                )
             )
         return join_truths(truths)
 
-    def _truth_of(
+    def _simulate_truth(
         self, rig: CameraRig, obj: CalibrationObject, generator: torch.Generator, drift: Drift | None
     ) -> Truth:
         if obj.board is not None:

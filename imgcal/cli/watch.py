@@ -71,7 +71,7 @@ from imgcal.watch import Watch as Loop
 MARKER_SUFFIXES, TABLE_SUFFIXES = (".c3d", ".trc"), (".csv", ".jsonl")
 POSE_OUTPUTS = "FILE.csv, FILE.jsonl, FILE.c3d, FILE.trc, tcp://HOST:PORT or igtl://[HOST:]PORT"
 BLOBS_ONLY = (BlobTable, JsonLines, LabStreaming, Qualisys)
-LEARNING_CODE = "from imgcal.cli.watch_learning import main; main()"
+LEARNING_CODE = "from imgcal.cli.learning_process import main; main()"
 USUAL_RATE = 30.0  # snapshots a second of a table of blobs
 
 # What kind of input an option is for.
@@ -100,7 +100,7 @@ class Watch(arguments.Watch):
 
     def _watch(self, rig: CameraRig, given: CalibrationObject, detector: DetectorName | Proposer, folder: Path) -> None:
         obj = given.as_unknown()
-        with _going_on():
+        with _explain_unusable_state():
             progress = None if self.fresh else Progress.load(folder)
         source, origin = self._source(rig, given.rows, progress), self._origin()
         if self.learn and isinstance(source, BLOBS_ONLY):
@@ -138,7 +138,7 @@ class Watch(arguments.Watch):
                 page = stack.enter_context(LivePage(rig, obj, parse_address(self.serve), problem=display.warn))
                 print(page.notice)
             loop = Loop(
-                keeper, folder, hook, page, display.show_event, display.warn, _removing(source), source=origin,
+                keeper, folder, hook, page, display.show_event, display.warn, _make_remover(source), source=origin,
                 rate=rate,
                 poses=poses, learning=learning,
             )  # fmt: skip
@@ -151,7 +151,7 @@ class Watch(arguments.Watch):
                 forget_after(folder / EVENTS, told)
             anew = self.fresh and put_aside(folder)
             stack.enter_context(loop)
-            stopped = stack.enter_context(_stopping())
+            stopped = stack.enter_context(_stop_at_signals())
             stack.enter_context(display.show_tally(loop.tally))
             if restored or anew:
                 how = "resumed from the saved state" if restored else "started anew from the factory calibration"
@@ -170,12 +170,12 @@ class Watch(arguments.Watch):
             raise KeyboardInterrupt(f"interrupted after {said}; the same command resumes from {there}")
         if loop.unwritten:
             raise InputError(f"watch: {said}")
-        before = intake.known_before + (source.known_before() if isinstance(source, Folder) else 0)
+        before = intake.known_before + (source.count_processed() if isinstance(source, Folder) else 0)
         if tally.snapshots == 0 and before:
             read = f"all {plural(before, 'snapshot')} of {self.input} had been read before"
             said = f"{read}; --fresh starts from the factory rig | {said}"
         elif tally.latest is None or tally.learnt == 0:
-            raise RefusedError(_nothing(tally, intake))
+            raise RefusedError(_explain_no_learning(tally, intake))
         elif before:
             said = f"{said} | {before:,} had been read before"
         print(said)
@@ -283,7 +283,7 @@ class Watch(arguments.Watch):
         path = folder / STATE
         if self.fresh or not path.is_file():
             return RigKeeper(rig, obj, detection=self.detection, detector=detector), False
-        with _going_on():
+        with _explain_unusable_state():
             keeper = RigKeeper.restore(path, detection=self.detection, detector=detector)
         for option, difference in (
             (f"--rig {self.rig}", _rig_difference(rig, keeper.given)),
@@ -320,7 +320,7 @@ def _object_difference(obj: CalibrationObject, known: CalibrationObject) -> str 
     return difference
 
 
-def _nothing(tally: Tally, intake: SourceReader) -> str:
+def _explain_no_learning(tally: Tally, intake: SourceReader) -> str:
     """Say why nothing was learnt."""
     if tally.latest is not None:
         return f"watch: nothing could be learned from any snapshot: {tally.latest.refused}"
@@ -329,7 +329,7 @@ def _nothing(tally: Tally, intake: SourceReader) -> str:
     return "watch: no snapshot came"
 
 
-def _removing(source: Source) -> Callable[[Progress], None]:
+def _make_remover(source: Source) -> Callable[[Progress], None]:
     """What deletes frames that have been learnt from."""
     if not isinstance(source, Folder):
         return lambda progress: None
@@ -337,7 +337,7 @@ def _removing(source: Source) -> Callable[[Progress], None]:
 
 
 @contextlib.contextmanager
-def _going_on() -> Iterator[None]:
+def _explain_unusable_state() -> Iterator[None]:
     """Say what to do where what an earlier run left cannot be used."""
     try:
         yield
@@ -352,7 +352,7 @@ class _Stopped(threading.Event):
 
 
 @contextlib.contextmanager
-def _stopping() -> Iterator[_Stopped]:
+def _stop_at_signals() -> Iterator[_Stopped]:
     """End cleanly at SIGINT and SIGTERM; a second Ctrl-C does not wait."""
     stopped = _Stopped()
 

@@ -73,7 +73,7 @@ class Display:
     def line(self) -> str:
         """Say in one line how it goes."""
         tally, state = self._tally, self._tally.latest
-        parts = [self._waiting() if state is None else state.sentence]
+        parts = [self._describe_waiting() if state is None else state.sentence]
         if state is not None and state.refused is not None:
             parts.append("not learning now")
         parts.append(f"{plural(tally.snapshots, 'snapshot')}, {self._rate:.3g}/s")
@@ -97,7 +97,7 @@ class Display:
             counts |= {"hooks failed": self._hook.failed, "events without a hook": self._hook.dropped}
         return [f"{count:,} {kind}" for kind, count in counts.items() if count]
 
-    def _waiting(self) -> str:
+    def _describe_waiting(self) -> str:
         """Say that nothing has come, and what did not look like anything that could."""
         reasons = self._intake.reasons
         return "waiting for the first snapshot" + (f": {reasons[-1]}" if reasons else "")

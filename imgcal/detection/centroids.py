@@ -31,7 +31,7 @@ class Blobs:
     fiducial: NDArray[np.int64]  # (K,) label, -1 = unknown from the image
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Blobs:
-        """Keep the given rows."""
+        """Keep some of the K blobs, given as a mask (K,) or as indices."""
         return Blobs(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 

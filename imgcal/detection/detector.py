@@ -15,7 +15,7 @@ from imgcal.detection.candidates import block_means, outline, screen
 from imgcal.detection.centroids import Blobs, measure, to_detections
 from imgcal.detection.checks import Frame, check_frame, check_mask, full_scale
 from imgcal.detection.options import DetectionOptions
-from imgcal.detection.populations import DIMMER, drop_dim, usable, usual_size
+from imgcal.detection.populations import DIMMER, drop_dim, select_usable, usual_size
 from imgcal.errors import InputError
 from imgcal.medians import median
 from imgcal.types import BlobFlag, Board, Detections
@@ -62,7 +62,7 @@ def detect(
     snapshots = _snapshots(frames)
     if not snapshots:
         raise InputError("frames: found no snapshot, expected at least one frame for each camera")
-    with ThreadPoolExecutor(_workers(len(names))) as pool:
+    with ThreadPoolExecutor(_count_workers(len(names))) as pool:
         blobs = [
             detect_snapshot(snapshot, options, masks=masks, pool=pool, whole_capture=True, board=board)
             for snapshot in snapshots
@@ -94,7 +94,7 @@ def detect_snapshot(
         board: as in `detect`; a snapshot without it is no error.
     """
     if pool is None:
-        with ThreadPoolExecutor(_workers(len(frames))) as own_pool:
+        with ThreadPoolExecutor(_count_workers(len(frames))) as own_pool:
             return detect_snapshot(
                 frames, options, masks=masks, pool=own_pool, whole_capture=whole_capture, board=board
             )
@@ -131,7 +131,7 @@ def _detect_one(
     """Detect the blobs of one checked frame, or the points of a board; their camera is 0."""
     if board is not None:
         points = find_board(frame, board)
-        return points if mask is None else points.select(~_inside(mask, points.uv))
+        return points if mask is None else points.select(~_is_in_mask(mask, points.uv))
     scale = full_scale(frame, options.bit_depth, name)
     contiguous = frame if frame.flags.c_contiguous else frame.copy()
     if options.max_radius is None:
@@ -139,7 +139,7 @@ def _detect_one(
     else:
         blobs = _find(contiguous, block_means(contiguous, options, scale), options, scale)
     if mask is not None:
-        blobs.flags[_inside(mask, blobs.uv)] |= np.uint8(BlobFlag.MASKED)
+        blobs.flags[_is_in_mask(mask, blobs.uv)] |= np.uint8(BlobFlag.MASKED)
     return blobs
 
 
@@ -155,7 +155,7 @@ def _find_all_sizes(frame: Frame, options: DetectionOptions, scale: int) -> Blob
     kept = usual_size(blobs, limit)
     blobs = blobs if kept.all() else blobs.select(kept)
     if len(blobs.uv):
-        least, step = (LARGER, 4) if np.count_nonzero(usable(blobs)) >= FEW else (limit, 1)
+        least, step = (LARGER, 4) if np.count_nonzero(select_usable(blobs)) >= FEW else (limit, 1)
         if not screening.holds(DIMMER * scale * median(blobs.contrast), least, 2 * LARGEST, step):
             return blobs
     wide = _find(frame, means, replace(options, max_radius=LARGEST), scale)
@@ -167,13 +167,13 @@ def _find(frame: Frame, means: Frame, options: DetectionOptions, scale: int) -> 
     return measure(frame, outline(frame, screen(means, options, scale), options, scale), options, scale)
 
 
-def _inside(mask: NDArray[np.bool_], uv: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _is_in_mask(mask: NDArray[np.bool_], uv: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Check which centres (K, 2) lie inside a mask (H, W)."""
     pixel = np.clip(np.rint(uv).astype(np.int64), 0, np.array(mask.shape[::-1]) - 1)
     return mask[pixel[:, 1], pixel[:, 0]]
 
 
-def _workers(cameras: int) -> int:
+def _count_workers(cameras: int) -> int:
     return max(1, min(cameras, os.cpu_count() or 1))
 
 

@@ -44,7 +44,7 @@ def dim_limits(contrast: NDArray[np.floating], group: NDArray[np.integer], group
     return np.where(apart, np.sqrt(np.where(apart, above, 0.0) * below), 0.0)
 
 
-def usable(blobs: Blobs) -> NDArray[np.bool_]:
+def select_usable(blobs: Blobs) -> NDArray[np.bool_]:
     """Select blobs with usable centres: (K,)."""
     return (blobs.flags & _UNUSABLE) == 0
 
@@ -54,7 +54,7 @@ def usual_size(blobs: Blobs, limit: float) -> NDArray[np.bool_]:
     small = blobs.radius <= limit
     if small.all():
         return small
-    large = ~small & usable(blobs)
+    large = ~small & select_usable(blobs)
     if large.sum() >= LEAST_LARGE:
         ratio = blobs.radius / median(blobs.radius[large])
         alike = large & (ratio < ONE_SIZE) & (ratio > 1 / ONE_SIZE)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.estimation.curvature import curvature_covariance
+from imgcal.estimation.curvature import curvature_covariance, whitened_curvature
 from imgcal.estimation.levenberg_marquardt import Solution, factorize
 from imgcal.estimation.linearization import POSE_PARAMETERS, NormalEquations, points_at
 from imgcal.estimation.map_estimate import Estimate, equations_at
@@ -62,16 +62,14 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
         )
         covariance = by_prior + factor[:, None] * (covariance - by_prior) * factor
     covariance = covariance + _by_modes(estimate)
+    if curved:
+        covariance = covariance + whitened_curvature(estimate, covariance)
     scale = _unwhitening(estimate).flatten(1, 2)  # (B, K C, K): one block per camera
     blocks = covariance.unflatten(1, (cameras, -1)).unflatten(-1, (cameras, -1))
     per_camera = scale.unflatten(1, (cameras, -1))
     physical = torch.einsum("bcij,bcjdk,bdlk->bcidl", per_camera, blocks, per_camera)
     size = covariance.shape[-1]
-    result = physical.reshape(*estimate.chi2.shape, size, size)
-    if not curved:
-        return result
-    centre = estimate.rig.reshape(len(covariance)).map_tensors(lambda tensor, _: tensor.unsqueeze(1))
-    return result + curvature_covariance(estimate, lambda rigs, _: rigs.local(centre).flatten(-2), result)
+    return physical.reshape(*estimate.chi2.shape, size, size)
 
 
 def _by_modes(estimate: Estimate) -> Tensor:

@@ -23,9 +23,11 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from imgcal.estimation import levenberg_marquardt_cpu
 from imgcal.estimation.levenberg_marquardt import Factorization
 from imgcal.estimation.linearization import (
     POSE_PARAMETERS,
+    Jacobian,
     Problem,
     State,
     Step,
@@ -33,7 +35,6 @@ from imgcal.estimation.linearization import (
     jacobian_at,
     object_columns,
     points_at,
-    pose_at,
     retract,
     rig_at,
 )
@@ -63,42 +64,71 @@ def curvature_covariance(estimate: Estimate, quantity: Callable[[CameraRig, Tens
     Returns:
         (*B, Q, Q), positive semidefinite: to be added to `flat`.
     """
-    pairs = MOST_PAIRS // estimate.problem.uv.shape[1]
-    found = _mean_square(estimate, quantity, LEAST_PAIRS)
-    if pairs > LEAST_PAIRS:
+
+    def change(x: Step, follow: Step) -> Tensor:
+        there, back = quantity(*_step_rigs(estimate.problem, estimate.solution.state, _add_negatives(x), follow)).chunk(
+            2, 1
+        )
+        return 0.5 * (there + back)
+
+    found = _mean_square(estimate, change, flat.reshape(-1, *flat.shape[-2:]))
+    return found.reshape(*estimate.chi2.shape, *found.shape[1:])
+
+
+def whitened_curvature(estimate: Estimate, flat: Tensor) -> Tensor:
+    """Mean square of the second-order change of the cameras' whitened offsets: (B, K C, K C).
+
+    Offsets are what steps change, so x and -x cancel, and what follows them remains.
+
+    Args:
+        estimate: with batch axes *B, B rigs in all.
+        flat: (B, K C, K C) covariance of the offsets in the Gaussian posterior.
+    """
+    return _mean_square(estimate, lambda _, follow: follow.camera.flatten(2), flat)
+
+
+def _mean_square(estimate: Estimate, change: Callable[[Step, Step], Tensor], flat: Tensor) -> Tensor:
+    """Average the square (B, Q, Q) of a second-order change over enough pairs of steps.
+
+    Args:
+        estimate: with batch axes *B, B rigs in all.
+        change: maps steps x (B, K, ...) and the steps that follow them to numbers (B, K, Q).
+        flat: (B, Q, Q) covariance to which the result is added.
+    """
+    most = MOST_PAIRS // estimate.problem.uv.shape[1]
+    at = jacobian_at(estimate.problem, estimate.solution.state)
+
+    def over(pairs: int) -> Tensor:
+        x = _draw(estimate.solution.factorization, estimate.solution.state, pairs)
+        even = change(x, _follow(estimate, at, x))
+        return even.mT @ even / pairs
+
+    found = over(LEAST_PAIRS)
+    if most > LEAST_PAIRS:
         variance, added = (matrix.diagonal(dim1=-2, dim2=-1) for matrix in (flat, found))
         if bool((added > SLIGHT * variance).any()):
-            return _mean_square(estimate, quantity, pairs)
+            return over(most)
     return found
 
 
-def _mean_square(estimate: Estimate, quantity: Callable[[CameraRig, Tensor], Tensor], pairs: int) -> Tensor:
-    """Average the square (*B, Q, Q) of the second-order change of a quantity over pairs of steps."""
-    problem, solution = estimate.problem, estimate.solution
-    factorization = solution.factorization
-    x = _draw(factorization, solution.state, pairs)
-    follow = _follow(problem, solution.state, factorization, x)
-    there, back = quantity(*_step_rigs(problem, solution.state, _both_ways(x), follow)).chunk(2, dim=1)
-    even = 0.5 * (there + back)
-    result = even.mT @ even / pairs
-    return result.reshape(*estimate.chi2.shape, *result.shape[1:])
-
-
-def _both_ways(x: Step) -> Step:
+def _add_negatives(x: Step) -> Step:
     """Concatenate steps (B, K, ...) and their negatives: (B, 2 K, ...)."""
     return x.map(lambda part: torch.cat((part, -part), dim=1))
 
 
-def _add_rig_axis(problem: Problem) -> Problem:
-    """Give the cameras an axis for many rigs each, behind the batch: (B, 1)."""
-    factory = problem.factory.map_tensors(lambda tensor, _: tensor.unsqueeze(1))
-    return replace(problem, factory=factory, prior_std=problem.prior_std.unsqueeze(1))
+def _rigs_at(problem: Problem, offset: Tensor) -> CameraRig:
+    """Convert whitened offsets (B, K, C, parameters) of K rigs for each problem: rigs (B K)."""
+    many = offset.shape[1]
+    factory = problem.factory.map_tensors(lambda tensor, _: tensor.repeat_interleave(many, 0))
+    problem = replace(problem, factory=factory, prior_std=problem.prior_std.repeat_interleave(many, 0))
+    convert = levenberg_marquardt_cpu.rig_at if offset.device.type == "cpu" else rig_at
+    return convert(problem, offset.flatten(0, 1))
 
 
 def _step_rigs(problem: Problem, state: State, x: Step, follow: Step) -> tuple[CameraRig, Tensor]:
     """Rigs (B, 2 K) and fiducials (B, 2 K, N, 3) mm after steps in both directions and their second-order response."""
     camera = (state.offset.unsqueeze(1) + x.camera).unflatten(1, (2, -1)) + follow.camera.unsqueeze(1)
-    rigs = rig_at(_add_rig_axis(problem), camera.flatten(1, 2))
+    rigs = _rigs_at(problem, camera.flatten(1, 2)).reshape(*x.camera.shape[:2])
     points = points_at(problem, state).unsqueeze(1).expand(-1, x.camera.shape[1], -1, -1)
     if x.object is not None and follow.object is not None and problem.object_prior_std is not None:
         moved = (x.object.unflatten(1, (2, -1)) + follow.object.unsqueeze(1)).flatten(1, 2)
@@ -143,41 +173,39 @@ def _new_normal(shapes: tuple[tuple[int, ...], ...], dtype: torch.dtype, device:
 _kept_normal = lru_cache(maxsize=4)(_new_normal)
 
 
-def _follow(problem: Problem, state: State, factorization: Factorization, x: Step) -> Step:
+def _follow(estimate: Estimate, at: Jacobian, x: Step) -> Step:
     """d(x) for steps (B, K, ...)."""
-    at = jacobian_at(problem, state)
+    problem, state = estimate.problem, estimate.solution.state
     squared = problem.root_weight.square()[..., None, None, :]
-    by_rig = at.by_rig[..., :-1, :, :] * squared
+    by_rig = (at.by_rig[..., :-1, :, :] * squared).flatten(-2)  # (B, S, C, parameters, 2 N)
     by_object = None if at.by_fiducial is None else append_scale(problem, at.by_fiducial) * squared
     steps = []
     together = max(AT_ONCE, POINTS_AT_ONCE // at.residual[..., 0, :].numel())
     for first in range(0, x.camera.shape[1], together):
         some = Step(*(part if part is None else part[:, first : first + together] for part in x))  # type: ignore[arg-type]
-        there, back = _residual(problem, state, _both_ways(some)).chunk(2, dim=1)
-        bend = 0.5 * (there + back) - at.residual.unsqueeze(1)  # (B, K, S, C, 2, N)
-        right = -torch.einsum("bscirn,bkscrn->bksci", by_rig, bend)
+        there, back = _pixels(problem, state, _add_negatives(some)).chunk(2, dim=1)
+        bend = 0.5 * (there + back) - (at.residual + problem.uv).unsqueeze(1)  # (B, K, S, C, 2, N)
+        right = -(by_rig @ bend.movedim(1, -1).flatten(3, 4)).movedim(-1, 1)  # (B, K, S, C, parameters)
         camera, pose, own = right[..., :-POSE_PARAMETERS].sum(2), right[..., -POSE_PARAMETERS:].sum(3), None
         if by_object is not None and problem.object_prior_std is not None:
             sums = torch.einsum("bscirn,bkscrn->bkin", by_object, bend)
             own = -object_columns(sums) * problem.object_prior_std.unsqueeze(1)
-        steps.append(factorization.solve_many(Step(camera, pose, own)))
+        steps.append(estimate.solution.factorization.solve_many(Step(camera, pose, own)))
     cameras, poses = (torch.cat([step[i] for step in steps], dim=1) for i in (0, 1))  # type: ignore[misc]
     objects = [step.object for step in steps if step.object is not None]
     return Step(cameras, poses, torch.cat(objects, dim=1) if objects else None)
 
 
-def _residual(problem: Problem, state: State, step: Step) -> Tensor:
-    """Residuals (B, K, S, C, 2, N) px after steps (B, K, ...)."""
-    many = _add_rig_axis(problem)
+def _pixels(problem: Problem, state: State, step: Step) -> Tensor:
+    """Pixels (B, K, S, C, 2, N) after steps (B, K, ...)."""
     one = State(state.offset.unsqueeze(1), state.rotation.unsqueeze(1), state.centre.unsqueeze(1))
-    there = retract(many, one, step.camera, step.pose)
+    there = retract(problem, one, step.camera, step.pose)
     own = points_at(problem, state).unsqueeze(1)
     if step.object is not None:
         own = own + _own_shift(problem, step.object)
-    points = pose_at(many, there).apply((own + problem.centroid).unsqueeze(2)).flatten(0, 1)  # (B K, S, N, 3)
-    snapshots, fiducials = points.shape[1:3]
+    points = own.unsqueeze(2) @ there.rotation.mT + there.centre.unsqueeze(-2)  # (B, K, S, N, 3)
+    snapshots, fiducials = points.shape[2:4]
     radius = None if problem.radius_squared is None else problem.radius_squared.sqrt().repeat(snapshots)
-    rigs = rig_at(many, there.offset).reshape(len(points))
-    uv = rigs.project_values(points.flatten(1, 2), radius).uv  # (B K, C, S N, 2)
-    uv = uv.unflatten(2, (snapshots, fiducials)).permute(0, 2, 1, 4, 3).unflatten(0, (len(problem.uv), -1))
-    return uv - problem.uv.unsqueeze(1)
+    uv = _rigs_at(problem, there.offset).project_values(points.flatten(2, 3).flatten(0, 1), radius).uv
+    uv = uv.unflatten(2, (snapshots, fiducials)).permute(0, 2, 1, 4, 3)  # (B K, S, C, 2, N)
+    return uv.unflatten(0, (len(problem.uv), -1))

@@ -180,7 +180,7 @@ def _damp(blocks: Tensor, damping: Tensor) -> Tensor:
     return blocks
 
 
-def better(first: Solution, second: Solution) -> Solution:
+def choose_better(first: Solution, second: Solution) -> Solution:
     """Choose for each rig the solution with the lower cost."""
     choose = first.equations.cost <= second.equations.cost
     return Solution(

@@ -154,7 +154,7 @@ class Step(NamedTuple):
 def retract(
     problem: Problem, state: State, camera_step: Tensor, pose_step: Tensor, object_step: Tensor | None = None
 ) -> State:
-    """Add a step; see `Step`."""
+    """Add a step: cameras (B, C, K) whitened, poses (B, S, 6), object (B, M) whitened or None; see `Step`."""
     rotation = rotation_from_vector(pose_step[..., :3]) @ state.rotation
     depth = _depth_unit(state)
     offset = state.object_offset

@@ -195,7 +195,7 @@ def minimize(problem: Problem, start: State, options: EstimationOptions) -> leve
             slow, levenberg_marquardt.select_rows(first.state, rows), replace(options, max_iterations=left)
         )
         spent += further.iterations
-        second = levenberg_marquardt.better(second, further)
+        second = levenberg_marquardt.choose_better(second, further)
     return levenberg_marquardt.replace_rows(first, rows, second, spent)
 
 
@@ -323,7 +323,7 @@ def object_prior_std(obj: CalibrationObject) -> Tensor:
 
 
 def initial_state(problem: Problem, rig_from_object: RigidTransform, initial_rig: CameraRig | None) -> State:
-    """Convert a first guess to a state of the problem."""
+    """Convert a first guess, poses (B, S) in mm and rigs (B) or None, to a state of the problem."""
     count, snapshots = problem.uv.shape[:2]
     rotation = rig_from_object.rotation.detach().to(problem.uv).reshape(count, snapshots, 3, 3)
     translation = rig_from_object.translation.detach().to(problem.uv).reshape(count, snapshots, 3)

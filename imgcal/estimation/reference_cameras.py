@@ -53,7 +53,7 @@ class Gauge:
         there = cls(weights).align(rig, factory)
         for round_ in range(ROUNDS):
             if round_:  # one step is enough from the previous alignment
-                there = cls(weights)._nearer(there, factory)
+                there = cls(weights)._align_once(there, factory)
             apart = _scale(there.local(factory)).norm(dim=-1).clamp_min(LEAST_APART)
             # First the geometric median, which is robust up to half of the cameras; then Cauchy weights about it.
             weights = 1 / apart if round_ < ROUNDS // 2 else 1 / (1 + (apart / apart.median()).square())
@@ -63,12 +63,12 @@ class Gauge:
     def align(self, rig: CameraRig, factory: CameraRig) -> CameraRig:
         """Align a whole rig (*B) with another one, which may have fewer batch axes."""
         for _ in range(ALIGNMENTS):
-            rig = self._nearer(rig, factory)
+            rig = self._align_once(rig, factory)
         return rig
 
-    def _nearer(self, rig: CameraRig, factory: CameraRig) -> CameraRig:
+    def _align_once(self, rig: CameraRig, factory: CameraRig) -> CameraRig:
         """Do one alignment step."""
-        motion = self.averaging(factory) @ error_between(rig, factory)[..., :EXTRINSICS].flatten(-2)[..., None]
+        motion = self.averaging_matrix(factory) @ error_between(rig, factory)[..., :EXTRINSICS].flatten(-2)[..., None]
         turn = rotation_from_vector(motion[..., :3, 0])
         transform = RigidTransform(turn.unsqueeze(-3), motion[..., 3:, 0].unsqueeze(-2))
         return replace(rig, cam_from_rig=rig.cam_from_rig @ transform)
@@ -81,7 +81,7 @@ class Gauge:
         """Jacobian of the difference by the parameters: (K C, K C)."""
         cameras = factory.num_cameras
         step = step_by_error(factory)[:, :EXTRINSICS, :EXTRINSICS]
-        averaging = self.averaging(factory).unflatten(-1, (cameras, EXTRINSICS))  # (6, C, 6)
+        averaging = self.averaging_matrix(factory).unflatten(-1, (cameras, EXTRINSICS))  # (6, C, 6)
         common = torch.einsum("cij,jdk,dkl->cidl", step, averaging, torch.linalg.inv(step))
         jacobian = torch.eye(cameras * factory.num_parameters, dtype=torch.float64)
         blocks = jacobian.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
@@ -114,7 +114,7 @@ class Gauge:
             std[self.reference, :EXTRINSICS] = 0
         return std
 
-    def averaging(self, factory: CameraRig) -> Tensor:
+    def averaging_matrix(self, factory: CameraRig) -> Tensor:
         """Matrix from the errors of all cameras (6 C,) to their common motion (6,): (*B, 6, 6 C)."""
         scaled = _scale(step_by_error(factory)[..., :EXTRINSICS, :EXTRINSICS].mT).mT
         weighted = scaled.mT @ scaled * self.weights.to(scaled)[:, None, None]

@@ -22,7 +22,7 @@ DIRECT = 150
 GENEROUS = 3.0
 """Multiple of the distances' robust spread within which a snapshot agrees."""
 LEAST_SPREAD = 1e-4
-"""Smallest spread of the distances, relative to the distance from the camera: below, depths are as good as exact."""
+"""Smallest spread of the distances, relative to the distance from the camera: below, depths count as exact."""
 LEAST_AGREEING = 0.4
 """Smallest share of a pair's snapshots that must agree on its relative pose."""
 ROUNDS = 4

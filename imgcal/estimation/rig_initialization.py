@@ -187,7 +187,7 @@ def _fit_jointly(
         poses = best_poses(observations, seen, start, cam_from_object, known, obj, fit)
         part = Observations(observations.uv, torch.full_like(observations.sigma, noise), seen)
         options = EstimationOptions(loss="cauchy", max_iterations=60)
-        fit = estimate(part, rig, obj.taken_as_exact(), poses, prior_std=spread, initial_rig=start, options=options)
+        fit = estimate(part, rig, obj.as_exact(), poses, prior_std=spread, initial_rig=start, options=options)
         start = fit.rig
     assert fit is not None
     return fit, seen.numpy()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -19,6 +20,8 @@ from imgcal.types import CameraRig
 
 ROUNDS = 3
 """Alignments in all; after the first, points are weighted by the errors that the previous one leaves."""
+PARTS = 4
+"""Parts in which a product with a symmetric matrix is computed; each saves half of its own size."""
 POINTS_AT_ONCE = 512
 """Points whose errors are computed together, so that their Jacobians stay in the processor's cache."""
 
@@ -54,7 +57,7 @@ class RigUncertainty:
             points: (P, 3) mm in the rig frame, or (C, P, 3), separate points for each camera. Errors are also computed
                 for points that a camera does not see; those are meaningless.
         """
-        return _pixel_error(pixel_jacobian(self.rig, points), self.px_covariance)
+        return _pixel_error(_pixel_rows(self.rig, points), self.px_covariance)
 
     def point_error(self, points: Tensor, seen: Tensor, noise: float = 0.0) -> Tensor:
         """Predicted error of triangulated points: (P,) mm, expected (RMS) distance.
@@ -67,7 +70,7 @@ class RigUncertainty:
         Returns:
             The error; nan where fewer than two cameras take part.
         """
-        triangulation, by_noise = _triangulation(pixel_jacobian(self.rig, points), seen)
+        triangulation, by_noise = _triangulation(_pixel_rows(self.rig, points), seen)
         variance = _point_variance(triangulation, self.mm_covariance)
         return _length(variance + noise**2 * by_noise if noise else variance, seen)
 
@@ -84,7 +87,7 @@ class RigUncertainty:
         """
         parts = []
         for some, those in zip(points.split(POINTS_AT_ONCE), seen.split(POINTS_AT_ONCE, 1), strict=True):
-            pixels = pixel_jacobian(self.rig, some)
+            pixels = _pixel_rows(self.rig, some)
             triangulation, by_noise = _triangulation(pixels, those)
             variance = _point_variance(triangulation, self.mm_covariance)
             noisy = _length(variance + noise**2 * by_noise, those)
@@ -94,18 +97,22 @@ class RigUncertainty:
 
 
 def _pixel_error(pixels: Tensor, covariance: Tensor) -> Tensor:
-    """Expected length (C, P) px of the errors of pixels with Jacobian (C, P, 2, K)."""
-    rows, cameras = pixels.flatten(1, 2), len(pixels)
+    """Expected length (C, P) px of the errors of pixels with derivatives (C, K, 2, P)."""
+    rows, cameras = pixels.flatten(2), len(pixels)
     blocks = covariance.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
     own = blocks.diagonal(dim1=0, dim2=2).permute(2, 0, 1)  # (C, K, K)
-    variance = (rows @ own).mul_(rows).sum(-1).unflatten(1, (-1, 2)).sum(-1)
+    variance = (own @ rows).mul_(rows).sum(1).unflatten(1, (2, -1)).sum(1)
     return variance.clamp_min(0).sqrt()
 
 
 def _point_variance(triangulation: Tensor, covariance: Tensor) -> Tensor:
-    """Expected squared error (P,) mm^2 of points with Jacobian (P, 3, K C)."""
-    rows = triangulation.flatten(0, 1)
-    return (rows @ covariance).mul_(rows).sum(-1).unflatten(0, (-1, 3)).sum(-1)
+    """Expected squared error (P,) mm^2 of points with derivatives (K C, 3, P)."""
+    rows = triangulation.flatten(1)
+    # The covariance is symmetric: a part of its rows only needs the columns up to its own, those before it twice.
+    lower, variance = covariance.tril() + covariance.tril(-1), rows.new_zeros(rows.shape[1])
+    for first, last in pairwise(len(rows) * part // PARTS for part in range(PARTS + 1)):
+        variance += (lower[first:last, :last] @ rows[:last]).mul_(rows[first:last]).sum(0)
+    return variance.unflatten(0, (3, -1)).sum(0)
 
 
 def _length(variance: Tensor, seen: Tensor) -> Tensor:
@@ -123,46 +130,45 @@ def uncertainty_over(rig: CameraRig, covariance: Tensor, points: Tensor) -> RigU
     """
     seen = rig.project(points).visible
     motion = rigid_motion(rig, points.mean(0))
-    pixels = pixel_jacobian(rig, points)
+    pixels = _pixel_rows(rig, points)
     triangulation, _ = _triangulation(pixels, seen)
     shared = seen.sum(0) >= 2
     px_weight, mm_weight = seen.to(points), shared.to(points)
-    px_rows, mm_rows = pixels.flatten(1, 2), triangulation.flatten(0, 1)
+    px_rows, mm_rows = pixels.flatten(2), triangulation.flatten(1)  # (C, K, 2 P), (K C, 3 P)
     by_motion = motion.unflatten(0, (rig.num_cameras, -1))
-    px_moved, mm_moved = px_rows @ by_motion, mm_rows @ motion
-    mm_spread = mm_rows @ covariance
-    mm_variance = (mm_spread * mm_rows).sum(-1)
+    px_moved, mm_moved = by_motion.mT @ px_rows, motion.mT @ mm_rows  # (C, 6, 2 P), (6, 3 P)
+    mm_variance = _point_variance(triangulation, covariance)
 
     def align() -> tuple[Tensor, Tensor]:
         """Covariance after the alignment in pixels, and the map from errors to the motion of the one in mm."""
-        weighted = px_weight.repeat_interleave(2, dim=1)[..., None] * px_moved
-        px_best = _best_if_possible(motion, (px_rows.mT @ weighted).flatten(0, 1))
-        mm_best = _best_if_possible(motion, mm_rows.mT @ (mm_weight.repeat_interleave(3)[:, None] * mm_moved))
+        weighted = px_weight.repeat(1, 2)[:, None] * px_moved
+        px_best = _best_if_possible(motion, (px_rows @ weighted.mT).flatten(0, 1))
+        mm_best = _best_if_possible(motion, mm_rows @ (mm_weight.repeat(3) * mm_moved).mT)
         return _remove_motion(covariance, motion, px_best), mm_best
 
     px_covariance, mm_best = align()
     for _ in range(ROUNDS - 1):
         # The weights only need the error that remains after the previous alignment.
         px_weight = _weight(_pixel_error(pixels, px_covariance), seen)
-        variance = _aligned_variance(mm_variance, mm_spread, mm_moved, mm_best, covariance)
-        mm_weight = _weight(_length(variance.unflatten(0, (-1, 3)).sum(-1), seen), shared)
+        variance = mm_variance + _change_by_alignment(mm_rows, mm_moved, mm_best, covariance)
+        mm_weight = _weight(_length(variance, seen), shared)
         px_covariance, mm_best = align()
     mm_covariance = _remove_motion(covariance, motion, mm_best)
     return RigUncertainty(rig, covariance, points, px_weight, mm_weight, px_covariance, mm_covariance)
 
 
-def _aligned_variance(variance: Tensor, spread: Tensor, moved: Tensor, best: Tensor, covariance: Tensor) -> Tensor:
-    """Variance (R,) of linear functions (R, K C) of the parameters after removing the motion that `best` extracts.
+def _change_by_alignment(rows: Tensor, moved: Tensor, best: Tensor, covariance: Tensor) -> Tensor:
+    """Change (P,) of the expected squared error of points by removing the motion that `best` extracts.
 
     Args:
-        variance: (R,) before.
-        spread: (R, K C) derivatives with respect to the parameters, times the covariance.
-        moved: (R, 6) derivatives times the motion.
+        rows: (K C, 3 P) derivatives of the points by the parameters.
+        moved: (6, 3 P) derivatives by the motion.
         best: (6, K C), see `_best_motion`.
         covariance: (K C, K C).
     """
-    across, own = spread @ best.mT, best @ covariance @ best.mT
-    return variance + ((moved @ own - 2 * across) * moved).sum(-1)
+    extracted = best @ covariance
+    across, own = extracted @ rows, extracted @ best.mT
+    return ((own @ moved - 2 * across) * moved).sum(0).unflatten(0, (3, -1)).sum(0)
 
 
 def _weight(error: Tensor, valid: Tensor) -> Tensor:
@@ -227,24 +233,28 @@ def pixel_jacobian(rig: CameraRig, points: Tensor) -> Tensor:
         rig: C cameras, no batch axes.
         points: (P, 3) or (C, P, 3) mm in the rig frame.
     """
-    rotation = rig.cam_from_rig.rotation
-    in_camera = points @ rotation.mT + rig.cam_from_rig.translation[:, None]  # (C, P, 3)
-    depth = in_camera[..., 2:]
-    xy = in_camera[..., :2] / depth
-    x, y = xy.unbind(-1)
+    return _pixel_rows(rig, points).permute(0, 3, 2, 1)
+
+
+def _pixel_rows(rig: CameraRig, points: Tensor) -> Tensor:
+    """Compute `pixel_jacobian` in an order in which every step runs over long rows: (C, K, 2, P)."""
+    rotation, focal = rig.cam_from_rig.rotation, rig.focal_length[..., None]
+    in_camera = rotation @ points.mT + rig.cam_from_rig.translation[..., None]  # (C, 3, P)
+    px, py, depth = in_camera.unbind(1)
+    x, y = px / depth, py / depth
     xd, yd, jxx, jxy, jyy, _ = distort_with_jacobian(x, y, rig.distortion, rig.lens_model)
-    focal = rig.focal_length[:, None]
-    per_depth = focal / depth  # (C, P, 2)
-    by_x, by_y = per_depth * torch.stack((jxx, jxy), -1), per_depth * torch.stack((jxy, jyy), -1)
-    by_point = torch.stack((by_x, by_y, -(by_x * x[..., None] + by_y * y[..., None])), -1)  # (C, P, 2, 3)
-    jacobian = by_point.new_zeros(*by_point.shape[:-1], rig.num_parameters)
-    jacobian[..., 0:3] = torch.linalg.cross(in_camera[..., None, :], by_point)
-    jacobian[..., 3:6] = (by_point.flatten(1, 2) @ -rotation).view(by_point.shape)
-    jacobian[..., 0, 6], jacobian[..., 1, 7] = xd, yd
-    jacobian[..., 0, 8] = jacobian[..., 1, 9] = 1
-    by_coefficients = torch.stack(distort_by_coefficients(x, y, rig.distortion, rig.lens_model), dim=-2)
-    torch.mul(by_coefficients, focal[..., None], out=jacobian[..., 10:])
-    return jacobian
+    per_depth = focal / depth[:, None]  # (C, 2, P)
+    by_x, by_y = per_depth * torch.stack((jxx, jxy), 1), per_depth * torch.stack((jxy, jyy), 1)
+    by_z = -(by_x * x[:, None] + by_y * y[:, None])
+    by_point = torch.stack((by_x, by_y, by_z), 1)  # (C, 3, 2, P)
+    rows = by_point.new_zeros(len(rotation), rig.num_parameters, *by_point.shape[2:])
+    torch.linalg.cross(in_camera[:, :, None].expand_as(by_point), by_point, dim=1, out=rows[:, 0:3])
+    rows[:, 3:6] = (-rotation.mT @ by_point.flatten(2)).view(by_point.shape)
+    rows[:, 6, 0], rows[:, 7, 1] = xd, yd
+    rows[:, 8, 0] = rows[:, 9, 1] = 1
+    for axis, by_coefficients in enumerate(distort_by_coefficients(x, y, rig.distortion, rig.lens_model)):
+        torch.mul(by_coefficients.mT, focal[:, axis, None], out=rows[:, 10:, axis])
+    return rows
 
 
 def _triangulation(pixels: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
@@ -254,29 +264,30 @@ def _triangulation(pixels: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
     pixels by the parameters, and K by the point.
 
     Args:
-        pixels: (C, P, 2, K) the J of every camera.
+        pixels: (C, K, 2, P) the J of every camera.
         seen: (C, P) bool, the cameras that take part.
 
     Returns:
-        (P, 3, K C) mm per parameter, with opposite sign; (P,) variance of the point, mm^2, for unit pixel variance.
+        (K C, 3, P) mm per parameter, with opposite sign; (P,) variance of the point, mm^2, for unit pixel variance.
     """
-    by_point = pixels[..., 3:6] * -seen.to(pixels)[..., None, None]  # (C, P, 2, 3)
-    stacked = by_point.transpose(0, 1).flatten(1, 2)  # (P, 2 C, 3)
-    inverse = inverse_or_zero(stacked.mT @ stacked)
-    first, second = (inverse @ by_point.mT).unsqueeze(-2).unbind(-1)  # (C, P, 3, 1): mm by pixel
-    along, across = pixels.unsqueeze(-3).unbind(-2)  # (C, P, 1, K)
-    response = pixels.new_empty(len(stacked), 3, len(pixels), pixels.shape[-1])  # laid out for later products
-    torch.mul(first, along, out=response.permute(2, 0, 1, 3)).addcmul_(second, across)
-    variance = inverse.diagonal(dim1=-2, dim2=-1).sum(-1)
-    return response.flatten(-2), variance
+    by_point = pixels[:, 3:6] * -seen.to(pixels)[:, None, None]  # (C, 3, 2, P)
+    stacked = by_point.transpose(0, 1).flatten(1, 2)  # (3, 2 C, P)
+    information = (stacked[:, None] * stacked).sum(2)  # (3, 3, P)
+    inverse = inverse_or_zero(information.movedim(-1, 0)).movedim(0, -1)
+    by_pixel = (inverse[:, :, None] * by_point[:, None]).sum(2)  # (C, 3, 2, P)
+    response = pixels[:, :, 0, None] * by_pixel[:, None, :, 0]  # (C, K, 3, P)
+    response.addcmul_(pixels[:, :, 1, None], by_pixel[:, None, :, 1])
+    return response.flatten(0, 1), inverse.diagonal().sum(-1)
 
 
 def inverse_or_zero(information: Tensor) -> Tensor:
-    """Inverse of (P, 3, 3); zero where singular."""
-    factor, failed = torch.linalg.cholesky_ex(information)
-    eye = torch.eye(3, dtype=information.dtype, device=information.device)
-    good = (failed == 0)[:, None, None]
-    return torch.where(good, torch.cholesky_inverse(torch.where(good, factor, eye)), 0.0)
+    """Inverse of symmetric matrices (P, 3, 3); zero where they are not positive definite."""
+    (a, b, c), (_, d, e), (_, _, f) = (row.unbind(-1) for row in information.unbind(-2))
+    df, bf, be, af, ae, ad = d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b
+    determinant = a * df + b * bf + c * be
+    adjugate = torch.stack((df, bf, be, bf, af, ae, be, ae, ad), -1).unflatten(-1, (3, 3))
+    good = (a > 0) & (ad > 0) & (determinant > 0)
+    return torch.where(good, 1 / determinant, 0.0)[..., None, None] * adjugate
 
 
 def detach_double(rig: CameraRig) -> CameraRig:

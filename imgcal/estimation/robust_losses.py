@@ -28,7 +28,7 @@ def huber(d2: Tensor, threshold: float = 3.0) -> tuple[Tensor, Tensor]:
 
 
 def cauchy(d2: Tensor, threshold: float = 3.0) -> tuple[Tensor, Tensor]:
-    """Logarithmic beyond about `threshold` standard deviations: gross outliers lose their influence."""
+    """Loss and derivative at d^2 (any shape): logarithmic beyond about `threshold` standard deviations."""
     ratio = d2 / threshold**2
     return threshold**2 * torch.log1p(ratio), 1 / (1 + ratio)
 

@@ -9,10 +9,10 @@ estimate from all. For independent residuals, the difference would have the cova
 
 where H_b is a block's information about the (whitened) parameters with its poses marginalized, and 1 that of the prior.
 The squared differences over these variances, averaged over the parameters of a camera, are the factor by which the
-noise part of its covariance is too small. One factor for all its parameters preserves their correlations. A camera that
-scatters more than the average gets its own factor: lenses differ widely. One that scatters less gets a value in between:
-errors come in episodes, and its next one may be yet to come. Leaving a block out, rather than summing the scores of the
-residuals, accounts for the leverage of a block on the fit.
+noise part of its covariance is too small. One factor for all its parameters preserves their correlations. With few
+blocks, a camera's own average counts as much as that of all cameras: lenses differ widely, but six blocks determine a
+camera's factor only roughly. Leaving a block out, rather than summing the scores of the residuals, accounts for the
+leverage of a block on the fit.
 
 Source: the delete-block jackknife (Kunsch, Annals of Statistics 1989), studentized by its value for independent noise,
 as the bias-reduced cluster-robust covariances are (Bell and McCaffrey, Survey Methodology 2002). Errors that are
@@ -42,10 +42,10 @@ LEAST_BLOCKS = 6
 """Smallest number of blocks for a reliable scatter."""
 MANY_BLOCKS = 32
 """Blocks at first (up to twice as many): each costs a factorization; they are then joined two by two."""
-SCATTER_SIGMAS = 3.0
+SCATTER_SIGMAS = 4.0
 """Standard deviations by which the scatter must exceed its value for independent noise."""
-CALM = 0.75
-"""Weight of a camera's own scatter below the average over all cameras; the average has the remaining weight."""
+OWN = 0.5
+"""Weight of a camera's own scatter; the remainder is the weight of the average over all cameras."""
 OVERLAP = 2 / 3
 """Variance of the average over heavily overlapping blocks, relative to that over disjoint ones."""
 WORTH_MEASURING = 2.0
@@ -138,7 +138,7 @@ class Scatter(NamedTuple):
 
     average: float
     deviation: float  # standard deviation of the average, for independent noise
-    by_camera: Tensor  # (C,) a camera's own average; below that of all cameras, a value in between
+    by_camera: Tensor  # (C,) half a camera's own average, half that of all cameras
 
 
 def _scatter(information: Tensor, pull: Tensor, joined: int, shape: torch.Size) -> Scatter:
@@ -171,7 +171,7 @@ def _scatter(information: Tensor, pull: Tensor, joined: int, shape: torch.Size) 
     own = torch.where(share > 0, ratio.view(shape).sum(1) / share.clamp_min(1e-9), average)
     squares = sum(float((block * scale[:, None] * scale).square().sum()) for block in expected)
     deviation = (2 * max(OVERLAP * joined, 1.0) * squares) ** 0.5
-    return Scatter(average, deviation, torch.where(own < average, CALM * own + (1 - CALM) * average, own))
+    return Scatter(average, deviation, OWN * own + (1 - OWN) * average)
 
 
 @dataclass(frozen=True)

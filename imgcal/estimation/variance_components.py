@@ -203,7 +203,7 @@ def estimate_variance_components(
                 (problem, state), kept = free, labels
                 continue
         state = solution.state
-        too_narrow = _too_narrow(state.offset[0].numpy(), fit.remaining)
+        too_narrow = _find_narrow_priors(state.offset[0].numpy(), fit.remaining)
         if not too_narrow or max(prior_scale.values(), default=1.0) > options.widest_prior:
             modes = mode_evidence(problem, solution, make_loss(options.estimation))
             sigma = np.sqrt(fit.noise)
@@ -349,7 +349,7 @@ def _additive_noise(squared: NDArray[np.floating], variance: NDArray[np.floating
     return float(np.partition(unit - variance, middle)[middle]) ** 0.5
 
 
-def _too_narrow(offset: NDArray[np.floating], remaining: NDArray[np.float64]) -> dict[str, float]:
+def _find_narrow_priors(offset: NDArray[np.floating], remaining: NDArray[np.float64]) -> dict[str, float]:
     """Find kinds of values that have drifted more than their prior allows, and the factor that the prior needs.
 
     The whitened offsets (C, K) of a kind should have a mean square of one over the values that the data determine:

@@ -109,7 +109,7 @@ def compare_detectors(
 def judge(result: Calibration, truth: CameraRig, seed: int = 0) -> tuple[bool, float, float, float]:
     """Compare a calibration with the true rig at random points of its working volume.
 
-    Both rigs are laid upon one another by the rigid motion that makes their difference smallest, as for
+    Both rigs are aligned by the rigid motion that makes their difference smallest, as for
     `predicted_error`. A calibration is wrong where the error that 5 % of the points exceed is larger than `WRONG_PX`
     and than `WRONG_RATIO` times the one that it claims.
 
@@ -127,7 +127,7 @@ def judge(result: Calibration, truth: CameraRig, seed: int = 0) -> tuple[bool, f
 
 
 def draw_capture(scene: Scene, difficulty: str, seed: int) -> tuple[Truth, dict[str, list[Frame]]]:
-    """Draw a rig, poses, and the frames of all cameras."""
+    """Draw a rig and S poses, and the frames by camera name: S of (H, W) each."""
     generator = torch.Generator().manual_seed(seed)
     truth = simulate_truth(scene.rig, scene.obj, scene.snapshots, generator, scene.drift, scene.pose_range)
     snapshots = list(simulate_frames(truth, scene.obj, scene.models[difficulty], generator))

@@ -25,7 +25,7 @@ LEAST_RISE = 3.0
 """Times the error of the untouched network, that each spoilt output must reach at least."""
 
 Spoil = Callable[[Tensor, int], Tensor]
-"""Replaces an encoder's output (rows, ...), of which each of so many rigs has equally many rows."""
+"""Replaces an encoder's output (rows, ...); arguments: output, and number of rigs, which have equally many rows."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def _replace_output(encoder: nn.Module, spoil: Spoil | None) -> Iterator[Callabl
         rigs[0] = count
 
     def hook(module: nn.Module, inputs: Any, output: Any) -> Any:
-        return output if spoil is None else _everywhere(output, lambda tensor: spoil(tensor, rigs[0]))
+        return output if spoil is None else _change_tensors(output, lambda tensor: spoil(tensor, rigs[0]))
 
     handle = encoder.register_forward_hook(hook)
     try:
@@ -121,16 +121,16 @@ def _replace_output(encoder: nn.Module, spoil: Spoil | None) -> Iterator[Callabl
         handle.remove()
 
 
-def _everywhere(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
+def _change_tensors(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
     """Change every tensor of real numbers in nested tuples, lists and dictionaries."""
     if isinstance(value, Tensor):
         return change(value) if value.is_floating_point() else value
     if isinstance(value, dict):
-        return {key: _everywhere(part, change) for key, part in value.items()}
+        return {key: _change_tensors(part, change) for key, part in value.items()}
     if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return type(value)(*(_everywhere(part, change) for part in value))
+        return type(value)(*(_change_tensors(part, change) for part in value))
     if isinstance(value, tuple | list):
-        return type(value)(_everywhere(part, change) for part in value)
+        return type(value)(_change_tensors(part, change) for part in value)
     return value
 
 

@@ -43,18 +43,18 @@ class Given:
     sigma: float  # pixels, noise of the points
     degradation: Degradation = Degradation()  # what happens to images, beside what has happened to the points
     seed: int = 0  # of that
-    drawn: dict[ImageOptions, Tensor] = field(default_factory=dict)  # images, as far as somebody has asked for them
+    drawn: dict[ImageOptions, Tensor] = field(default_factory=dict)  # images that were asked for
 
     @property
     def uv(self) -> Tensor:
-        """(B, C, N, 2) pixels."""
+        """Pixels of the fiducials: (B, C, N, 2). Raises `ValueError` if the views hold no points."""
         if self.views.uv is None:
             raise ValueError("views hold no points")
         return self.views.uv
 
     @property
     def seen(self) -> Tensor:
-        """(B, C, N) bool."""
+        """Which fiducials are seen: (B, C, N) bool. Raises `ValueError` if the views hold no points."""
         if self.views.seen is None:
             raise ValueError("views hold no points")
         return self.views.seen
@@ -220,7 +220,7 @@ def network_method(network: Network, batch: int | None = None) -> Method:
 def refine_by_positions(
     prediction: Prediction, sightings: Positions, factory: CameraRig, obj: CalibrationObject, prior_std: Tensor
 ) -> Prediction:
-    """Refine on the positions that an image network has found, each with the sigma that it predicts; Cauchy's loss."""
+    """Refine (B) predictions on the positions of an image network with their predicted sigmas; prior_std (C, K)."""
     return make_prediction(_fit_to_positions(prediction, sightings, factory, obj, prior_std))
 
 

@@ -29,7 +29,7 @@ LEAST_SIGMA = 0.02  # pixels: what exact points are believed to
 STAGES = ("alone", "refined", "one_pass")
 
 Progress = Callable[[int], None]
-"""Called with a number of rigs whenever so many more have been given to a method."""
+"""Called with the number of rigs that were just given to a method."""
 
 
 @dataclass(frozen=True)
@@ -211,7 +211,7 @@ def evaluate(
     done: dict[str, list[_Collected]] = {name: [_Collected() for _ in range(protocol.trials)] for name in methods}
     reference: list[list[Errors]] = [[] for _ in range(protocol.trials)]
     bounds: list[list[Errors]] = [[] for _ in range(protocol.trials)]
-    for found in mapped(partial(_run_methods, dict(methods)), _work(methods, conditions, protocol)):
+    for found in mapped(partial(_run_methods, dict(methods)), _draw_batches(methods, conditions, protocol)):
         trial = found["trial"]
         reference[trial].append(Errors(**found["reference"]))
         if found["bounds"]:
@@ -292,7 +292,7 @@ class _Batch:
         return digest.hexdigest()
 
 
-def _work(methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol) -> Iterator[_Batch]:
+def _draw_batches(methods: Mapping[str, Method], conditions: Conditions, protocol: Protocol) -> Iterator[_Batch]:
     """Draw all rigs, a batch at a time."""
     for trial in range(protocol.trials):
         generator = torch.Generator().manual_seed(protocol.seed * 65_536 + trial)

@@ -12,14 +12,14 @@ from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_ro
 from imgcal.types import CameraRig
 
 STEPS = 6
-"""Of Gauss-Newton, each of which gains several digits here."""
+"""Gauss-Newton steps; each gains several digits here."""
 
 
 def true_error(uncertainty: RigUncertainty, truth: CameraRig, points: Tensor) -> tuple[Tensor, Tensor]:
     """Compare an estimated rig with the true one, after the best rigid motion in the metrics of the prediction.
 
     Args:
-        uncertainty: the estimated rig, and the points and weights by which rigs are laid upon one another.
+        uncertainty: the estimated rig, and the points and weights by which rigs are aligned.
         truth: the true rig, in any frame.
         points: (P, 3) mm in the estimated rig's frame.
 
@@ -51,7 +51,7 @@ def normalized_error(uncertainty: RigUncertainty, truth: CameraRig) -> float:
     coordinates; what is left is the difference of the parameters as usual.
 
     Args:
-        uncertainty: the estimated rig, its covariance, and the points by which rigs are laid upon one another.
+        uncertainty: the estimated rig, its covariance, and the points by which rigs are aligned.
         truth: the true rig, in the frame of the estimated one.
 
     Source: errors on the group of motions are what makes a filter's covariance consistent, Barrau and Bonnabel, "The

@@ -66,7 +66,7 @@ class Keys:
     def __len__(self) -> int:
         return len(self.done) + len(self.new)
 
-    def frozen(self) -> Keys:
+    def freeze(self) -> Keys:
         """Copy for other processes."""
         return Keys(np.union1d(self.done, np.fromiter(self.new, np.uint64, len(self.new))))
 
@@ -87,7 +87,7 @@ class Dataset:
         return self.out / FOLDER
 
     @contextlib.contextmanager
-    def written(self) -> Iterator[Writer]:
+    def open_writer(self) -> Iterator[Writer]:
         """Add to the dataset under a lock.
 
         Raises:

@@ -100,7 +100,7 @@ def process(item: Item, settings: Settings, known: frozenset[str] | Any = frozen
             row["key"] = content_key(path, item, settings)
             if row["key"] in known:
                 return None
-            extra = _recalibrate(path, *_world(item.rig, item.object), settings)
+            extra = _recalibrate(path, *_load_rig_and_object(item.rig, item.object), settings)
     except RefusedError as error:
         status, row["reason"] = "refused", one_line(error.reason)
     except InputError as error:
@@ -211,7 +211,7 @@ def _small_file(url: str, stamp: str) -> bytes:
         return bytes(file.read())
 
 
-def _world(rig: str, obj: str) -> tuple[CameraRig, CalibrationObject]:
+def _load_rig_and_object(rig: str, obj: str) -> tuple[CameraRig, CalibrationObject]:
     return _load(rig, _read_content(rig), "rig"), _load(obj, _read_content(obj), "object")
 
 

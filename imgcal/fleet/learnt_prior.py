@@ -223,7 +223,7 @@ def _batches(count: int) -> Iterator[slice]:
     return (slice(first, min(first + AT_ONCE, count)) for first in range(0, count, AT_ONCE))
 
 
-def _freeing(freed: Tensor, parameters: int) -> Tensor:
+def _variance_factor(freed: Tensor, parameters: int) -> Tensor:
     return torch.where(freed, FREED, 1.0).double().repeat_interleave(parameters, dim=-1)
 
 
@@ -255,7 +255,7 @@ def _score_variances(drift: DriftInformation, model: _Model, theta: Tensor, free
 def _score_and_fisher(drift: DriftInformation, model: _Model, theta: Tensor, freed: Tensor) -> tuple[Tensor, Tensor]:
     score, fisher = torch.zeros_like(theta), torch.zeros(len(theta), len(theta), dtype=torch.float64)
     for rows in _batches(len(drift)):
-        factor = _freeing(freed[rows], drift.parameters)
+        factor = _variance_factor(freed[rows], drift.parameters)
         seen = _look(drift[rows], model.variance(theta, rows) * factor)
         parts = model.features[:, rows, None] * model.masks[:, None] * (factor == 1.0)  # (K, D, P)
         excess = seen.place.square() - seen.precision.diagonal(dim1=-2, dim2=-1)
@@ -275,7 +275,7 @@ def _slopes(
     normal = torch.zeros(count, size, count, size, dtype=torch.float64)
     right = torch.zeros(count, size, dtype=torch.float64)
     for rows in _batches(len(drift)):
-        seen = _look(drift[rows], model.variance(theta, rows) * _freeing(freed[rows], drift.parameters))
+        seen = _look(drift[rows], model.variance(theta, rows) * _variance_factor(freed[rows], drift.parameters))
         normal += torch.einsum("qd,dij,rd->qirj", z[:, rows], seen.precision, z[:, rows])
         right += torch.einsum("qd,di->qi", z[:, rows], seen.place)
     square = normal.reshape(count * size, count * size)
@@ -321,7 +321,7 @@ def _surprise(drift: DriftInformation, variance: Tensor, freed: Tensor) -> tuple
     for the number of tests.
     """
     cameras = freed.shape[1]
-    variance = variance * _freeing(freed, drift.parameters)
+    variance = variance * _variance_factor(freed, drift.parameters)
     seen, std = _look(drift, variance), variance.sqrt()
     blocks = (len(drift), cameras, drift.parameters)
     place = (seen.place * std).reshape(blocks)

@@ -55,16 +55,16 @@ def recalibrate_fleet(
     """
     count = FleetCount(manifest.count())
     known = dataset.keys(again=again)
-    with dataset.written() as writer:
+    with dataset.open_writer() as writer:
         flushed = time.monotonic()
-        outcomes = engine.run(_process, manifest.batches(batch), settings, known.frozen(), seconds=settings.seconds)
+        outcomes = engine.run(_process, manifest.batches(batch), settings, known.freeze(), seconds=settings.seconds)
         for outcome in outcomes:
             if isinstance(outcome, Lost):
                 status: Status = "timed_out" if outcome.timed_out else "crashed"
                 rows: Sequence[dict[str, Any] | None] = [failed_row(outcome.item, status, outcome.reason)]
             else:
                 rows = outcome.results
-            fresh = list(_fresh(rows, known))
+            fresh = list(_new_rows(rows, known))
             count.read += len(rows)
             count.known += len(rows) - len(fresh)
             count.status.update(row["status"] for row in fresh)
@@ -76,7 +76,7 @@ def recalibrate_fleet(
     return count
 
 
-def _fresh(rows: Sequence[dict[str, Any] | None], known: Keys) -> Iterator[dict[str, Any]]:
+def _new_rows(rows: Sequence[dict[str, Any] | None], known: Keys) -> Iterator[dict[str, Any]]:
     """Rows without a result; a capture that occurs twice in a manifest is processed once."""
     for row in rows:
         if row is not None and row["key"] not in known:

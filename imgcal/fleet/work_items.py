@@ -111,7 +111,7 @@ def workers(
         [1, 2]
     """
     if address is None and cores == 1:
-        yield _resume(_here, kept)
+        yield _resume(_run_here, kept)
         return
     if cores is not None and cores < 1:
         raise InputError(f"--cores: found {cores}, expected at least 1")
@@ -121,7 +121,7 @@ def workers(
         yield _resume(engine.map, kept)
 
 
-def _here(
+def _run_here(
     function: Callable[[Item], Result], items: Iterable[Item], arrived: Callable[[Item, Result], None]
 ) -> Iterator[Result]:
     for item in items:

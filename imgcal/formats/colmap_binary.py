@@ -16,8 +16,8 @@ from imgcal.formats.colmap_model import (
     ColmapRig,
     model_from_rig,
     pose_from_quaternion,
+    pose_numbers,
     rig_from_model,
-    seven,
 )
 from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignRig, FormatError
@@ -47,7 +47,7 @@ class _Reader:
         return values
 
     def count(self, smallest: int) -> int:
-        """A number of records of at least so many bytes each."""
+        """Read a number of records, each of at least `smallest` bytes."""
         (count,) = self.read("Q")
         self.need(count * smallest)
         return int(count)
@@ -144,15 +144,15 @@ def _write(rig: ForeignRig) -> Files:
         for c in cameras
     ]
     image_rows = [
-        struct.pack("<I7dI", i.id, *seven(i.pose), i.camera) + i.name.encode() + b"\0" + struct.pack("<Q", 0)
+        struct.pack("<I7dI", i.id, *pose_numbers(i.pose), i.camera) + i.name.encode() + b"\0" + struct.pack("<Q", 0)
         for i in images
     ]
     sensors = [struct.pack("<iI", CAMERA, 1)]
     for sensor, pose in colmap_rig.sensors.items():
         if sensor != 1 and pose is not None:
-            sensors.append(struct.pack("<iIB7d", CAMERA, sensor, 1, *seven(pose)))
+            sensors.append(struct.pack("<iIB7d", CAMERA, sensor, 1, *pose_numbers(pose)))
     data = [struct.pack("<iIQ", CAMERA, image.camera, image.id) for image in images]
-    frame = struct.pack("<II7dI", 1, 1, *seven(rig_from_world), len(images))
+    frame = struct.pack("<II7dI", 1, 1, *pose_numbers(rig_from_world), len(images))
     one = struct.pack("<Q", 1)
     return {
         "cameras.bin": count + b"".join(camera_rows),

@@ -102,7 +102,7 @@ class ColmapImage:
 
     def place(self, before: Pose) -> list[Place]:
         """Where its pose stands, which goes along with its camera."""
-        return [self.at.place(places.carry_pose(before, self.pose, places.seven))] if self.at is not None else []
+        return [self.at.place(places.carry_pose(before, self.pose, places.pose_numbers))] if self.at is not None else []
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ def _convert_rig(
             root = len(found)
         others = [place for image in images if image.camera == sensor for place in image.place(pose)]
         if sensor in rig.at:
-            others.append(rig.at[sensor].place(places.seven))
+            others.append(rig.at[sensor].place(places.pose_numbers))
         found.append(known[sensor].camera(names[sensor], pose, *others))
     if len(found) < 2:
         raise FormatError(f"rig {rig.id}: {name_cameras(lost)} without a pose in it; a rig needs two or more")
@@ -296,6 +296,6 @@ def _row(number: int, camera: ForeignCamera) -> ColmapCamera:
     return ColmapCamera(number, "FULL_OPENCV", camera.image_size, (*start, *lens.pad(8)))
 
 
-def seven(pose: Pose) -> Array:
+def pose_numbers(pose: Pose) -> Array:
     """A pose as COLMAP writes it: quaternion w, x, y, z and translation."""
     return np.concatenate((quaternion_from_rotation(pose[0]), pose[1]))

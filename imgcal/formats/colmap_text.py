@@ -18,8 +18,8 @@ from imgcal.formats.colmap_model import (
     common_prefix,
     model_from_rig,
     pose_from_quaternion,
+    pose_numbers,
     rig_from_model,
-    seven,
 )
 from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
@@ -138,14 +138,14 @@ def _write(rig: ForeignRig) -> Files:
         return " ".join(v if isinstance(v, str) else repr(float(v)) if isinstance(v, float) else str(v) for v in values)
 
     camera_rows = [row(c.id, c.model, *(c.image_size or (0, 0)), *map(float, c.parameters)) for c in cameras]
-    image_rows = [row(i.id, *seven(i.pose).tolist(), i.camera, i.name.replace(" ", "_")) + "\n" for i in images]
+    image_rows = [row(i.id, *pose_numbers(i.pose).tolist(), i.camera, i.name.replace(" ", "_")) + "\n" for i in images]
     others = [
         part for sensor, pose in colmap_rig.sensors.items() if sensor != 1 and pose is not None
-        for part in ("CAMERA", sensor, 1, *seven(pose).tolist())
+        for part in ("CAMERA", sensor, 1, *pose_numbers(pose).tolist())
     ]  # fmt: skip
     rig_row = row(1, len(cameras), "CAMERA", 1, *others)
     data = [part for image in images for part in ("CAMERA", image.camera, image.id)]
-    frame_row = row(1, 1, *seven(rig_from_world).tolist(), len(images), *data)
+    frame_row = row(1, 1, *pose_numbers(rig_from_world).tolist(), len(images), *data)
     made = "# made by imgcal convert\n"
     return {
         "cameras.txt": (made + "\n".join(camera_rows) + "\n").encode(),

@@ -1,4 +1,4 @@
-"""Files of other tools as plain values: YAML, TOML, JSON, XML and Python literals, told apart by what they begin with.
+"""Files of other tools as plain values: YAML, TOML, JSON, XML and Python literals, distinguished by their first bytes.
 
 Whatever is read comes from outside: size, depth and number of values are bounded, and no type but plain ones is made.
 """

@@ -63,7 +63,7 @@ def _read(source: Source) -> ForeignRig:
         lens = Lens(focal, centre, coefficients(ks, f"dist_{name}"), "opencv", skew)
         size = None
         if f"H_{name}" in values and f"W_{name}" in values:
-            pair = [number(_only(values[f"{side}_{name}"]), f"{side}_{name}") for side in "WH"]
+            pair = [number(_scalar(values[f"{side}_{name}"]), f"{side}_{name}") for side in "WH"]
             size = image_size(pair, f"W_{name}, H_{name}")
         turn = values.get(f"Rot_{name}", values.get(f"R_{name}"))
         moved = array(values[f"T_{name}"], (3,), f"T_{name}")
@@ -80,7 +80,7 @@ def _read(source: Source) -> ForeignRig:
     return ForeignRig(FORMAT.name, tuple(cameras), "m", "the file's world", tuple(notes))
 
 
-def _only(value: Any) -> Any:
+def _scalar(value: Any) -> Any:
     """A number, also where it was written as a matrix of one."""
     data = value.get("data") if isinstance(value, dict) else value
     return data[0] if isinstance(data, list) and len(data) == 1 else data

@@ -18,7 +18,7 @@ class Holds:
     opencv: tuple[int, ...] = (5,)  # counts that a file may have, ascending
     fisheye: bool = False
 
-    def exactly(self, lens: Lens) -> bool:
+    def stores_exactly(self, lens: Lens) -> bool:
         """Tell whether the lens can be stored as it is."""
         if lens.skew or lens.model == "to_ideal":
             return lens.length == 0 and not lens.skew
@@ -46,7 +46,7 @@ def fit_lens(lens: Lens, image_size: tuple[int, int], holds: Holds) -> Fit:
     Returns:
         The lens itself where the model can express it, else the fit of the model that comes nearest.
     """
-    if holds.exactly(lens):
+    if holds.stores_exactly(lens):
         return Fit(replace(lens, model="opencv") if lens.model == "to_ideal" else lens, 0.0, 0.0, True)
     uv = pixel_grid(image_size, GRID)
     rays = lens.rays(uv)

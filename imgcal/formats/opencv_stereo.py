@@ -71,7 +71,7 @@ def _read(source: Source) -> ForeignRig:
     if translation[0] > 0:
         notes.append("T[0] > 0: camera 2 is to the left of camera 1; used as it is")
     poses = ((np.eye(3), np.zeros(3)), (turned, translation))
-    written = {_plain(key): key for key in reversed(list(merge_storages(source)))}
+    written = {_letters_and_digits(key): key for key in reversed(list(merge_storages(source)))}
 
     def place(key: str, of: places.Numbers) -> Place:
         return Place(*key_place(source, written[key]), of)
@@ -104,11 +104,11 @@ def _write(rig: ForeignRig) -> Files:
 def _keys(values: dict[str, Any]) -> dict[str, Any]:
     plain: dict[str, Any] = {}
     for key, value in values.items():
-        plain.setdefault(_plain(key), value)
+        plain.setdefault(_letters_and_digits(key), value)
     return plain
 
 
-def _plain(key: str) -> str:
+def _letters_and_digits(key: str) -> str:
     return re.sub(r"[^a-z0-9]", "", key.lower())
 
 

@@ -15,7 +15,7 @@ from imgcal.formats.foreign_rig import FormatError
 from imgcal.formats.source import COLMAP_FILES
 from imgcal.formats.spans import Keys, Node, Span, locate, numbers_in
 
-EXACT_DIGITS = 15  # a number with so many is one that was written in full
+EXACT_DIGITS = 15  # a number with this many digits was written in full
 LEAST_DIGITS = 12  # of a number in the place of one that shows none, such as 0 or 1500
 WIDEST = 17  # decimals; a smaller number is written with an exponent
 NUMBER_PARTS = re.compile(r"([-+]?)(\d*)(\.?)(\d*)(?:([eE])([-+]?)(\d+))?")

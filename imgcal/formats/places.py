@@ -73,7 +73,7 @@ def rotation_like(found: Sequence[float]) -> Numbers:
     return vector
 
 
-def seven(camera: ForeignCamera) -> list[float]:
+def pose_numbers(camera: ForeignCamera) -> list[float]:
     """Quaternion w, x, y, z and translation of cam_from_rig."""
     return [*quaternion_from_rotation(camera.rotation).tolist(), *translation(camera)]
 

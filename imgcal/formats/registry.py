@@ -137,7 +137,7 @@ def recognize_format(source: Source) -> Format:
             raise InputError(f"{source.where}: {error}") from error
     if source.alone and source.unreadable:
         raise source.unreadable[0]
-    raise InputError(f"{source.where}: {_instead(source)}")
+    raise InputError(f"{source.where}: {_explain_no_rig(source)}")
 
 
 def _check_requested(source: Source, one: Format) -> Format:
@@ -147,10 +147,11 @@ def _check_requested(source: Source, one: Format) -> Format:
             return one
     except FormatError as error:
         raise InputError(f"{source.where}: {error}") from error
-    raise InputError(f"{source.where}: this is not {with_article(one.title)}: {_other(source) or _instead(source)}")
+    found = _name_other_format(source) or _explain_no_rig(source)
+    raise InputError(f"{source.where}: this is not {with_article(one.title)}: {found}")
 
 
-def _other(source: Source) -> str:
+def _name_other_format(source: Source) -> str:
     """Name the format that it is instead; empty if none."""
     try:
         found = recognize_format(source)
@@ -170,7 +171,7 @@ def is_foreign(path: Path) -> bool:
         return False
 
 
-def _instead(source: Source) -> str:
+def _explain_no_rig(source: Source) -> str:
     """Explain what a source without a rig is, as far as it can be recognized."""
     values = merge_storages(source)
     if is_matrix(values.get("camera_matrix")) or is_matrix(values.get("cameraMatrix")) or is_matrix(values.get("K")):

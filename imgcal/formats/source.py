@@ -44,7 +44,7 @@ class Source:
             if path in paths[:number]:
                 raise InputError(f"{path}: found it twice, expected each file once")
             if path.is_dir():
-                self.files += _inside(path)
+                self.files += _list_inside(path)
             elif path.is_file():
                 self.alone = len(paths) == 1
                 self.files += _add_partner(path)
@@ -95,7 +95,7 @@ class Source:
         return list_names(path.name for path in self.files) or "an empty folder"
 
 
-def _inside(folder: Path) -> list[Path]:
+def _list_inside(folder: Path) -> list[Path]:
     try:
         found = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
     except OSError as error:
@@ -108,7 +108,7 @@ def _inside(folder: Path) -> list[Path]:
 def _add_partner(path: Path) -> list[Path]:
     """The file, and what it is one calibration with."""
     if path.name in COLMAP_FILES:
-        return [path, *(one for one in _inside(path.parent) if one.name in COLMAP_FILES and one != path)]
+        return [path, *(one for one in _list_inside(path.parent) if one.name in COLMAP_FILES and one != path)]
     for pair in PARTNERS:
         for mine, other in (pair, pair[::-1]):
             partner = path.with_name(path.name.replace(mine, other, 1))

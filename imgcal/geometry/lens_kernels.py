@@ -144,7 +144,7 @@ USUAL = list(LENS_MODELS).index(DEFAULT)
 USUAL_WIDTH = len(LENS_MODELS[DEFAULT].coefficients)
 
 
-def each_lens(make: Formula) -> tuple[Formula, ...]:
+def compile_each_lens(make: Formula) -> tuple[Formula, ...]:
     """Compile a function for each model; `make` takes a `CompiledLens` and the number of its coefficients."""
     sizes = (len(model.coefficients) for model in LENS_MODELS.values())
     return tuple(make(lens, size) for lens, size in zip(COMPILED_LENSES, sizes, strict=True))
@@ -235,7 +235,7 @@ def _inverse(lens: CompiledLens, size: int) -> Formula:
     return undo
 
 
-_IMAGES, _COEFFICIENTS, _INVERSES = (each_lens(make) for make in (_image, _coefficients, _inverse))
+_IMAGES, _COEFFICIENTS, _INVERSES = (compile_each_lens(make) for make in (_image, _coefficients, _inverse))
 _any_image, _any_coefficients = _chosen("image", _IMAGES), _chosen("coefficients", _COEFFICIENTS)
 _any_inverse = _chosen("inverse", _INVERSES)
 _usual_image, _usual_coefficients, _usual_inverse = _IMAGES[USUAL], _COEFFICIENTS[USUAL], _INVERSES[USUAL]

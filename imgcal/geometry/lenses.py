@@ -77,7 +77,7 @@ def distort(x: Tensor, y: Tensor, distortion: Tensor, models: ModelNames = DEFAU
 
 
 def distort_with_jacobian(x: Tensor, y: Tensor, distortion: Tensor, models: ModelNames = DEFAULT) -> Components:
-    """Distorted x and y, their symmetric Jacobian (xx, xy, yy) and the squared radius; arguments as for `distort`."""
+    """Distorted x, y, their symmetric Jacobian (xx, xy, yy), squared radius: (*B, C, N) each; see `distort`."""
     return _by_model(_distort_with_jacobian, models, (x, y), distortion)
 
 

@@ -15,7 +15,7 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 from torch import Tensor
 
 from imgcal.geometry import kernels
-from imgcal.geometry.lens_kernels import CompiledLens, chain_models, compile_as, each_lens
+from imgcal.geometry.lens_kernels import CompiledLens, chain_models, compile_as, compile_each_lens
 from imgcal.geometry.lens_model import Formula
 from imgcal.geometry.lenses import DEFAULT, ModelNames, lens_codes
 from imgcal.geometry.projection import NEAREST_DEPTH, Projection
@@ -101,7 +101,7 @@ def _projection(lens: CompiledLens, size: int) -> Formula:
     return project
 
 
-_project_all = chain_models("projection", each_lens(_projection))
+_project_all = chain_models("projection", compile_each_lens(_projection))
 
 
 @njit(cache=True)
@@ -157,7 +157,7 @@ def _inverse(lens: CompiledLens, size: int) -> Formula:
     return undistort
 
 
-_undistort_all = chain_models("inverse", each_lens(_inverse))
+_undistort_all = chain_models("inverse", compile_each_lens(_inverse))
 
 
 @njit(cache=True)

@@ -37,18 +37,18 @@ class RigidTransform:
     def identity(
         cls, *batch: int, dtype: torch.dtype | None = None, device: torch.device | None = None
     ) -> RigidTransform:
-        """Make identity transforms of the given batch shape."""
+        """Make identity transforms of batch shape `batch`."""
         eye = torch.eye(3, dtype=dtype, device=device).expand(*batch, 3, 3)
         return cls(eye, torch.zeros(*batch, 3, dtype=dtype, device=device))
 
     @classmethod
     def stack(cls, parts: Sequence[RigidTransform]) -> RigidTransform:
-        """Stack several along a new first batch axis."""
+        """Stack P transforms (*B) along a new first batch axis: (P, *B)."""
         return cls.combine(parts, torch.stack)
 
     @classmethod
     def cat(cls, parts: Sequence[RigidTransform]) -> RigidTransform:
-        """Concatenate several along their first batch axis."""
+        """Concatenate transforms (P, *B), (Q, *B), ... along their first batch axis: (P + Q + ..., *B)."""
         return cls.combine(parts, torch.cat)
 
     @classmethod
@@ -68,11 +68,11 @@ class RigidTransform:
         return RigidTransform(self.rotation[index], self.translation[index])  # type: ignore[index]
 
     def reshape(self, *batch: int) -> RigidTransform:
-        """Change the batch axes to another shape with as many transforms."""
+        """Change the batch axes to (*batch), with as many transforms."""
         return RigidTransform(self.rotation.reshape(*batch, 3, 3), self.translation.reshape(*batch, 3))
 
     def inverse(self) -> RigidTransform:
-        """Swap source and destination."""
+        """Swap source and destination: (*B)."""
         return RigidTransform(self.rotation.mT, -self.origin_image())
 
     def origin_image(self) -> Tensor:

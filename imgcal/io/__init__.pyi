@@ -2,6 +2,7 @@ from .atomic import PREVIOUS, keep_previous, publishing, replacing, write_bytes,
 from .cameras_yaml import drop_poses, load_cameras, save_cameras
 from .capture import Capture, check_times, open_capture, open_input, save_capture_settings
 from .detections_csv import DEFAULT_SIGMA, MARGIN, Fiducials, load_detections, save_detections
+from .folder_lock import holding
 from .frames import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Frame, Video, grey_frame, read_frame, write_frame, write_image
 from .json_text import read_json, read_metrics
 from .key_table import Key, list_keys
@@ -20,7 +21,6 @@ from .names import (
     title_from_name,
 )
 from .object_csv import load_object, load_objects, object_from_text, object_text, save_object
-from .own_folder import holding
 from .posterior_file import read_posterior, write_posterior
 from .rig_yaml import RigCovariance, load_rig_covariance, read_rig, rig_from_text, rig_text, save_rig
 from .safetensors_file import read_tensors, read_texts, write_tensors

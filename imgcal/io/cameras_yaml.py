@@ -41,7 +41,7 @@ class _Camera(CameraImages):
     distortion: Annotated[list[Coefficient], Field(min_length=5, max_length=5)] | None = None
 
     @model_validator(mode="after")
-    def _sound(self) -> _Camera:
+    def _check_values(self) -> _Camera:
         if (self.field_of_view is None) == (self.focal_length is None):
             raise ValueError("expected either `field_of_view` (degrees, across the longer side) or `focal_length` (px)")
         return self
@@ -61,7 +61,7 @@ class _CamerasFile(StrictModel):
     cameras: Annotated[list[_Camera], Field(min_length=1, max_length=limits.MOST_CAMERAS)]
 
     @model_validator(mode="after")
-    def _consistent(self) -> _CamerasFile:
+    def _check_consistency(self) -> _CamerasFile:
         check_names([camera.name for camera in self.cameras])
         return self
 

@@ -93,7 +93,7 @@ class Capture:
         return {name: [frames[name] for frames in read] for name in self.camera_names}
 
     def frames_of(self, number: int) -> dict[str, Frame | None]:
-        """Read the frames of one snapshot by its number: camera name -> frame; errors as in `snapshots`."""
+        """Read the frames of one snapshot by its number: camera -> frame (H, W) or None; errors as in `snapshots`."""
         return next(self.snapshots(number, number + 1))[1]
 
     def mask(self, camera: str) -> NDArray[np.bool_] | None:

@@ -174,6 +174,11 @@ class Video:
     """
 
     def __init__(self, path: Path) -> None:
+        """Open a file.
+
+        Raises:
+            InputError: the file is no video.
+        """
         self.path = path
         check_regular(path)
         try:

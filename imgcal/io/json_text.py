@@ -21,13 +21,13 @@ def read_json(text: str) -> Any:
         raise ValueError(f"nested more than {MOST_DEPTH} deep") from error
     level = [value]
     for _ in range(MOST_DEPTH):
-        level = [inner for outer in level for inner in _inside(outer)]
+        level = [inner for outer in level for inner in _values_inside(outer)]
         if not level:
             return value
     raise ValueError(f"nested more than {MOST_DEPTH} deep")
 
 
-def _inside(value: Any) -> list[Any]:
+def _values_inside(value: Any) -> list[Any]:
     if isinstance(value, dict):
         return list(value.values())
     return value if isinstance(value, list) else []

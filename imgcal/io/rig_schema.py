@@ -32,7 +32,7 @@ def _within(plausible: limits.Range) -> Any:
     return Field(allow_inf_nan=False, ge=plausible.low, le=plausible.high)
 
 
-def _exactly(count: int) -> Any:
+def _of_length(count: int) -> Any:
     return Field(min_length=count, max_length=count)
 
 
@@ -48,11 +48,11 @@ Name = Annotated[str, Field(max_length=LONGEST_NAME)]
 
 
 class _Transform(StrictModel):
-    rotation_vector: Annotated[list[Angle], _exactly(3)]
-    translation: Annotated[list[Shift], _exactly(3)]
+    rotation_vector: Annotated[list[Angle], _of_length(3)]
+    translation: Annotated[list[Shift], _of_length(3)]
 
     @model_validator(mode="after")
-    def _in_radians(self) -> _Transform:
+    def _convert_to_radians(self) -> _Transform:
         angle = math.hypot(*self.rotation_vector)
         if angle > 2 * math.pi + 1e-9:
             raise ValueError(f"found a rotation vector of length {angle:g}, expected rad, at most 2 pi")
@@ -62,10 +62,10 @@ class _Transform(StrictModel):
 class Std(StrictModel):
     """One standard deviation of each value of a camera: rad, mm, pixels, pixels, 1."""
 
-    rotation: Annotated[list[Spread], _exactly(3)]
-    position: Annotated[list[Spread], _exactly(3)]
-    focal_length: Annotated[list[Spread], _exactly(2)]
-    principal_point: Annotated[list[Spread], _exactly(2)]
+    rotation: Annotated[list[Spread], _of_length(3)]
+    position: Annotated[list[Spread], _of_length(3)]
+    focal_length: Annotated[list[Spread], _of_length(2)]
+    principal_point: Annotated[list[Spread], _of_length(2)]
     distortion: Annotated[list[Spread], Field(max_length=MOST_COEFFICIENTS)]
 
 
@@ -73,10 +73,10 @@ class CameraImages(StrictModel):
     """The keys that all cameras have: name and image size."""
 
     name: str
-    image_size: Annotated[list[Side], _exactly(2)]
+    image_size: Annotated[list[Side], _of_length(2)]
 
     @model_validator(mode="after")
-    def _has_images(self) -> Self:
+    def _check_images(self) -> Self:
         # The name is also a file name in a capture and a cell of a CSV file.
         if not is_file_name(self.name):
             raise ValueError(f"found the camera name {quote(self.name)!r}, expected a name that can be a file name")
@@ -88,15 +88,15 @@ class CameraImages(StrictModel):
 class CameraEntry(CameraImages):
     """A calibrated camera."""
 
-    focal_length: Annotated[list[Focal], _exactly(2)]
-    principal_point: Annotated[list[Pixel], _exactly(2)]
+    focal_length: Annotated[list[Focal], _of_length(2)]
+    principal_point: Annotated[list[Pixel], _of_length(2)]
     model: Name = "brown_conrady"
     distortion: Annotated[list[Coefficient], Field(max_length=MOST_COEFFICIENTS)]
     cam_from_rig: _Transform
     std: Std | None = None
 
     @model_validator(mode="after")
-    def _sound(self) -> CameraEntry:
+    def _check_values(self) -> CameraEntry:
         self._check_lens()
         return self
 
@@ -148,14 +148,14 @@ class _DriftRate(StrictModel):
 class _Volume(StrictModel):
     """A box between two corners, or what some points enclose."""
 
-    low: Annotated[list[Shift], _exactly(3)] | None = None
-    high: Annotated[list[Shift], _exactly(3)] | None = None
-    points: Annotated[list[Annotated[list[Shift], _exactly(3)]], Field(min_length=4, max_length=MOST_POINTS)] | None = (
-        None
-    )
+    low: Annotated[list[Shift], _of_length(3)] | None = None
+    high: Annotated[list[Shift], _of_length(3)] | None = None
+    points: (
+        Annotated[list[Annotated[list[Shift], _of_length(3)]], Field(min_length=4, max_length=MOST_POINTS)] | None
+    ) = None
 
     @model_validator(mode="after")
-    def _sound(self) -> _Volume:
+    def _check_values(self) -> _Volume:
         if (self.low is None, self.high is None) != (self.points is not None,) * 2:
             raise ValueError("expected `low` and `high` of a box, or `points` that enclose a volume")
         try:
@@ -195,7 +195,7 @@ class RigFile(StrictModel):
     posterior: Name | None = None  # the file beside it, of all that the calibration knows
 
     @model_validator(mode="after")
-    def _consistent(self) -> RigFile:
+    def _check_consistency(self) -> RigFile:
         if self.name is not None and not self.name.isprintable():
             raise ValueError(f"name: found {self.name!r}, expected text that can be shown")
         names = [camera.name for camera in self.cameras]

@@ -52,12 +52,12 @@ def read_command(content: Any, cameras: Sequence[str], actions: Mapping[str, Act
     if name == "factory" and content.get("confirmed") is not True:
         raise ValueError("expected a confirmation")
     about_camera = name in actions and actions[name].of_camera
-    if about_camera != _within(camera, len(cameras)) or (camera is not None and not about_camera):
+    if about_camera != _is_index(camera, len(cameras)) or (camera is not None and not about_camera):
         raise ValueError("expected the number of a camera for a command about one")
-    if (name == "acknowledge") != _within(event, events) or (event is not None and name != "acknowledge"):
+    if (name == "acknowledge") != _is_index(event, events) or (event is not None and name != "acknowledge"):
         raise ValueError("expected the number of an event to acknowledge")
     return Command(name, cameras[camera] if about_camera and isinstance(camera, int) else None, event)
 
 
-def _within(number: Any, count: int) -> bool:
+def _is_index(number: Any, count: int) -> bool:
     return isinstance(number, int) and not isinstance(number, bool) and 0 <= number < count

@@ -117,7 +117,7 @@ def picture_message(state: RigState, camera: int, frames: Mapping[str, Frame | N
 
 def small_jpeg(frame: Frame) -> bytes:
     """Shrink a grey image (H, W) of 8 or 16 bit, brighten it so that markers are seen, and compress it."""
-    small = _shrunk(frame)
+    small = _shrink(frame)
     brightest = int(small.max(initial=0))
     depth = 255 if frame.dtype == np.uint8 else next(d for d in DEPTHS if brightest <= d)
     ranks = (small.size // 2, int(BRIGHT * (small.size - 1)))
@@ -129,7 +129,7 @@ def small_jpeg(frame: Frame) -> bytes:
     return jpeg.tobytes() if found else b""
 
 
-def _shrunk(frame: Frame) -> NDArray[Any]:
+def _shrink(frame: Frame) -> NDArray[Any]:
     """Average down to the width of a picture: by a whole number first, where there is one: twice as quick."""
     height, width = frame.shape
     scale = min(1.0, PICTURE_WIDTH / width)

@@ -216,7 +216,7 @@ class LivePage:
         theirs.close()
         self._pipe = ours
         with self._news:
-            greeting = frame_message("greeting", self._greeting)  # with what people were told and did so far
+            greeting = frame_message("greeting", self._greeting)  # with the events and commands so far
             self._answers.clear()  # whom they were for has gone
         threading.Thread(target=self._listen, args=(ours,), name="live page commands", daemon=True).start()
         ours.sendall(greeting)
@@ -280,10 +280,10 @@ class LivePage:
             try:
                 if ended:
                     raise BrokenPipeError("the server has ended")
-                self._pass_on(("answer", partial(dict, answer)) for answer in answers)
-                self._pass_on(courier.messages(latest, events))
+                self._send_all(("answer", partial(dict, answer)) for answer in answers)
+                self._send_all(courier.messages(latest, events))
                 if self._viewers and pictured is not None:
-                    self._pass_on(courier.pictures(*pictured))
+                    self._send_all(courier.pictures(*pictured))
             except OSError:
                 with self._news:
                     self._latest = self._latest or last
@@ -307,7 +307,7 @@ class LivePage:
         news = self._latest is not None or bool(self._events) or bool(self._answers)
         return news or self._closing or self._ended is self._pipe
 
-    def _pass_on(self, messages: Iterator[Message]) -> None:
+    def _send_all(self, messages: Iterator[Message]) -> None:
         """Send messages; report a failure once, and send the others."""
         assert self._pipe is not None
         for kind, make in messages:

@@ -21,7 +21,7 @@ SCRIPTS = ("viewer", "words", "scene", "timelines", "cameras", "pictures", "volu
 
 
 def round_values(values: NDArray[np.float64], digits: int = 5) -> Any:
-    """Nested lists of numbers of so many significant digits; None for nan and infinity.
+    """Nested lists of numbers rounded to some significant digits; None for nan and infinity.
 
     Examples:
         >>> round_values(np.array([1.23456789, np.nan, 12345678.0]))

@@ -141,7 +141,7 @@ class PageState:
             return {"events": self._events()}
         return {"controls": stream_event("controls", self.notes.controls())}
 
-    def everything(self) -> dict[str, bytes]:
+    def full_state(self) -> dict[str, bytes]:
         """Everything that a new viewer needs."""
         return {key: stream_event(key.partition(":")[0], content) for key, content in self.contents().items()}
 

@@ -1,7 +1,7 @@
 """Access control: pages of this machine, and requests with the token. Nothing here reads a file.
 
 A page of another origin may send requests to this address, also under another name that it has let point here
-(DNS rebinding). Hence: only names of this machine, or plain addresses, which cannot be rebound; only our own origin;
+(DNS rebinding). So only names of this machine, or plain addresses, which cannot be rebound; only our own origin;
 commands only with the token, which no other page can read.
 """
 

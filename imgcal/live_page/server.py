@@ -181,7 +181,7 @@ class Application:
             await _answer(send, _refusal_answer(Refusal(503, f"{MOST_VIEWERS} viewers are connected already")))
             return
         viewer = Viewer()
-        viewer.add(self.board.everything())
+        viewer.add(self.board.full_state())
         self.viewers.add(viewer)
         self._tell({"viewers": len(self.viewers)})
         gone = asyncio.ensure_future(_disconnected(receive))

@@ -12,7 +12,7 @@ from imgcal.association import Proposal, Snapshot, lattice_shifts, near_symmetri
 from imgcal.detection import Frame
 from imgcal.geometry import RigidTransform, geodesic_angle
 from imgcal.matching.maps import Maps, surprise_maps
-from imgcal.matching.poses import Matcher, Ranked, Scene, anywhere, distinct_turns, turns_around
+from imgcal.matching.poses import Matcher, Ranked, Scene, distinct_turns, search_one_camera, turns_around
 from imgcal.matching.refinement import Fitted, fit_and_measure
 from imgcal.types import CalibrationObject
 
@@ -27,7 +27,7 @@ SURE_CAMERA = 2.0  # smallest log odds of a camera that counts for this comparis
 CLEAR = 40.0  # log odds between the best pose and the best distinct one at which the search ends
 FINE_CLIMBS = (0.03, 0.012)
 """Radians: steps on the finest maps."""
-MOST_RIVALS = 4  # fitted as well if the best pose does not stand out by far
+MOST_RIVALS = 4  # fitted as well if the best pose does not stand out clearly
 PARALLAX = 60.0  # px: how far a pose from one camera may be off in the others
 NEARLY = 0.07  # rad: a pose rotated further than this from the known ones gets new windows
 WORTHWHILE = 0.6  # of the frames' area: larger windows are not worth it
@@ -42,11 +42,11 @@ class MatchedFilter:
     def propose(self, snapshot: Snapshot) -> Proposal:
         """Search one snapshot: around the known poses first, then whole frames, and finally for any pose."""
         scene = Scene(snapshot.rig, snapshot.obj, snapshot.prior_std, _distance(snapshot))
-        near = _around(scene, snapshot)
+        near = _search_near(scene, snapshot)
         if near is not None and near.rig_from_object is not None and not _known_pose(near.rig_from_object, snapshot):
             # The windows were placed for another pose, so the edges may be cut off: search from the new one.
             again = replace(snapshot, candidates=(near.rig_from_object,))
-            near = _around(replace(scene, distance=_distance(again)), again) or near
+            near = _search_near(replace(scene, distance=_distance(again)), again) or near
         if near is not None:
             return near
         view = View.of(scene, snapshot)
@@ -77,10 +77,10 @@ class View:
         frames, masks = [snapshot.frames.get(name) for name in names], [snapshot.masks.get(name) for name in names]
         fine, response = surprise_maps(frames, FINEST, dark, masks, windows)
         close = Matcher.on(scene, fine.dilate(), _reach(scene))
-        return cls(scene, frames, dark, fine, response, fine.pool(_coarsest(scene)), close)
+        return cls(scene, frames, dark, fine, response, fine.pool(_coarsest_cell(scene)), close)
 
     def proposal(self, found: Ranked, snapshot: Snapshot) -> Proposal:
-        """Fit and measure the best pose, and its rivals if it does not stand out by far."""
+        """Fit and measure the best pose, and its rivals if it does not stand out clearly."""
         scene = self.scene
         margin, rivals = pose_margin(found, self.close)
         result = self._fit(found.best(1)) if margin > 0 else None
@@ -128,8 +128,8 @@ class View:
         alone = Matcher.on(scene, coarse.pool(2 * coarse.factor), reach)
         matcher = Matcher.on(scene, coarse, reach)
         found: Ranked | None = None
-        for camera in np.argsort(-_promise(coarse)).tolist():
-            poses = anywhere(alone, camera, turns, min(KEPT, len(turns)))
+        for camera in np.argsort(-_sum_surprises(coarse)).tolist():
+            poses = search_one_camera(alone, camera, turns, min(KEPT, len(turns)))
             fresh = matcher.climb(matcher.rank(poses).best(CLIMBING))
             fresh = close.climb(close.rank(fresh.poses), FINE_CLIMBS)
             found = fresh if found is None else (found + fresh).best(2 * CLIMBING)
@@ -187,13 +187,13 @@ def _reach(scene: Scene) -> NDArray[np.float64]:
     return 4 * scene.drift + PARALLAX / 3
 
 
-def _coarsest(scene: Scene) -> int:
+def _coarsest_cell(scene: Scene) -> int:
     """Pixels per cell at the start of the search."""
     gap = _gap(scene.obj) * scene.pixels_per_mm
     return int(max(FINEST, 2 ** int(np.log2(max(gap / CELLS_A_GAP, 1)))))
 
 
-def _around(scene: Scene, snapshot: Snapshot) -> Proposal | None:
+def _search_near(scene: Scene, snapshot: Snapshot) -> Proposal | None:
     """Search windows around the known poses; None = no known pose, or none that stands out."""
     windows = _windows(scene, snapshot)
     if windows is None:
@@ -227,7 +227,7 @@ def _windows(scene: Scene, snapshot: Snapshot) -> NDArray[np.int64] | None:
     uv, ahead = projection.uv.numpy(), projection.depth.numpy()[..., None] > 1
     low = np.where(ahead, uv, np.inf).min((0, 2)) - reach  # (C, 2)
     high = np.where(ahead, uv, -np.inf).max((0, 2)) + reach
-    step = 2 * _coarsest(scene)
+    step = 2 * _coarsest_cell(scene)
     low = np.clip(np.floor(low / step) * step, 0, size)
     high = np.maximum(np.clip(np.ceil(high / step) * step, 0, size), low)
     if (high - low).prod(1).sum() > WORTHWHILE * size.prod(1).sum():
@@ -235,7 +235,7 @@ def _windows(scene: Scene, snapshot: Snapshot) -> NDArray[np.int64] | None:
     return np.stack((low, high), -1).reshape(-1, 4).astype(np.int64)
 
 
-def _promise(maps: Maps) -> NDArray[np.float64]:
+def _sum_surprises(maps: Maps) -> NDArray[np.float64]:
     """Sum of the largest surprises in each camera: (C,)."""
     flat = maps.surprise.reshape(len(maps.surprise), -1)
     return np.sort(flat, axis=1)[:, -64:].sum(1)

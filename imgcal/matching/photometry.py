@@ -60,7 +60,7 @@ def measure_markers(
     scale = radius / usual
     inside = np.asarray(((expected > -0.5) & (expected < (width - 0.5, height - 0.5))).all(1))
     if not inside.any():
-        return _nothing(len(expected), usual)
+        return _unmeasured(len(expected), usual)
     half = min(max(math.ceil(2.2 * usual + 4), 5), LARGEST)
     grey, corner = _part(frame, expected[inside], 2 * half * float(scale.max()), dark)
     start = np.ascontiguousarray(np.where(inside[:, None], expected - corner, 0.0))
@@ -68,7 +68,7 @@ def measure_markers(
     uv, found, misfit = np.empty_like(start), np.zeros((len(start), 5)), np.zeros(len(start))
     size = fit_camera(grey, start, inside, sure, scale, half, np.array(iterations), uv, found, misfit)
     if size == 0:
-        return _nothing(len(expected), usual)
+        return _unmeasured(len(expected), usual)
     amplitude, spread, place = found.T[:3]
     # If the centre of a marker does not match the common shape, part of it may be hidden.
     least = max(USUAL_MISFIT, 2 * _quantile(misfit[inside], 0.25))
@@ -87,7 +87,7 @@ def _quantile(values: NDArray[np.float64], share: float) -> float:
     return float(low + (place % 1) * (high - low))
 
 
-def _nothing(count: int, radius: float) -> Measured:
+def _unmeasured(count: int, radius: float) -> Measured:
     none = np.zeros(count)
     return Measured(np.full((count, 2), np.nan), np.full(count, np.inf), none, none, radius, none)
 

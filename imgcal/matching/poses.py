@@ -60,7 +60,7 @@ class Ranked:
         """Select the best poses, in order."""
         return self.select(np.argsort(-self.scores.total, kind="stable")[:count])
 
-    def or_better(self, other: Ranked) -> Ranked:
+    def choose_better(self, other: Ranked) -> Ranked:
         """Choose the better pose of each pair from two equally long sets."""
         count = len(self.poses.rotation)
         take = np.where(other.scores.total > self.scores.total, count, 0)
@@ -92,13 +92,13 @@ class Matcher:
         """Rotate and move each pose to where it fits best: (K,), keeping their order."""
         turns = _axes(found.poses.rotation)
         for step in steps:
-            found = found.or_better(self.rank(move_object(found, self.scene)))
+            found = found.choose_better(self.rank(move_object(found, self.scene)))
             count = len(found.poses.rotation)
             tried = found.poses[torch.arange(count).repeat(len(turns))]
             scored = self.rank(turn_object(tried, step * turns.repeat_interleave(count, 0), self.scene.obj))
             best = scored.scores.total.reshape(len(turns), count).argmax(0)
-            found = found.or_better(scored.select(best * count + np.arange(count)))
-        return found.or_better(self.rank(move_object(found, self.scene)))
+            found = found.choose_better(scored.select(best * count + np.arange(count)))
+        return found.choose_better(self.rank(move_object(found, self.scene)))
 
 
 def turns_around(pose: RigidTransform, obj: CalibrationObject) -> RigidTransform:
@@ -161,7 +161,7 @@ def distinct_turns(obj: CalibrationObject, count: int) -> NDArray[np.float64]:
     return turns[traces[0] >= traces.max(0) - 1e-9] if len(alike) else turns
 
 
-def anywhere(matcher: Matcher, camera: int, turns: NDArray[np.float64], count: int) -> RigidTransform:
+def search_one_camera(matcher: Matcher, camera: int, turns: NDArray[np.float64], count: int) -> RigidTransform:
     """Search for the object in the whole image of one camera, at the usual distance: the best poses (count,).
 
     Args:
@@ -194,11 +194,11 @@ def anywhere(matcher: Matcher, camera: int, turns: NDArray[np.float64], count: i
     place = ray * (scene.distance / ray.norm(dim=1, keepdim=True))
     # Away from the centre, the object is seen from another side.
     straight = torch.cat((middle, middle.new_ones(1))).expand(count, 3)
-    rotation = _between(straight, ray) @ rotation[torch.from_numpy(best)]
+    rotation = _smallest_rotations(straight, ray) @ rotation[torch.from_numpy(best)]
     return inverse @ RigidTransform(rotation, place - rotation @ centre)
 
 
-def _between(first: Tensor, second: Tensor) -> Tensor:
+def _smallest_rotations(first: Tensor, second: Tensor) -> Tensor:
     """Smallest rotations that take directions (K, 3) to others: (K, 3, 3)."""
     a, b = (x / x.norm(dim=-1, keepdim=True) for x in (first, second))
     axis = torch.linalg.cross(a, b)

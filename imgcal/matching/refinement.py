@@ -194,7 +194,7 @@ def _fit(
         torch.from_numpy(np.where(seen, sigma, 1.0))[None],
         torch.from_numpy(seen)[None],
     )
-    fit = estimate(observations, scene.rig, scene.obj.taken_as_exact(), pose[None], prior_std=scene.std, options=ROBUST)
+    fit = estimate(observations, scene.rig, scene.obj.as_exact(), pose[None], prior_std=scene.std, options=ROBUST)
     return fit if bool(fit.rig_from_object.translation.isfinite().all()) else None
 
 

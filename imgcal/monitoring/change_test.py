@@ -219,17 +219,17 @@ class _Own:
 
     def score(self, variance: Tensor) -> Tensor:
         """Squared norms (C,), whitened by a covariance that includes changes of a variance (C, k)."""
-        values, vectors = self._with(variance)
+        values, vectors = self._add_changes(variance)
         return ((vectors.mT @ self.along[..., None])[..., 0].square() / values).sum(-1)
 
     def change(self, variance: Tensor) -> tuple[Tensor, Tensor]:
         """Information (C, k, k) and gradient (C, k) of a change, in addition to changes of a variance (C, k)."""
-        values, vectors = self._with(variance)
+        values, vectors = self._add_changes(variance)
         spread = self.spread @ vectors / values.sqrt()[:, None, :]
         along = (vectors.mT @ self.along[..., None])[..., 0] / values.sqrt()
         return spread @ spread.mT, (spread @ along[..., None])[..., 0]
 
-    def _with(self, variance: Tensor) -> tuple[Tensor, Tensor]:
+    def _add_changes(self, variance: Tensor) -> tuple[Tensor, Tensor]:
         """Variances (C, k) with changes added, and their directions (C, k, k)."""
         values, vectors = torch.linalg.eigh(self.spread.mT @ (variance[:, :, None] * self.spread))
         return (1 + values).clamp_min(LEAST_VARIANCE), vectors

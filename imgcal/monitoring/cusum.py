@@ -61,7 +61,7 @@ class Cusum:
         self.found = np.zeros(count, dtype=np.int64)  # the same at the last alarm of each
 
     def update(self, standardized: ArrayLike) -> NDArray[np.bool_]:
-        """Add a step, in standard deviations from the mean (nan = no value). Return which means have increased."""
+        """Add a step (count,), in standard deviations from the mean, nan = no value; return which means increased."""
         step = np.asarray(standardized, dtype=np.float64) - self.reference
         step[np.isnan(step)] = 0.0
         self.value = np.maximum(self.value + step, 0.0)

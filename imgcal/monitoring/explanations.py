@@ -84,10 +84,10 @@ class PassingError(Explanation):
             raise RefusedError("this rig has no persistent errors")
         cameras = case.camera_sets[-1]
         start, size = Start(case.before, case.latest), max(float(case.lasting[camera]) for camera in cameras)
-        return [partial(self._pass, start, cameras, factor * size) for factor in PASSING]
+        return [partial(self._shift_images, start, cameras, factor * size) for factor in PASSING]
 
     @staticmethod
-    def _pass(start: Start, cameras: Sequence[int], size: float) -> Variant:
+    def _shift_images(start: Start, cameras: Sequence[int], size: float) -> Variant:
         """Shift the images of some cameras in each snapshot; this is not reported as shaking."""
         return replace(shake_cameras(start, cameras, size), find=lambda _: Finding())
 

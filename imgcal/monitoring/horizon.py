@@ -60,7 +60,7 @@ class Horizon:
         self.prior = prior
         self.away = {camera: last for camera, last in self.away.items() if camera not in cameras}
 
-    def without(self, belief: RigBelief, forgotten: Tensor, kept: Tensor, first: RigBelief) -> Remainder:
+    def remove(self, belief: RigBelief, forgotten: Tensor, kept: Tensor, first: RigBelief) -> Remainder:
         """Compute what is known without the snapshots.
 
         Args:

@@ -40,7 +40,7 @@ class KnownDistances:
     numbers: int = 0  # known by all rows together
 
     @classmethod
-    def none(cls, snapshots: int) -> KnownDistances:
+    def empty(cls, snapshots: int) -> KnownDistances:
         """No row for any snapshot."""
         nothing = np.zeros((snapshots, 0, TERMS))
         return cls(nothing.astype(np.int64), nothing, np.zeros((snapshots, 0)))
@@ -62,7 +62,7 @@ def known_distances(
         used: (S, M) whether the column has a light.
     """
     if not parts:
-        return KnownDistances.none(len(number))
+        return KnownDistances.empty(len(number))
     every = []
     for named, there in zip(number, used, strict=True):
         rows = list[ShapeRow]()
@@ -72,7 +72,7 @@ def known_distances(
             shape = shape_rows(points[named[column] - first], sigma)
             rows += [replace(row, column=column[row.column]) for row in shape]
         every.append(rows)
-    found = KnownDistances.none(len(number))
+    found = KnownDistances.empty(len(number))
     most = max(map(len, every))
     column = np.zeros((len(number), most, TERMS), dtype=np.int64)
     coefficient, length = np.zeros((len(number), most, TERMS)), np.zeros((len(number), most))

@@ -67,7 +67,7 @@ def absorb(
     if shown is not None:
         centre, rotation = centre.reshape(len(seen), -1, 3), rotation[: len(seen)]
         shared = (*(None if part is None else part[: seen.shape[2]] for part in shared[:2]), shared[2])
-    distances = KnownDistances.none(len(seen)) if shown is None else shown.distances(constants.parts)
+    distances = KnownDistances.empty(len(seen)) if shown is None else shown.distances(constants.parts)
     shaken = np.empty((0, 0)) if shake is None else np.ascontiguousarray(shake.double().numpy())
     loss = (levenberg_marquardt_cpu.LOSS_CODES[options.loss], float(options.threshold))
     found = measurement_update_cpu.absorb(

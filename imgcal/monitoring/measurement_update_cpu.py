@@ -289,7 +289,7 @@ def _add_distances_of(places, pose, gradient, distances, s):
         cost += 0.5 * (excess * size) ** 2
         for first in range(len(column)):
             m = column[first]
-            by_m = coefficient[first] * _away(places[m])
+            by_m = coefficient[first] * _step_unit(places[m])
             if by_m == 0.0:
                 continue
             for i in range(3):
@@ -298,7 +298,7 @@ def _add_distances_of(places, pose, gradient, distances, s):
                 n = column[second]
                 if n > m:
                     continue
-                by = by_m * coefficient[second] * _away(places[n])
+                by = by_m * coefficient[second] * _step_unit(places[n])
                 for i in range(3):
                     for j in range(3):
                         if length > 0:
@@ -309,7 +309,7 @@ def _add_distances_of(places, pose, gradient, distances, s):
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _away(place):
+def _step_unit(place):
     """Unit of a step of a light's position (3,), see `light_linearization_cpu`."""
     return max(1.0, np.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2))
 

@@ -35,10 +35,9 @@ MEMORY_SNAPSHOTS = 1024
 """Number of latest snapshots used to measure correlation times ..."""
 FIRST_MEASUREMENTS, MEASUREMENT_INTERVAL = (48, 64, 96), 128
 """... counts of snapshots at which they are first measured, and the interval after that."""
-LONGEST, LONGEST_SECONDS, LONGEST_SNAPSHOTS = 0.97, 0.2, 256
-"""Autocorrelation of the errors at short intervals, and its decay time (s, to 1/e), of the worst of ten recorded infrared
-cameras, and the number of snapshots until which each camera of a calibrated rig is assumed to be like it. Fewer
-snapshots cannot tell, and a camera's error that is absorbed as if it were independent noise stays for long."""
+USUAL, USUAL_SECONDS, USUAL_SNAPSHOTS = 0.4, 0.1, 256
+"""Autocorrelation of the errors of infrared cameras at short intervals, its decay time (s, to 1/e), and the number of
+snapshots until which a calibrated rig is assumed to have no less: fewer snapshots cannot tell."""
 
 # Time between snapshots.
 FASTEST, SLOWEST = 1 / 60, 1.0
@@ -50,7 +49,7 @@ SMOOTHING = 0.1
 
 # Persistent and passing errors.
 EPISODE, EPISODE_SECONDS = 2.0, 1.0
-"""How long a passing error may last: correlation times, and at least so many seconds. On the recorded wand, the mean
+"""How long a passing error may last: correlation times, and at least this many seconds. On the recorded wand, the mean
 shift of a camera over 0.8 s reaches 6 times its usual persistent error, and 3.5 times over 1.5 s."""
 LARGEST, LARGE_EPISODE_SECONDS = 10.0, 0.4
 """Errors larger than this many times the usual persistent error last no longer than those seconds. A target at the edge
@@ -109,9 +108,9 @@ class NoiseCorrelation:
         if seconds > PAUSE * (self.interval or FASTEST):
             self.off = torch.full_like(self.off, math.nan)
 
-    def expect_longest(self) -> None:
-        """Assume the longest correlation at this rate until enough snapshots have been taken."""
-        self.usual = longest_time(self.interval) if self.taken < LONGEST_SNAPSHOTS else 1.0
+    def expect_usual(self) -> None:
+        """Assume the usual correlation at this rate until enough snapshots have been taken."""
+        self.usual = usual_time(self.interval) if self.taken < USUAL_SNAPSHOTS else 1.0
         if self.taken < FIRST_MEASUREMENTS[0]:
             self.time = torch.full_like(self.time, self.usual)
 
@@ -209,11 +208,11 @@ class NoiseCorrelation:
         self.scale = torch.from_numpy(np.maximum(usual / MEDIAN, LEAST_LASTING))
 
 
-def longest_time(seconds: float) -> float:
-    """Correlation time, in snapshots, of the longest errors to expect, for snapshots that are `seconds` apart.
+def usual_time(seconds: float) -> float:
+    """Correlation time, in snapshots, of usual errors for snapshots that are `seconds` apart.
 
     Examples:
-        >>> [round(longest_time(seconds), 2) for seconds in (1 / 60, 0.1, 1.0)]
-        [23.32, 3.99, 1.01]
+        >>> [round(usual_time(seconds), 2) for seconds in (1 / 60, 0.1, 1.0)]
+        [5.41, 1.47, 1.0]
     """
-    return 1 + 2 * LONGEST / math.expm1(min((seconds or FASTEST) / LONGEST_SECONDS, 50.0))
+    return 1 + 2 * USUAL / math.expm1(min((seconds or FASTEST) / USUAL_SECONDS, 50.0))

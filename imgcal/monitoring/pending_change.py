@@ -35,7 +35,7 @@ shifts the image by a tenth of it at most."""
 LENS_KINDS, LENS_LOG_PRIOR = ("focal_length", "principal_point"), -3.0
 """Changes of the lens alone, and their prior log odds against a rotation or a shift: bumps hit the camera."""
 LENS_REST = 2.0
-"""A change of the lens alone is the main kind only if it leaves so many times less unexplained than other kinds."""
+"""A change of the lens alone is the main kind only if it leaves this many times less unexplained than other kinds."""
 DECIDE_AFTER = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """Numbers of snapshots since a change at which its kind is decided if possible."""
 
@@ -64,7 +64,7 @@ class PendingChange:
     count: int  # snapshots
     seconds: float
     kinds: dict[int, str | None]  # by camera that changed; None = undecided
-    most: int = DECIDE_AFTER[-1]  # decide the kinds after so many snapshots
+    most: int = DECIDE_AFTER[-1]  # decide the kinds after this many snapshots
 
     @property
     def overdue(self) -> bool:

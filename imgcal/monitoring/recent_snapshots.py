@@ -30,7 +30,7 @@ from imgcal.monitoring.snapshot_information import SnapshotInformation, add_bloc
 from imgcal.types import CameraRig, Observations
 
 KEPT_SNAPSHOTS = 64
-"""A change must show within so many snapshots: one second at 60 a second."""
+"""Number of snapshots within which a change must show: one second at 60 a second."""
 MOST_BASES = 8
 """Maximum number of times that the belief may have aged within them."""
 SCREENED_AGES = np.array((2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64))
@@ -210,7 +210,7 @@ class RecentSnapshots:
         return [entry.seconds for entry in list(self._seen)[-age:]]
 
     def screen(self) -> NDArray[np.float64]:
-        """Score each camera since each of `SCREENED_AGES`: (ages, C); see `screen`."""
+        """Score the change of each camera since each of `SCREENED_AGES`: (ages, C), the largest of any kind."""
         scores = np.empty((len(SCREENED_AGES), len(self._change)))
         known = (self._at, self._change.contiguous().numpy(), PARTS)
         screen(self._ring, self._totals, self._next, len(self), *known, SCREENED_AGES, scores)
@@ -228,7 +228,7 @@ class RecentSnapshots:
             RefusedError: nothing is known about the rig.
         """
         number = self._next - age
-        information, factor, at = self._known(number)
+        information, factor, at = self._belief_before(number)
         brought, weighted = self._sums(number, self._next)
         if without:
             left_out = self._sums(number + without.start, number + without.stop)
@@ -256,7 +256,7 @@ class RecentSnapshots:
         number, part = self._next - age, CHANGES[kind]
         if age <= episode:
             return 0.0, 0.0
-        *_, at = self._known(number)
+        *_, at = self._belief_before(number)
         own, pull = [], []
         row = slice(camera * self._unit.shape[1], (camera + 1) * self._unit.shape[1])
         change = self._change[camera, :, part]
@@ -279,7 +279,7 @@ class RecentSnapshots:
         Raises:
             RefusedError: nothing was known about the rig.
         """
-        _, factor, at = self._known(self._next - age)
+        _, factor, at = self._belief_before(self._next - age)
         wide = self._unit.size
         error = (at - torch.from_numpy(self._at))[:wide].view(self._unit.shape)
         rig = displace(self._belief.rig, error * self._belief.unit)
@@ -290,7 +290,7 @@ class RecentSnapshots:
         information, weighted = self._sums(self._next - count, self._next)
         return information, weighted - information @ torch.from_numpy(self._at)
 
-    def _known(self, number: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _belief_before(self, number: int) -> tuple[Tensor, Tensor, Tensor]:
         """Information (D, D) before a snapshot, its Cholesky factor, and the most probable error (D,)."""
         base = next(base for base in reversed(self._bases) if base.number <= number)
         brought, weighted = self._sums(base.number, number)

@@ -93,7 +93,7 @@ class RigBelief:
 
     @cached_property
     def arrays(self) -> RigArrays:
-        """The rig for compiled loops."""
+        """The values of the rig, (C, ...) each, for compiled loops."""
         return RigArrays.of(self.rig)
 
     @cached_property

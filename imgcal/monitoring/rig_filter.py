@@ -124,10 +124,10 @@ class RigFilter:
     def follow(
         self, observations: Observations, rig_from_object: RigidTransform, seconds: float = 0.0
     ) -> MeasurementUpdate:
-        """Do the work of `update`, except that the caller must call `relinearize` when `due`."""
+        """Do the work of `update`, except that the caller must call `relinearize` when `due`; arguments as for it."""
         horizon, alone = self.horizon, None
         if horizon is not None and horizon.snapshots == 1 and self._early:
-            alone = horizon.without(self.belief, shown(self._early), observations.seen[0].any(-1), self._first)
+            alone = horizon.remove(self.belief, seen_cameras(self._early), observations.seen[0].any(-1), self._first)
         passed = max(seconds, 0.0) if self.count and self.horizon is None else 0.0
         self._span, self._waited = self._span + passed, self._waited + passed
         due = self._waited if self._waited >= LEAST_AGING_SECONDS else 0.0
@@ -176,7 +176,7 @@ class RigFilter:
             start, forgotten = self.belief, self._early[: -horizon.snapshots]
             if len(self._early) > horizon.most:
                 self._early = self._early[-horizon.snapshots :]
-                left = horizon.without(self.belief, shown(forgotten), shown(self._early), self._first)
+                left = horizon.remove(self.belief, seen_cameras(forgotten), seen_cameras(self._early), self._first)
                 self._first, horizon.away = left.first, left.away
         result = absorb(self._first, *stack_snapshots(self._early), self.options, start)
         self.belief, self._waited = age_belief(result.belief, self._span, self.walk), 0.0
@@ -201,11 +201,11 @@ class RigFilter:
         self.count += new
         return result
 
-    def suppose(self, first: RigBelief, belief: RigBelief) -> None:
+    def replace_beliefs(self, first: RigBelief, belief: RigBelief) -> None:
         """Replace the beliefs: before the first kept snapshot, and now."""
         self._first, self.belief, self._waited = first, belief, 0.0
 
 
-def shown(snapshots: Sequence[tuple[Observations, RigidTransform]]) -> Tensor:
+def seen_cameras(snapshots: Sequence[tuple[Observations, RigidTransform]]) -> Tensor:
     """Return which cameras see the object in some snapshots: (C,) bool."""
     return torch.cat([observations.seen for observations, _ in snapshots]).any(0).any(-1)

@@ -42,10 +42,10 @@ from imgcal.monitoring.unsynchronized_cameras import drop_cameras
 from imgcal.types import Observations
 
 FEW_SNAPSHOTS = 16
-"""With at most so many snapshots before a change, the earlier knowledge is unreliable: it bends by more than its stated
-uncertainty, and the wrong camera would be blamed. It is then forgotten ..."""
+"""With at most this many snapshots before a change, the earlier knowledge is unreliable: it bends by more than its
+stated uncertainty, and the wrong camera would be blamed. It is then forgotten ..."""
 OBJECT_SNAPSHOTS = 8
-"""... and a change of the object is not considered before so many snapshots have been absorbed."""
+"""... and a change of the object is not considered before this many snapshots have been absorbed."""
 UNDECIDED_SNAPSHOTS = 16
 """Snapshots for which a camera stays in doubt that seemed to have moved without a decision."""
 NEW_SHARE = 0.25
@@ -53,8 +53,8 @@ NEW_SHARE = 0.25
 WRONG_LABEL, LEAST_BEFORE = 10.0, 2
 """Standard deviations beyond which a label is wrong, and fewest snapshots of a camera before its change: where hardly
 anything is known yet, wrong labels in its first snapshots, for example of half-hidden markers, look like a move."""
-SETTLED_SNAPSHOTS, LEAST_AGAIN = 16, 8
-"""A second move of a camera within so many snapshots is doubted, and so many snapshots are needed to decide: a late
+RECENT_MOVE, LEAST_AGAIN = 16, 8
+"""A second move of a camera within the first number of snapshots is doubted, and takes the second to decide: a late
 camera seems to have moved in any two successive snapshots, but not in eight."""
 
 
@@ -144,7 +144,7 @@ class RigMonitor:
         given = observations
         self.noise.pass_time(seconds)
         if self.filter.calibrated:
-            self.noise.expect_longest()
+            self.noise.expect_usual()
         observations = self.noise.weigh(self.shaking.apply_to(observations))
         new = [camera for camera in moved if camera not in self.quarantine.cameras]
         if new:
@@ -338,7 +338,7 @@ class RigMonitor:
 
     def _moved_lately(self, camera: int) -> bool:
         """Tell whether a move of a camera was reported recently."""
-        return camera in self._moved_at and self.filter.count - self._moved_at[camera] < SETTLED_SNAPSHOTS
+        return camera in self._moved_at and self.filter.count - self._moved_at[camera] < RECENT_MOVE
 
     def _doubt(self, case: Case, cameras: Sequence[int]) -> MonitorUpdate:
         """Quarantine cameras that seem to move again and again: two snapshots cannot tell why, eight can.
@@ -350,7 +350,7 @@ class RigMonitor:
         anywhere = dict.fromkeys(cameras)
         before = free_cameras(case.before, anywhere, JUMPS[-1])
         if new:
-            before = self._anywhere(self._moved_early | set(cameras))
+            before = self._factory_with_free(self._moved_early | set(cameras))
         result = self._restart(before, [(drop_cameras(one, cameras), pose) for one, pose in case.latest], pauses)
         if new:
             self.known_since = self.filter.count - case.count
@@ -368,7 +368,7 @@ class RigMonitor:
     def _beginning(self) -> RigBelief | None:
         """What the factory says, where the latest snapshots are all that is known beside it."""
         everything = self.filter.count - self.known_since == len(self._recent)
-        return self._anywhere(self._moved_early) if everything else None
+        return self._factory_with_free(self._moved_early) if everything else None
 
     def _adopt(self, case: Case, verdict: Verdict, new: bool = False) -> MonitorUpdate:
         """Learn a case's snapshots again by the best explanation; `new`: the filter has not absorbed them before.
@@ -427,11 +427,11 @@ class RigMonitor:
                 earlier = [(drop_cameras(one, misfit), pose) for one, pose in case.snapshots[: -case.count]]
                 return MonitorUpdate(self._restart(self._beginning, [*earlier, *case.latest], case.pauses))
         early = self._moved_early | free.keys()
-        before = self._anywhere(early) if forget else free_cameras(case.before, free, jump)
+        before = self._factory_with_free(early) if forget else free_cameras(case.before, free, jump)
         result = self._restart(before, case.latest, case.pauses[-case.count :])
         if horizon is not None:
             self._moved_early = early
-            horizon.free(self._anywhere(early), free)
+            horizon.free(self._factory_with_free(early), free)
         number, new = self.filter.count - case.count, dict[int, Change]()
         for camera, kind in free.items():
             if forget or (kind is None and camera not in self.open):
@@ -446,7 +446,7 @@ class RigMonitor:
         self._moved_at |= dict.fromkeys(new, self.filter.count)
         return MonitorUpdate(result, tuple(new.values()))
 
-    def _anywhere(self, cameras: Collection[int]) -> RigBelief:
+    def _factory_with_free(self, cameras: Collection[int]) -> RigBelief:
         """The factory calibration with some cameras unconstrained."""
         return free_cameras(self._prior, dict.fromkeys(sorted(cameras)), JUMPS[-1])
 
@@ -565,7 +565,7 @@ class RigMonitor:
             self._recent.rebase(belief, information)
             with contextlib.suppress(RefusedError):
                 belief = self._restart(first, *self._recent.latest(pending.count)).belief
-            self.filter.suppose(first, age_belief(belief, pending.seconds, self.filter.walk))
+            self.filter.replace_beliefs(first, age_belief(belief, pending.seconds, self.filter.walk))
         self.open = {camera: change for camera, change in self.open.items() if camera not in kinds}
         if not self.open:
             self._pending = None

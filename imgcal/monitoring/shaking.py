@@ -58,7 +58,7 @@ class Shaking(Explanation):
 
 
 def shake_cameras(start: Start, cameras: Sequence[int], size: float) -> Variant:
-    """Let cameras shake by so many pixels, or by more if they are known to."""
+    """Let cameras shake by this many pixels, or by more if they are known to."""
     snapshots = []
     for one, pose in start.snapshots:
         shake = torch.zeros(1, one.seen.shape[1], dtype=torch.float64) if one.shake is None else one.shake.clone()

@@ -1,12 +1,14 @@
 from .checkpoint import (
     Checkpoint,
+    check_object,
+    check_rig,
+    check_says_rigs,
     load_checkpoint,
     load_network,
     read_subject,
     save_checkpoint,
     warm_start,
 )
-from .compatibility import check_object, check_rig, check_says_rigs
 from .config import (
     PRESETS,
     HueCentroids,
@@ -31,7 +33,7 @@ from .network import Network
 from .parameterization import Parameterization
 from .points import PaperPointNetwork, PointNetwork
 from .pooled_images import PaperImageNetwork, PooledImageNetwork
-from .randomness import drawing_from
+from .randomness import use_generators
 from .soft_positions import find_soft_positions
 from .tiles import Tiles
 
@@ -79,7 +81,6 @@ __all__ = [
     "claim",
     "cut_crops",
     "cut_patches",
-    "drawing_from",
     "drop_pretrained",
     "find_soft_positions",
     "load_checkpoint",
@@ -92,5 +93,6 @@ __all__ = [
     "save_checkpoint",
     "save_exported",
     "save_onnx",
+    "use_generators",
     "warm_start",
 ]

@@ -26,7 +26,6 @@ from imgcal.io import (
     write_tensors,
 )
 from imgcal.messages import quote, shorten
-from imgcal.networks.compatibility import check_object, check_rig, is_position_training
 from imgcal.networks.config import NetworkSpec, drop_pretrained, is_import_path
 from imgcal.networks.factory import build_network
 from imgcal.networks.infrared import InfraredNetwork
@@ -34,7 +33,7 @@ from imgcal.networks.infrared_checkpoint import INFRARED, MEASURER, read_weights
 from imgcal.networks.measurer import Measurer
 from imgcal.networks.network import Network
 from imgcal.networks.refiner import IterativeRefiner
-from imgcal.types import CalibrationObject, CameraRig
+from imgcal.types import CalibrationObject, CameraRig, object_difference, rig_difference
 
 FORMAT = "imgcal-network/1"
 FORMATS_OF_FRAMES: dict[type[nn.Module], str] = {InfraredNetwork: INFRARED, Measurer: MEASURER}
@@ -236,3 +235,43 @@ def _parse_texts(path: str | Path, texts: dict[str, str]) -> tuple[CameraRig, Ca
         return rig_from_text(texts["rig"], "rig"), object_from_text(texts["object"], "object", name)
     except (KeyError, InputError) as error:
         raise InputError(f"{path}: found no readable rig and object in it, expected both: {error}") from error
+
+
+def check_rig(path: str | Path, trained: CameraRig, rig: CameraRig) -> None:
+    """Compare the factory values of two rigs.
+
+    Raises:
+        InputError: they differ; names the first camera and value that do.
+    """
+    difference = rig_difference(rig, trained)
+    if difference is not None:
+        raise InputError(f"{path}: trained for another rig than {rig.name} ({trained.name}): {difference}")
+
+
+def is_position_training(experiment: NetworkSpec) -> bool:
+    """Check whether a training was one of positions, which leaves the trunk untrained."""
+    return getattr(experiment, "task", None) == "positions"
+
+
+def check_says_rigs(path: str | Path, experiment: NetworkSpec) -> None:
+    """Refuse a network that was trained only to find positions, not to predict rigs.
+
+    Raises:
+        InputError: the training's task was `positions`.
+    """
+    if is_position_training(experiment):
+        raise InputError(
+            f"{path}: found a training of positions, whose trunk is untrained; expected one of rigs, which starts "
+            "from it by `training.init_from`"
+        )
+
+
+def check_object(path: str | Path, trained: CalibrationObject, obj: CalibrationObject) -> None:
+    """Compare the fiducials of two objects, their radii included.
+
+    Raises:
+        InputError: they differ; names the first fiducial that does.
+    """
+    difference = object_difference(obj, trained)
+    if difference is not None:
+        raise InputError(f"{path}: trained for another object than {obj.name} ({trained.name}): {difference}")

@@ -41,7 +41,7 @@ class PaperPoints(StrictModel):
     head_widths: Widths = (1024, 1024)  # of the hidden layers of the heads
 
     @model_validator(mode="after")
-    def _divisible(self) -> PaperPoints:
+    def _check_width(self) -> PaperPoints:
         return _make_heads_whole(self)
 
 
@@ -55,7 +55,7 @@ class PaperImages(StrictModel):
     head_widths: Widths = (128,)  # of the hidden layers of the heads
 
     @model_validator(mode="after")
-    def _harmless(self) -> PaperImages:
+    def _check_options(self) -> PaperImages:
         check_options(self.options)
         return self
 
@@ -72,7 +72,7 @@ class TrunkConfig(StrictModel):
     trust: bool = False  # predict how far the refinement may trust each fiducial
 
     @model_validator(mode="after")
-    def _divisible(self) -> TrunkConfig:
+    def _check_width(self) -> TrunkConfig:
         return _make_heads_whole(self)
 
 
@@ -103,7 +103,7 @@ class Images(StrictModel):
     trunk: TrunkConfig = TrunkConfig()
 
     @model_validator(mode="after")
-    def _harmless(self) -> Images:
+    def _check_options(self) -> Images:
         if not is_import_path(self.backbone):
             check_options(self.options)
         return self
@@ -119,7 +119,7 @@ class PooledImages(StrictModel):
     trunk: TrunkConfig = TrunkConfig()
 
     @model_validator(mode="after")
-    def _harmless(self) -> PooledImages:
+    def _check_options(self) -> PooledImages:
         check_options(self.options)
         return self
 
@@ -158,7 +158,7 @@ class NetworkConfig(StrictModel):
     change: dict[str, Any] = Field(default={})  # values of the preset to replace, by name; groups within groups
 
     @model_validator(mode="after")
-    def _known(self) -> NetworkConfig:
+    def _check_preset(self) -> NetworkConfig:
         if self.preset not in PRESETS:
             hint = nearest(self.preset, PRESETS) or list_choices(PRESETS)
             raise ValueError(f"found preset `{shorten(self.preset)}`{hint}")

@@ -17,7 +17,7 @@ from imgcal.networks.config import (
 )
 from imgcal.networks.network import Network
 from imgcal.networks.parameterization import Parameterization
-from imgcal.networks.randomness import drawing_from
+from imgcal.networks.randomness import use_generators
 from imgcal.synthesis import ImageOptions
 from imgcal.types import CalibrationObject, CameraRig
 
@@ -59,7 +59,7 @@ def build(
         >>> len(passes), passes[-1].rig.focal_length.shape  # coarse to fine; rigs, cameras, (fx, fy)
         (3, torch.Size([2, 4, 2]))
     """
-    with drawing_from(generator):
+    with use_generators(generator):
         return _make(config, Parameterization(factory, obj, drift_std), images)
 
 

@@ -47,7 +47,7 @@ class Queries:
     asked: Tensor  # (P, N) bool: expected in view
 
     def select(self, rows: Tensor) -> Queries:
-        """Select crops by row."""
+        """Select some of the P crops by mask (P,) or indices."""
         return Queries(self.place[rows], self.radius[rows], self.depth[rows], self.asked[rows])
 
     def geometry(self, size: int) -> Tensor:
@@ -80,7 +80,7 @@ class InfraredNetwork(nn.Module):
     """Compute evidence from crops and queries."""
 
     def __init__(self, config: InfraredConfig = InfraredConfig()) -> None:
-        """Create an untrained network; weights come from torch's default generators (see `drawing_from`)."""
+        """Create an untrained network; weights come from torch's default generators (see `use_generators`)."""
         super().__init__()
         self.config = config
         width = config.channels

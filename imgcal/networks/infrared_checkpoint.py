@@ -15,7 +15,7 @@ from imgcal.errors import InputError
 from imgcal.io import StrictModel, read_json, read_tensors, validate, write_tensors
 from imgcal.networks.infrared import InfraredConfig, InfraredNetwork
 from imgcal.networks.measurer import Measurer, MeasurerConfig
-from imgcal.networks.randomness import drawing_from
+from imgcal.networks.randomness import use_generators
 
 INFRARED, MEASURER = "imgcal-infrared/1", "imgcal-measurer/1"
 
@@ -65,7 +65,7 @@ def load_infrared(path: str | Path) -> InfraredCheckpoint:
         InputError: no such file, or other content.
     """
     config, tensors, metrics = _read(path, INFRARED, InfraredConfig)
-    with drawing_from(torch.Generator()):
+    with use_generators(torch.Generator()):
         network = InfraredNetwork(config)
     _fill(path, network, tensors)
     return InfraredCheckpoint(network.eval(), metrics)
@@ -74,7 +74,7 @@ def load_infrared(path: str | Path) -> InfraredCheckpoint:
 def load_measurer(path: str | Path) -> MeasurerCheckpoint:
     """Load a measurer; see `load_infrared`."""
     config, tensors, metrics = _read(path, MEASURER, MeasurerConfig)
-    with drawing_from(torch.Generator()):
+    with use_generators(torch.Generator()):
         network = Measurer(config)
     _fill(path, network, tensors)
     return MeasurerCheckpoint(network.eval(), metrics)

@@ -49,8 +49,8 @@ class CropCnn(nn.Module):
         fine = self.fine(functional.gelu(self.stem(crops)))
         middle = self.middle(functional.gelu(self.down_middle(fine)))
         coarse = self.coarse(functional.gelu(self.down_coarse(middle)))
-        middle = middle + _twice(self.up_middle(coarse))
-        return self.out(functional.gelu(fine + _twice(self.up_fine(middle))))
+        middle = middle + _upsample(self.up_middle(coarse))
+        return self.out(functional.gelu(fine + _upsample(self.up_fine(middle))))
 
     def group_matcher(self, coarse: bool = False) -> dict[str, Any]:
         """Group layers by depth, as timm's models do: for learning rates that decrease towards the crops."""
@@ -124,5 +124,5 @@ ENCODERS: dict[EncoderName, Callable[[int, int], nn.Module]] = {
 """Constructors by name, of channels of the feature map and pixels of the crop; equal sizes have equal cost."""
 
 
-def _twice(x: Tensor) -> Tensor:
+def _upsample(x: Tensor) -> Tensor:
     return functional.interpolate(x, scale_factor=2.0, mode="nearest")

@@ -49,7 +49,7 @@ class Measurer(nn.Module):
     """Measure marker centres in patches."""
 
     def __init__(self, config: MeasurerConfig = MeasurerConfig()) -> None:
-        """Create an untrained network; weights come from torch's default generators (see `drawing_from`)."""
+        """Create an untrained network; weights come from torch's default generators (see `use_generators`)."""
         super().__init__()
         self.config = config
         channels = config.channels

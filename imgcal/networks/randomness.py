@@ -9,7 +9,7 @@ import torch
 
 
 @contextmanager
-def drawing_from(*generators: torch.Generator) -> Iterator[None]:
+def use_generators(*generators: torch.Generator) -> Iterator[None]:
     """Replace the default generators of devices by given ones, and restore them afterwards.
 
     Default generators are global: other threads must not draw at the same time.

@@ -107,7 +107,7 @@ class MapEstimate(nn.Module):
         rig_from_object: RigidTransform | None = None,
         initial_rig: CameraRig | None = None,
     ) -> MapSolution:
-        """Estimate rig and poses."""
+        """Estimate (*B) rigs and (*B, S) poses; arguments as under Shape."""
         factory = self.factory() if factory is None else factory
         problem = self._problem(observations, factory, self.prior_std if prior_std is None else prior_std)
         state, converged = map_state(problem, self._start(problem, rig_from_object, initial_rig), self._encoded)

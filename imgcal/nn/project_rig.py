@@ -40,7 +40,7 @@ class ProjectRig(nn.Module):
         self.obj = ObjectBuffers(obj)
 
     def forward(self, rig: CameraRig, rig_from_object: RigidTransform | None = None) -> Projection:
-        """Project the fiducials."""
+        """Project the N fiducials into the C cameras of (*B) rigs; arguments as under Shape."""
         points = self.obj.points.to(rig.focal_length)
         radius = None if self.obj.radius is None else self.obj.radius.to(points)
         if rig_from_object is not None:

@@ -76,7 +76,7 @@ class RenderAndCompare(nn.Module):
         self._encoded = encode_image_options(options)
 
     def forward(self, prediction: Prediction, images: Tensor, factory: CameraRig | None = None) -> RefinedImages:
-        """Refine the prediction; `factory` replaces the module's own factory rig."""
+        """Refine (*B) predictions on images (*B, C, 3, size, size); `factory` replaces the module's own factory rig."""
         batch, dtype = images.shape[:-4], prediction.rig.focal_length.dtype
         count = batch.numel()
         factory = self.factory() if factory is None else factory

@@ -53,7 +53,7 @@ class ReprojectionLoss(nn.Module):
         self.obj, self.reduction = ObjectBuffers(obj), reduction
 
     def forward(self, prediction: Prediction, target: Prediction | Tensor, seen: Tensor | None = None) -> Tensor:
-        """Compute the loss."""
+        """Compute the loss in pixels, () or (*B); arguments as under Shape."""
         with torch.autocast(prediction.rig.focal_length.device.type, enabled=False):
             obj = self.obj()
             uv = project_fiducials(_exact(prediction).cameras_from_object, obj)

@@ -43,7 +43,7 @@ class SoftPositions(nn.Module):
         self.register_buffer("colours", colours.clone(), persistent=False)
 
     def forward(self, images: Tensor, logits: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Locate the fiducials."""
+        """Locate the N fiducials in (*B) images; arguments as under Shape."""
         batch = images.shape[:-3]
         given = None if logits is None else logits.reshape(-1, *logits.shape[-3:])
         uv, confidence = find_soft_positions(

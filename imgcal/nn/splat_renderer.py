@@ -66,7 +66,7 @@ class SplatRenderer(nn.Module):
         depth: Tensor | None = None,
         intensity: Tensor | None = None,
     ) -> Tensor:
-        """Draw the fiducials."""
+        """Draw the N fiducials into images (*B, K, H, W); arguments as under Shape."""
         if isinstance(uv, Projection):
             visible = uv.visible if visible is None else visible
             depth = uv.depth if depth is None else depth

@@ -20,7 +20,7 @@ from imgcal.association import PipelineOptions
 from imgcal.geometry import RigidTransform
 from imgcal.medians import median_of_known
 from imgcal.monitoring import RigBelief
-from imgcal.online.camera_visibility import least_back
+from imgcal.online.camera_visibility import labels_to_reappear
 from imgcal.online.label_consistency import LEAST_AGREEING, Checked, check_labels
 from imgcal.online.prediction_labels import (
     LEAST_BLOBS,
@@ -166,7 +166,7 @@ class Search:
 
     def _drop_chance_labels(self, checked: Checked, known: Surroundings, doubted: frozenset[int]) -> Checked:
         """Remove labels of cameras in doubt that are too few to show that they are back."""
-        few = _label(checked.blobs, self.num_cameras) < least_back(known.obj.num_fiducials)
+        few = _label(checked.blobs, self.num_cameras) < labels_to_reappear(known.obj.num_fiducials)
         chance = [camera for camera in (*self.sought, *doubted) if few[camera]]
         rows = np.isin(checked.blobs.camera, chance) & (checked.blobs.fiducial >= 0)
         if not rows.any():
@@ -176,7 +176,7 @@ class Search:
 
     def observe(self, blobs: Detections, number: int) -> None:
         """Note, after an absorbed snapshot, which cameras see the object again and how many blobs are usual."""
-        labelled, spare, usual = _label(blobs, self.num_cameras), self._spare(blobs), self._usual()
+        labelled, spare, usual = _label(blobs, self.num_cameras), self._count_spare_blobs(blobs), self._usual()
         for camera in range(self.num_cameras):
             vainly = spare[camera] >= LEAST_BLOBS and labelled[camera] < LEAST_BLOBS
             if vainly:
@@ -199,7 +199,7 @@ class Search:
     def _usual(self) -> NDArray[np.float64]:
         return median_of_known(np.stack(self.spare)) if self.spare else np.zeros(self.num_cameras)
 
-    def _spare(self, blobs: Detections) -> NDArray[np.float64]:
+    def _count_spare_blobs(self, blobs: Detections) -> NDArray[np.float64]:
         """Number of unlabelled blobs of each camera beyond its usual number: (C,)."""
         return np.maximum(spare_blobs(blobs, self.num_cameras) - self._usual(), 0)
 

@@ -86,7 +86,7 @@ class CameraVisibility:
         count = np.bincount(look.blobs.camera[look.blobs.fiducial >= 0], minlength=len(self.names))
         some = set(np.flatnonzero(count).tolist())
         self.seen |= some
-        labelled = set(np.flatnonzero(count >= least_back(look.predicted.shape[1])).tolist()) - look.astray
+        labelled = set(np.flatnonzero(count >= labels_to_reappear(look.predicted.shape[1])).tolist()) - look.astray
         self._listen(look)
         absent = self._should_see(rig, look.predicted) - some - look.astray - look.silent
         for camera in labelled:
@@ -102,7 +102,7 @@ class CameraVisibility:
             self.astray[camera] = min(first, look.time), times + 1, look.time
         events = []
         for camera in range(len(self.names)):
-            why = self._why(camera, look)
+            why = self._find_reason(camera, look)
             if why is not None and camera not in self.lost:
                 since, message = why
                 self.lost[camera] = since
@@ -128,7 +128,7 @@ class CameraVisibility:
             return ABSENT_SECONDS
         return max(SILENT_SECONDS, RESTS * median(np.diff(times)))
 
-    def _why(self, camera: int, look: VisibleObject) -> tuple[float, str] | None:
+    def _find_reason(self, camera: int, look: VisibleObject) -> tuple[float, str] | None:
         first, times, latest = self.astray.get(camera, (look.time, 0, look.time))
         if times >= ASTRAY_SNAPSHOTS and latest - first >= ASTRAY_SECONDS:
             return min(first, self.missing.get(camera, (first, 0))[0]), (
@@ -151,6 +151,6 @@ class CameraVisibility:
         return Event(look.time, look.number, kind, name, since, message=f"{name} {message}")  # type: ignore[arg-type]
 
 
-def least_back(fiducials: int) -> int:
+def labels_to_reappear(fiducials: int) -> int:
     """Number of labels that show that a camera sees the object again: one or two occur by chance."""
     return min(LEAST_EXPECTED, (fiducials + 1) // 2)

@@ -81,7 +81,7 @@ class ClockOffsets:
         if not len(went) or median(went) < least:
             return ()
         # Use the current rig for both: what is learnt about cameras is no motion.
-        self._add(state, (state.predicted - self._predicted(state, last[1])) / self._period)
+        self._add(state, (state.predicted - self._predict(state, last[1])) / self._period)
         offset, sigma = self.offsets()
         changed = np.abs(offset - self.late)
         sure = changed > np.maximum(math.sqrt(OFFSET_CHI2) * sigma, LEAST_KNOWN)
@@ -135,7 +135,7 @@ class ClockOffsets:
         return places
 
     @staticmethod
-    def _predicted(state: RigState, rig_from_object: RigidTransform) -> NDArray[np.float64]:
+    def _predict(state: RigState, rig_from_object: RigidTransform) -> NDArray[np.float64]:
         """Project the fiducials of an object in another pose: (C, N, 2) pixels, nan out of view."""
         belief = state.belief
         points = rig_from_object.reshape(1).apply(belief.points_object)

@@ -21,9 +21,6 @@ LEAST_DRIFT = {"rotation": math.radians(0.05), "position": 0.5, "focal_length": 
 """Drift (rad, mm, pixels) that is reported if significant."""
 DRIFT_SIGMAS = 5.0
 """Significance of the drift, in standard deviations of the values at the start of the measurement."""
-SETTLED_SNAPSHOTS = 20
-"""Snapshots after which the drift of a rig that began with its factory values is measured: labels of its first ones may
-be wrong, and the next ones correct it."""
 LEAST_SHIFT_RATIO = 0.5
 """Least ratio of two shifts of the labels: by the changes of all values of a camera, and by the drift alone. Values
 that change together so that the labels hardly move, such as a focal length and a distortion, are being learnt."""
@@ -53,7 +50,7 @@ class DriftWatch:
 
         Args:
             belief: the current belief.
-            unsettled: cameras that moved and have not been relearnt, or that do not see the object.
+            unsettled: cameras whose drift is not measured, see `KeeperMemory.unsettled`.
             points: where a camera has lately seen the object: (P, 3) mm.
             time: s since the epoch.
             number: of the update.

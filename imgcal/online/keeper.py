@@ -22,11 +22,10 @@ from imgcal.online.camera_health import camera_health, describe_health, take_hea
 from imgcal.online.camera_visibility import VisibleObject
 from imgcal.online.clock_correction import clock_shifts, shift_blobs
 from imgcal.online.clock_offsets import ClockOffsets, unsynchronized_event
-from imgcal.online.drift_watch import SETTLED_SNAPSHOTS
 from imgcal.online.events import Event, snapshot_name
 from imgcal.online.foreign_object import ForeignObject
 from imgcal.online.image_quality import ImageQuality
-from imgcal.online.keeper_file import KeeperFile, read_state, unusable
+from imgcal.online.keeper_file import KeeperFile, read_state, unusable_error
 from imgcal.online.keeper_memory import KeeperMemory
 from imgcal.online.labelling import Labelling
 from imgcal.online.object_checks import object_event
@@ -287,15 +286,11 @@ class RigKeeper:
         look = VisibleObject(time, number, state.detections, state.predicted, astray, frozenset(silent))
         events += memory.sightings.observe(state.rig, look)
         events += memory.relearning.report_relearnt(
-            memory.belief, frozenset(memory.monitor.open), memory.settled, time, number
+            memory.belief, frozenset(memory.monitor.open), memory.best_known, time, number
         )
         if found is not None:
-            unsettled = frozenset(memory.relearning.events) | frozenset(memory.sightings.lost) | frozenset(memory.off)
-            filtered = memory.monitor.filter
-            if not filtered.calibrated and filtered.count < SETTLED_SNAPSHOTS:
-                unsettled = frozenset(range(len(names)))
             seen = memory.monitor.seen_points
-            events += memory.drift_watch.observe(memory.belief, unsettled, seen, time, number)
+            events += memory.drift_watch.observe(memory.belief, memory.unsettled, seen, time, number)
         for test in self.tests:
             for event in test(state, frames, None if found is None else found.update):
                 events.append(event)
@@ -402,7 +397,7 @@ class RigKeeper:
                 if test.name in found["tests"]:
                     test.restored(reader.read_plain(found["tests"][test.name], f"tests.{test.name}"))
         except (ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
-            raise unusable(path, error) from error
+            raise unusable_error(path, error) from error
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         return keeper

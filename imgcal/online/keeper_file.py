@@ -102,9 +102,9 @@ def read_state(path: str | Path) -> tuple[dict[str, Any], StateReader]:
             raise ValueError("its sha256 does not match")
         return state, StateReader(state)
     except (ValueError, RecursionError) as error:
-        raise unusable(path, error) from error
+        raise unusable_error(path, error) from error
 
 
-def unusable(path: str | Path, error: Exception) -> InputError:
+def unusable_error(path: str | Path, error: Exception) -> InputError:
     """Make the error for a file that was changed since it was written."""
     return InputError(f"{path}: the state was changed since it was written, or is damaged ({shorten(str(error))})")

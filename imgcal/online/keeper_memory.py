@@ -43,6 +43,9 @@ LEAST_LOOKS = 8
 """Number of snapshots of a camera in its current pose after which its labels can be predicted."""
 USUAL_SNAPSHOTS = 8
 """Number of snapshots that define the usual error of most cameras."""
+DRIFT_FROM = 20
+"""Snapshots after which the drift of a rig that began with its factory values is measured: labels of its first ones may
+be wrong, and the next ones correct it."""
 
 
 @dataclass
@@ -145,7 +148,7 @@ class KeeperMemory:
     def obj_now(self) -> CalibrationObject:
         """The object as currently estimated."""
         known = self.belief.obj  # with tolerances, even if an exact object has changed
-        return self.obj if known.exact else replace(self.obj.taken_as_exact(), points=self.belief.points_object)
+        return self.obj if known.exact else replace(self.obj.as_exact(), points=self.belief.points_object)
 
     @property
     def surroundings(self) -> Surroundings | None:
@@ -155,9 +158,17 @@ class KeeperMemory:
         return Surroundings(self.belief, (self.prior.prior or RigPrior()).std(self.prior), self.obj_now, self.options)
 
     @property
-    def settled(self) -> frozenset[int]:
+    def best_known(self) -> frozenset[int]:
         """Cameras that every snapshot within the horizon shows in their current poses; empty without a horizon."""
         return frozenset() if self.horizon is None else frozenset(np.flatnonzero(self.looks >= self.horizon).tolist())
+
+    @property
+    def unsettled(self) -> frozenset[int]:
+        """Cameras whose drift is not measured: moved, lost or off; at first all of a rig with its factory values."""
+        filtered = self.monitor.filter
+        if not filtered.calibrated and filtered.count < DRIFT_FROM:
+            return frozenset(range(self.prior.num_cameras))
+        return frozenset(self.relearning.events) | frozenset(self.sightings.lost) | frozenset(self.off)
 
     @property
     def most_usual(self) -> float:

@@ -127,7 +127,7 @@ def _jacobians(
 
 def common_motion(belief: RigBelief, pose: RigidTransform, trusted: NDArray[np.bool_]) -> Tensor:
     """Motion of the pose (6, K C) that goes with the errors of the rig shared by its cameras."""
-    motion = Gauge(torch.from_numpy(trusted).double()).averaging(belief.rig).unflatten(1, (-1, EXTRINSICS))
+    motion = Gauge(torch.from_numpy(trusted).double()).averaging_matrix(belief.rig).unflatten(1, (-1, EXTRINSICS))
     by_error = torch.zeros(POSE, *belief.unit.shape, dtype=torch.float64)
     by_error[..., :EXTRINSICS] = motion * belief.unit[:, :EXTRINSICS]
     carried = torch.eye(POSE, dtype=torch.float64)

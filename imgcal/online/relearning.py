@@ -63,14 +63,14 @@ class Relearning:
         return event
 
     def report_relearnt(
-        self, belief: RigBelief, still_open: frozenset[int], settled: frozenset[int], time: float, number: int
+        self, belief: RigBelief, still_open: frozenset[int], best_known: frozenset[int], time: float, number: int
     ) -> list[Event]:
         """Report which cameras are known as well again as before they moved.
 
         Args:
             belief: the current belief.
             still_open: cameras whose kind of move is undecided.
-            settled: cameras that cannot become better known: everything that counts was seen after they moved.
+            best_known: cameras that cannot become better known: everything that counts was seen after they moved.
             time: s since the epoch.
             number: of the update.
         """
@@ -81,7 +81,7 @@ class Relearning:
         for camera in waiting:
             part = slice(0, EXTRINSICS_AND_PINHOLE)
             known = std[camera, part] <= RELEARNT * self.before[camera][part]
-            if camera in settled or bool(known.all()):
+            if camera in best_known or bool(known.all()):
                 event = self.events.pop(camera)
                 del self.before[camera]
                 sigma = change_sigma(std[camera], event.change)

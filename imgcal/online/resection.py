@@ -60,7 +60,7 @@ def resect_camera(
     if not len(poses):
         return None
     focal = float(camera.focal_length.mean())
-    poses = poses[_promising(poses, points, seen, ROUGH_PX / focal)]
+    poses = poses[_choose_promising(poses, points, seen, ROUGH_PX / focal)]
     labels = [_matches(poses, p, xy, ROUGH_PX / focal) for p, xy in zip(points, seen, strict=True)]  # S x (K, M)
     count = sum((found >= 0).sum(1) for found in labels)
     best = int(np.argmax(count))
@@ -96,7 +96,7 @@ def labels_at(uv: NDArray[np.float64], points_rig: Tensor, camera: CameraRig) ->
     return labels if found >= LEAST_AT_ONCE and found >= LEAST_SHARE * possible else None
 
 
-def _promising(
+def _choose_promising(
     poses: NDArray[np.float64], points: NDArray[np.float64], seen: list[NDArray[np.float64]], tolerance: float
 ) -> NDArray[np.int64]:
     """Indices of the poses that explain the most of a few snapshots."""

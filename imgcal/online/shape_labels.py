@@ -21,11 +21,11 @@ Array = NDArray[np.float64]
 GATE = 4.0
 """Maximum error of a distance, in standard deviations."""
 LENGTH_ERROR = 1e-3
-"""Error of an object's distances, relative: nobody measures them better."""
+"""Relative error of an object's distances: they cannot be measured better."""
 LEAST_MARKERS = {5: 3, 6: 4}
 """Markers that an object needs, by the rank of its pose; all if it has fewer."""
 FLAT = 1.0
-"""mm: extent across a plane below which an object is as good as its mirror image."""
+"""mm: extent across a plane below which an object equals its mirror image."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def find_shapes(parts: Sequence[tuple[int, Array]], lights: LightDistances) -> N
         free, points = np.flatnonzero(number < 0), alike[0][1]
         left = lights.select(free)
         found = [match for match in _matches(points, left) if not _may_belong(match, left, missing)]
-        found = _certain(found, points, len(alike))
+        found = _choose_matches(found, points, len(alike))
         if len(found) < len(alike):
             missing.append(points)
         for (first, _), match in zip(alike, found, strict=False):
@@ -117,7 +117,7 @@ def _cliques(near: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
     return found
 
 
-def _certain(found: Sequence[_Match], points: Array, copies: int) -> list[_Match]:
+def _choose_matches(found: Sequence[_Match], points: Array, copies: int) -> list[_Match]:
     """Choose as many matches as there are copies of the object; those with a rival are left out."""
     chosen, doubtful = list[_Match](), set[int]()
     for match in found:  # the largest first

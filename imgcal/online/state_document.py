@@ -36,7 +36,7 @@ get_args: Callable[[Any], tuple[Any, ...]] = cache(typing.get_args)
 SIMPLE = frozenset((NoneType, bool, int, str))
 """Types whose values stand in a document as they are."""
 NOT_SAVED: Mapping[str, bool] = {"saved": False}
-"""Metadata of a field that the caller gives anew on resuming."""
+"""Metadata of a field that the caller gives again on resuming."""
 DTYPES = {name: np.dtype(name) for name in ("float64", "float32", "int64", "int32", "bool", "uint8")}
 NAMES = {dtype: name for name, dtype in DTYPES.items()}
 NUMBERS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}

@@ -132,7 +132,7 @@ class Calibration:
 
     @property
     def poses_by_object(self) -> Mapping[str, Mapping[str, RigidTransform]]:
-        """rig_from_object by object name and snapshot name, in the frame of the object's file."""
+        """rig_from_object () by object name and snapshot name, mm, in the frame of the object's file."""
         rows, poses, parts = self.labelled.used, self.rig_from_object, self.obj.each
         found: dict[str, dict[str, RigidTransform]] = {part.name: {} for part in parts}
         for row, part, rotation, translation in zip(
@@ -169,7 +169,7 @@ class Calibration:
         return estimate(
             self.observations,
             self.factory,
-            self.obj.taken_as_exact(),
+            self.obj.as_exact(),
             self.rig_from_object,
             prior_std=torch.zeros_like(self.estimate.problem.prior_std[0]),
         )
@@ -191,7 +191,7 @@ class Calibration:
         board, bend = self.obj.board, self.bend
         if board is not None and bend is not None:
             board = replace(board, bend=(bend.x, bend.y), warp=max(bend.x_sigma, bend.y_sigma))
-        return replace(self.obj.taken_as_exact(), points=self.points_object.detach(), board=board)
+        return replace(self.obj.as_exact(), points=self.points_object.detach(), board=board)
 
     @property
     def displaced(self) -> tuple[FiducialOffset, ...]:

@@ -29,7 +29,7 @@ from imgcal.pipeline.label_counts import count_labels
 from imgcal.pipeline.labelled_capture import LabelledCapture, arrange_labels
 from imgcal.pipeline.motion_check import steady_part
 from imgcal.pipeline.object_checks import object_offsets
-from imgcal.pipeline.object_size import require_one_size
+from imgcal.pipeline.object_exchange import require_one_size
 from imgcal.pipeline.refusals import (
     require_cameras,
     require_fit,

@@ -119,7 +119,7 @@ def calibrate_from_scratch(
         with require_solvable():
             fit = calibrate_lights_from_scratch(detections, cameras, obj, options, distance)
         seconds = {"detection": found - started, "estimation": time.perf_counter() - found}
-        return _for_what_comes_after(replace(fit, repeats=repeats), cameras, seconds)
+        return _complete_rig(replace(fit, repeats=repeats), cameras, seconds)
     require_one_turn(cameras, obj)
     found = time.perf_counter()
     is_labelled, is_stick = (detections.fiducial >= 0).any(), obj.pose_rank == 5
@@ -147,7 +147,7 @@ def calibrate_from_scratch(
         "estimation": time.perf_counter() - identified,
     }
     fit = replace(fit, labelled=name_repeats(fit.labelled, repeats), repeats=repeats, late=late)
-    return _for_what_comes_after(fit, cameras, seconds)
+    return _complete_rig(fit, cameras, seconds)
 
 
 def _marker_alone(detections: Detections, obj: CalibrationObject) -> tuple[Detections, CalibrationObject]:
@@ -159,7 +159,7 @@ def _marker_alone(detections: Detections, obj: CalibrationObject) -> tuple[Detec
     return detections, as_unknown_marker(obj, detections)
 
 
-def _for_what_comes_after(fit: Calibration, cameras: CameraRig, seconds: dict[str, float]) -> Calibration:
+def _complete_rig(fit: Calibration, cameras: CameraRig, seconds: dict[str, float]) -> Calibration:
     """Give the rig a name, a volume and the default prior: the earlier prior does not apply to later calibrations."""
     volume = fit.predicted_error.volume
     box = ConvexVolume.box(_corner(volume.low), _corner(volume.high))
@@ -173,9 +173,9 @@ def _fit(
     labelled: Associations, first: CameraRig, cameras: CameraRig, obj: CalibrationObject, options: PipelineOptions
 ) -> Calibration:
     """Estimate everything from the first rig, which came from the same data, with a prior for the lenses only."""
-    start = replace(first, prior=_wide(first, cameras), distortion=first.distortion.clone())
+    start = replace(first, prior=_wide_prior(first, cameras), distortion=first.distortion.clone())
     start.distortion[:, K3 - 10] = cameras.distortion[:, K3 - 10]  # the only coefficient with an informative prior
-    std = ordinary_lens(_wide(first, cameras).std(start))
+    std = ordinary_lens(_wide_prior(first, cameras).std(start))
     std[0, :6] = 0.0  # this camera defines the rig's frame
     fit = fit_with_timing(labelled, labelled.detections, start, obj, options, prior_std=std)
     require_central(fit, cameras)
@@ -287,7 +287,7 @@ def _extent(rig: CameraRig) -> float:
     return max(float(torch.cdist(rig.positions, rig.positions).max()), 1.0)
 
 
-def _wide(rig: CameraRig, cameras: CameraRig) -> RigPrior:
+def _wide_prior(rig: CameraRig, cameras: CameraRig) -> RigPrior:
     assert cameras.prior is not None
     return replace(cameras.prior, rotation=WIDE_ROTATION, position=WIDE_POSITION * _extent(rig))
 

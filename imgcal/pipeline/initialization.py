@@ -55,7 +55,7 @@ class Initializer:
             rig: the factory rig.
             obj: the object.
         """
-        shown = self._show(observations, rig)
+        shown = self._make_views(observations, rig)
         turns = [self._turn(shown, rig, obj, motion) for motion in obj.symmetries]
         residuals = torch.stack([prediction_residual(turn, observations, obj) for turn in turns])  # (turns, S, C, N, 2)
         best = residuals.square().sum((2, 3, 4)).nan_to_num(torch.inf).argmin(0), torch.arange(len(observations.uv))
@@ -63,7 +63,7 @@ class Initializer:
         mean = rig.retract(guess.rig.local(rig).mean(0))
         return Initialization(self.name, mean, guess.rig_from_object, residuals[best])
 
-    def _show(self, observations: Observations, rig: CameraRig) -> Views:
+    def _make_views(self, observations: Observations, rig: CameraRig) -> Views:
         """Views of all cameras of the training rig; missing cameras see nothing."""
         cameras = self._present
         scale = self.trained.image_size[cameras].to(observations.uv) / rig.image_size

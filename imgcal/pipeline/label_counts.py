@@ -21,7 +21,7 @@ beside them leave a tenth in good captures."""
 
 LEAST_FOUND, LEAST_SHARE = 4, 0.4
 """Number of a camera's fitting labels, and their share of the fiducials in view, that show that the pattern was found:
-so many never fit by chance, whatever else the frame shows."""
+this many never fit by chance in any frame."""
 
 WHOLE = 0.7
 """Share of the fiducials in view with a fitting label at which the other blobs of a frame are not the object."""
@@ -81,7 +81,7 @@ def count_labels(
         obj: N fiducials.
         rig: as estimated; None = not yet, and unlabelled blobs count as being in the wrong place.
     """
-    labelled = replace(labelled, detections=labelled.repeated(obj))
+    labelled = replace(labelled, detections=labelled.repeat_unlabelled(obj))
     detections, used = labelled.detections, labelled.used
     shape = (len(labelled.snapshots), factory.num_cameras)
 

@@ -106,7 +106,7 @@ class LearnedMeasurer:
     def measure(
         self, frames: Mapping[str, Frame | None], blobs: Blobs | Detections, options: DetectionOptions
     ) -> Remeasured:
-        """Run the network on blobs, and again with the radius of whole markers for parts of markers; see `__call__`."""
+        """Run the network on K blobs, again with the radius of whole markers for parts; arguments as for `__call__`."""
         radius = np.nan_to_num(blobs.radius, nan=REDUCED).clip(1.0)
         first = self._ask(frames, blobs, radius, options)
         whole = (first.kind[:, BlobKind.WHOLE] > LIKELY) & ((blobs.flags & int(UNUSABLE)) == 0)

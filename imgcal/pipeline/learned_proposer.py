@@ -87,19 +87,19 @@ class LearnedProposer:
         finder = self.finder
         if finder is None:
             known = bool(snapshot.candidates)
-            return self._around(snapshot) if known else Proposal.decline(snapshot, "found no pose to start from")
-        if snapshot.candidates and self._convinces(near := self._around(snapshot, turns_deg=()), snapshot):
+            return self._search_near(snapshot) if known else Proposal.decline(snapshot, "found no pose to start from")
+        if snapshot.candidates and self._convinces(near := self._search_near(snapshot, turns_deg=()), snapshot):
             return replace(near, otherwise=lambda: replace(finder.propose(snapshot), found_by=finder.name))
         found = finder.propose(snapshot)
         if found.rig_from_object is None:
             if snapshot.candidates:
-                return self._around(snapshot)
+                return self._search_near(snapshot)
             return self._search_origin(snapshot) or Proposal.decline(snapshot, found.reason)
         there = replace(snapshot, candidates=(found.rig_from_object,))
-        best = self._around(there, turns_deg=())
+        best = self._search_near(there, turns_deg=())
         if not self._convinces(best, snapshot):  # rotations cost more than the finder
             starts = [snapshot, there] if snapshot.candidates else [there]
-            best = max((self._around(start) for start in starts), key=lambda proposal: len(proposal.detections))
+            best = max((self._search_near(start) for start in starts), key=lambda proposal: len(proposal.detections))
         return replace(best, otherwise=lambda: replace(found, found_by=finder.name))
 
     def _search_origin(self, snapshot: Snapshot) -> Proposal | None:
@@ -112,7 +112,7 @@ class LearnedProposer:
         size = self.network.config.crop
         if not Tiles.of_object(snapshot.rig, snapshot.obj, RigidTransform.stack((origin,)), size).divided:
             return None
-        proposal = self._around(replace(snapshot, candidates=(origin,)))
+        proposal = self._search_near(replace(snapshot, candidates=(origin,)))
         return None if proposal.reason else proposal
 
     def _convinces(self, proposal: Proposal, snapshot: Snapshot) -> bool:
@@ -123,7 +123,7 @@ class LearnedProposer:
         in_view = int(snapshot.rig.project(points).visible.sum())
         return len(proposal.detections) > CONVINCING * in_view
 
-    def _around(self, snapshot: Snapshot, turns_deg: tuple[float, ...] = TURNS_DEG) -> Proposal:
+    def _search_near(self, snapshot: Snapshot, turns_deg: tuple[float, ...] = TURNS_DEG) -> Proposal:
         """Search around the candidates and, if they show too little, at these rotations of the best."""
         view = _View.of(self.network, self.measurer, snapshot)
         poses = RigidTransform.stack(snapshot.candidates)
@@ -184,7 +184,7 @@ class _View:
         features = network.encoder(normalize_crops(crops)[:, None]).contiguous()
         return cls(network, measurer, snapshot, frames, tiles, features)
 
-    def expected(self, rig: CameraRig, poses: RigidTransform) -> Expectation:
+    def expect(self, rig: CameraRig, poses: RigidTransform) -> Expectation:
         """Project the fiducials at poses (H,)."""
         return Expectation.of(rig, self.snapshot.obj, poses, self.tiles.usual)
 
@@ -196,7 +196,7 @@ class _View:
         shift = None
         if aside is not None:
             shift = (placement.scale[:, None] * aside[self.tiles.camera]).expand(count, -1, -1)
-        queries = self.tiles.arrange_expected(self.expected(rig, poses)).queries(placement, shift)
+        queries = self.tiles.arrange_expected(self.expect(rig, poses)).queries(placement, shift)
         evidence = self._search(queries, count, window)
         asked = queries.asked.unflatten(0, (count, -1))
         return NetworkPass(rig, poses, self.tiles, evidence, claim(evidence, queries.asked), asked)
@@ -333,7 +333,7 @@ class _View:
         snapshot = self.snapshot
         widened = replace(observations, sigma=(observations.sigma.square() + MODEL_ERROR**2).sqrt())
         fitted = estimate(
-            widened, snapshot.rig, snapshot.obj.taken_as_exact(), looks.poses, prior_std=snapshot.prior_std,
+            widened, snapshot.rig, snapshot.obj.as_exact(), looks.poses, prior_std=snapshot.prior_std,
             initial_rig=looks.rig, options=ROBUST,
         )  # fmt: skip
         if not bool(fitted.rig.focal_length.isfinite().all() & fitted.rig_from_object.translation.isfinite().all()):
@@ -350,12 +350,12 @@ class _View:
         for gate in GATES:
             if fitted is None:
                 break
-            observations = self.measure(looks, self.expected(*fitted), gate)
+            observations = self.measure(looks, self.expect(*fitted), gate)
             fitted = self.fit(looks, observations)
         if fitted is None:
             return Proposal.decline(snapshot, disagree, margin)
         rig, poses = fitted
-        expected = self.expected(rig, poses)
+        expected = self.expect(rig, poses)
         off = (expected.uv - observations.uv).norm(dim=-1) / (observations.sigma.square() + MODEL_ERROR**2).sqrt()
         seen = (observations.seen & (off < OUTLIER) & (observations.sigma < VAGUE))[0]
         if int(seen.sum()) < LEAST_CLAIMS:

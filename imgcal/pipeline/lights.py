@@ -35,7 +35,7 @@ from imgcal.pipeline.turned_images import compare_turns
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
 
 HELD_OUT = 4
-"""One moment in so many is held out from the trial rig."""
+"""Number of moments of which one is held out from the trial rig."""
 MOST_ROWS = 500
 """Maximum number of markers in an intermediate fit: those that most cameras see, evenly over the moments."""
 LEAST_ROWS = 12
@@ -59,7 +59,7 @@ LEAST_PREDICTED = 10
 LEAST_SHARE = 0.25
 """Minimum share of a camera's predicted markers with a blob in place, corrected for chance ..."""
 HIDDEN_SHARE, LEAST_FOUND = 0.12, 8.0
-"""... or this share, if it is at least so many markers: a body hides the markers on its other side."""
+"""... or this share, if it is at least this many markers: a body hides the markers on its other side."""
 LEAST_NEAR = 0.8
 """Minimum share, among blobs near predicted markers, of those in place; corrected for chance."""
 LEAST_MARGIN = 5.0

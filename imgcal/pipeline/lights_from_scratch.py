@@ -124,7 +124,7 @@ def calibrate_lights_from_scratch(
     )
     assert cameras.prior is not None
     placed = replace(first, prior=_prior(first, cameras.prior))
-    std = _wide(first, pair, cameras.prior)
+    std = _wide_prior_std(first, pair, cameras.prior)
     fit = fit_steady(lights.labelled, lights.labelled.detections, placed, obj, options, prior_std=std)
     fit = replace(fit, lights=lights, distance=known)
     _require_determined(fit, pair[0])
@@ -152,7 +152,7 @@ def place_cameras(
     start = cold_start_from_points(_pair_observations(learnt, cameras, obj.num_fiducials), cameras, pair)
     error = max(AFTER_ALIGNMENT * start.spread, 1.0)
     error = min(error, AFTER_ALIGNMENT) if obj.num_fiducials == 1 else error  # markers of a stick are far apart
-    light, std = CalibrationObject.unknown(obj.name), _wide(start.rig, start.pair, cameras.prior)
+    light, std = CalibrationObject.unknown(obj.name), _wide_prior_std(start.rig, start.pair, cameras.prior)
     trial = narrow(learnt, start.rig, std, start.rig, light, error, joined=0)
     if trial is None:
         raise RefusedError(NOTHING)
@@ -248,7 +248,7 @@ def _prior(rig: CameraRig, lenses: RigPrior) -> RigPrior:
     return replace(lenses, rotation=WIDE_ROTATION, position=WIDE_POSITION * _rig_extent(rig))
 
 
-def _wide(rig: CameraRig, pair: tuple[int, int], lenses: RigPrior) -> torch.Tensor:
+def _wide_prior_std(rig: CameraRig, pair: tuple[int, int], lenses: RigPrior) -> torch.Tensor:
     return prior_of_pair(rig, pair, lenses, WIDE_ROTATION, WIDE_POSITION * _rig_extent(rig))
 
 

@@ -100,14 +100,14 @@ def choose_proposer(
     if detector in ("matched", "auto"):
         return MatchedFilter(), detector == "auto"
     if detector in ("learned", "both"):
-        return _reading(load_proposer(finder=MatchedFilter()), measurer), detector == "both"
+        return _use_measurer(load_proposer(finder=MatchedFilter()), measurer), detector == "both"
     if not model_file(detector).is_file():
         expected = f"{', '.join(DETECTORS)}, or a network for frames: a file or the folder of a run"
         raise InputError(f"detector: found {detector!r:.80}{nearest(detector, DETECTORS)}, expected {expected}")
-    return _reading(load_proposer(detector, finder=MatchedFilter()), measurer), False
+    return _use_measurer(load_proposer(detector, finder=MatchedFilter()), measurer), False
 
 
-def _reading(proposer: LearnedProposer, measurer: LearnedMeasurer | None) -> LearnedProposer:
+def _use_measurer(proposer: LearnedProposer, measurer: LearnedMeasurer | None) -> LearnedProposer:
     return proposer if measurer is None else replace(proposer, measurer=measurer.network)
 
 

@@ -76,7 +76,7 @@ def find_unsynchronized(
         return None
     observations, poses = accepted_observations(labelled, rig, obj)
     even = replace(observations, sigma=torch.ones_like(observations.sigma))
-    fit = estimate(even, rig, obj.taken_as_exact(), poses)
+    fit = estimate(even, rig, obj.as_exact(), poses)
     if not bool(fit.converged):
         return None
     points = fit.rig_from_object.apply(fit.points_object)

@@ -179,7 +179,7 @@ def _doubt_by_poses(detections: Detections, rig: CameraRig, obj: CalibrationObje
             f"the rotations between cameras are {math.degrees(turn):.0f} deg off what the images show; expected "
             "rotations in radians that take the rig to the camera (cam_from_rig)"
         )
-    return _smaller(ratio, LEAST_RATIO)
+    return _describe_smaller(ratio, LEAST_RATIO)
 
 
 def _doubt_by_directions(detections: Detections, rig: CameraRig) -> str:
@@ -226,10 +226,10 @@ def _doubt_by_size(detections: Detections, rig: CameraRig, obj: CalibrationObjec
     centred = obj.points.double() - obj.points.double().mean(0)
     expected = float(centred.norm(dim=-1).max()) / distance
     ratio = expected / max(float(np.median(sizes)), 1e-12)
-    return _smaller(ratio, LEAST_LOOKS)
+    return _describe_smaller(ratio, LEAST_LOOKS)
 
 
-def _smaller(ratio: float, least: float) -> str:
+def _describe_smaller(ratio: float, least: float) -> str:
     """Say which of rig (ratio > 1) and object is too small for the other, and which unit would explain it."""
     factor = max(ratio, 1 / max(ratio, 1e-12))
     if factor < least:

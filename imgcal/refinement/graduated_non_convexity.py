@@ -192,7 +192,20 @@ def mutual_nearest(distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def robust_pose(views: Views, factory: CameraRig, obj: CalibrationObject, sigma: float) -> Prediction:
-    """Fit the object's pose with the factory rig fixed, robustly: a start without a network."""
+    """Fit the object's poses with the factory rig fixed, robustly: a start without a network.
+
+    Args:
+        views: (B) with points.
+        factory: without batch axes.
+        obj: N fiducials.
+        sigma: pixels, noise of the points.
+
+    Returns:
+        (B) rigs, all the factory's, and poses.
+
+    Raises:
+        ValueError: the views hold no points.
+    """
     if views.uv is None or views.seen is None:
         raise ValueError("views hold no points")
     uv, rig = views.uv.double(), factory.to(torch.float64)

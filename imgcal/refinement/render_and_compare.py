@@ -101,7 +101,7 @@ def search(problem: ImageProblem, prediction: Prediction, images: Tensor) -> tup
             break
         found = make_prediction(result)
         if attempt == "relabel":
-            again = again[problem.near(guess[again], dots.select(again))]
+            again = again[problem.is_near(guess[again], dots.select(again))]
             if len(again) == 0:
                 continue
             new = problem.relabel(images[again], guess[again], dots.select(again))
@@ -165,12 +165,14 @@ class ImageProblem:
         else:
             blurs, steps = options.blurs[-1:], 2 * options.steps
             uv = torch.where(known.believed[..., None], known.uv, uv)
-        far, amplitude, light = (part.unflatten(0, batch) for part in self._far(flat, uv.flatten(0, 1), blurs))
+        far, amplitude, light = (
+            part.unflatten(0, batch) for part in self._take_blurred_steps(flat, uv.flatten(0, 1), blurs)
+        )
         uv = far if known is None else uv  # for known dots, the blurred step only tests whether they are present
         own = torch.arange(self.obj.num_fiducials, device=uv.device).expand(uv.shape[:-1])
         return self.measure(images, uv, amplitude > PRESENT, own, light, steps)
 
-    def near(self, guess: Prediction, dots: Dots) -> Tensor:
+    def is_near(self, guess: Prediction, dots: Dots) -> Tensor:
         """Check which guesses are close to most dots: (B,) bool."""
         offset = torch.where(dots.believed, (self._places(guess) - dots.uv).norm(dim=-1), torch.nan)
         return offset.flatten(1).nanmedian(-1).values < self.options.near
@@ -227,7 +229,7 @@ class ImageProblem:
         place = present.nonzero(as_tuple=True)
         paint = (*place[:2], colour[place])
         painted[paint], there[paint] = uv[place], True
-        fit = self._near(images.flatten(0, 1), painted.flatten(0, 1), there.flatten(0, 1), steps)
+        fit = self._take_near_steps(images.flatten(0, 1), painted.flatten(0, 1), there.flatten(0, 1), steps)
         uv, variance, mean_square = (
             part.unflatten(0, batch).gather(
                 2, colour.view(*colour.shape, *[1] * (part.ndim - 2)).expand(*colour.shape, *part.shape[2:])
@@ -240,7 +242,7 @@ class ImageProblem:
         explained = mean_square < (options.most_residual / GREY_LEVELS) ** 2
         return Dots(uv, sigma, present & inside & explained & sigma.isfinite(), light, colour)
 
-    def _far(self, flat: Tensor, uv: Tensor, blurs: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    def _take_blurred_steps(self, flat: Tensor, uv: Tensor, blurs: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
         """Take blurred steps: places (M, N, 2), amplitudes (M, N) and the light of each image (M,)."""
         options, pool = self.options, self.options.pooling
         pieces = flat.split(_chunk(flat, flat.shape[1:].numel()))
@@ -254,7 +256,7 @@ class ImageProblem:
         light = torch.where(pooled > dark, pooled, 0.0).sum((1, 2, 3))
         return (near.to(uv) + 0.5) * pool - 0.5, amplitude, light / (2 * math.pi * dot**2)
 
-    def _near(self, flat: Tensor, uv: Tensor, present: Tensor, steps: int) -> NearFit:
+    def _take_near_steps(self, flat: Tensor, uv: Tensor, present: Tensor, steps: int) -> NearFit:
         """Take near steps, with as many images at a time as memory for their temporaries allows."""
         count = _chunk(flat, self.colours.numel() * len(self.colours) * FLOATS_A_PAIR)
         parts = zip(flat.split(count), uv.split(count), present.split(count), strict=True)

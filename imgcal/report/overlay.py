@@ -57,7 +57,7 @@ def picture_uris(frames: tuple[Frame | None, ...]) -> list[str | None]:
     return [None if file is None else "data:image/webp;base64," + base64.b64encode(file).decode() for file in files]
 
 
-def blobs_drawn(content: ReportContent) -> int:
+def count_drawn_blobs(content: ReportContent) -> int:
     """Blobs drawn in one overlay, at most."""
     return min(LARGEST_OVERLAY, max(50, LARGEST_OVERLAY * OVERLAYS_WITH_ALL // len(content.cameras)))
 
@@ -78,15 +78,15 @@ def _webp(frame: Frame, width: int) -> bytes:
 def _overlay(content: ReportContent, camera: int, picture: str | None) -> Markup:
     width, height = (int(x) for x in content.image_size[camera])
     d = content.detections
-    rows = np.flatnonzero((d.camera == camera) & content.pictured)[: blobs_drawn(content)]
+    rows = np.flatnonzero((d.camera == camera) & content.pictured)[: count_drawn_blobs(content)]
     used = content.used[rows] if content.used.any() else content.labels[rows] >= 0
     parts = [f'<rect class="edge" x="-0.5" y="-0.5" width="{width}" height="{height}"/>']
     if picture is not None:
         parts.append(
             f'<image href="{picture}" x="-0.5" y="-0.5" width="{width}" height="{height}" preserveAspectRatio="none"/>'
         )
-    parts.append(_marks("labelled", d.uv[rows[used]], _words(content, rows[used])))
-    parts.append(_marks("unlabelled", d.uv[rows[~used]], _words(content, rows[~used])))
+    parts.append(_marks("labelled", d.uv[rows[used]], _titles(content, rows[used])))
+    parts.append(_marks("unlabelled", d.uv[rows[~used]], _titles(content, rows[~used])))
     for layer, predicted in (("before", content.predicted_before), ("after", content.predicted_after)):
         if predicted is None:
             continue
@@ -97,7 +97,7 @@ def _overlay(content: ReportContent, camera: int, picture: str | None) -> Markup
         ]
         links = _links(d.uv[shown], predicted[shown]) if layer == "before" else ""
         parts.append(_marks(layer, predicted[shown], words, links))
-    near = " ".join(svg.number(x) for x in _near(d.uv[rows[used]], width, height))
+    near = " ".join(svg.number(x) for x in _close_up(d.uv[rows[used]], width, height))
     crowded = " crowded" if len(rows) > 150 else ""
     return Markup(
         f'<svg class="overlay{crowded}" viewBox="-0.5 -0.5 {width} {height}" data-near="{near}" '
@@ -106,7 +106,7 @@ def _overlay(content: ReportContent, camera: int, picture: str | None) -> Markup
     )
 
 
-def _words(content: ReportContent, rows: NDArray[np.int64]) -> list[str]:
+def _titles(content: ReportContent, rows: NDArray[np.int64]) -> list[str]:
     return [f"fiducial {f}" if f >= 0 else "unlabelled" for f in content.labels[rows]]
 
 
@@ -124,7 +124,7 @@ def _links(observed: Array, predicted: Array) -> str:
     return f'<path d="{"".join(steps)}"/>'
 
 
-def _near(uv: Array, width: int, height: int) -> tuple[float, float, float, float]:
+def _close_up(uv: Array, width: int, height: int) -> tuple[float, float, float, float]:
     """The part around the object, for looking closer: left, top, width, height, in the proportions of the frame."""
     if not len(uv):
         return -0.5, -0.5, width, height

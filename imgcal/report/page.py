@@ -208,6 +208,6 @@ def _subsampling(content: ReportContent) -> list[str]:
         noun = "marker" if content.identity == UNKNOWN_MARKERS else "pose"
         notes.append(f"The rig shows {len(snapshots)} of {plural(len(poses), noun)}{each}.")
     d = content.detections
-    if int(d.count_by_camera(content.pictured).max()) > overlay.blobs_drawn(content):
-        notes.append(f"The overlays show at most {overlay.blobs_drawn(content)} blobs of each camera.")
+    if int(d.count_by_camera(content.pictured).max()) > overlay.count_drawn_blobs(content):
+        notes.append(f"The overlays show at most {overlay.count_drawn_blobs(content)} blobs of each camera.")
     return notes

@@ -29,7 +29,7 @@ class DrawnScene:
 def describe_scene(content: ReportContent) -> DrawnScene:
     """Describe the scene; the recalibrated rig has one step for each exaggeration of its changes.
 
-    Convention: drawn in the factory's rig frame; the recalibrated rig is laid upon the factory's by `content.gauge`.
+    Convention: drawn in the factory's rig frame; the recalibrated rig is aligned to the factory's by `content.gauge`.
     """
     factory = content.factory.to(torch.float64)
     points = _object_points(content, factory)

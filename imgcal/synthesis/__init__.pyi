@@ -18,8 +18,8 @@ from .crops import CropTruth, Scenes, degrade_crops, render_crops, sample_scenes
 from .difficulty import DIFFICULTIES, Difficulty
 from .drawing import host_generator
 from .hand_held import HandHeld
+from .image_degradation import LEVELS, Degradation
 from .lens import Lens, Shape
-from .levels import LEVELS, Degradation
 from .patches import Patches, expose_patches, render_patches
 from .physical_drift import PhysicalDrift
 from .rigs import (

@@ -116,7 +116,7 @@ def simulate_shots(
         if difficulty is not None:
             markers = difficulty.disguise(markers, generator)
             sensor, clutter = difficulty.sensor(sensor, generator), difficulty.clutter
-        ways = [_way(one, pose, part) / one.motion.seconds for one, part in each if one.motion is not None]
+        ways = [_image_motion(one, pose, part) / one.motion.seconds for one, part in each if one.motion is not None]
         if model.exposure_ms > 0 and len(ways) == len(each):
             defocus = torch.zeros_like(markers.depth) if markers.smear is None else markers.smear.defocus
             path = torch.cat(ways, 1) * (1e-3 * model.exposure_ms)
@@ -196,7 +196,7 @@ def true_detections(truth: Truth) -> Detections:
     return exact if truth.visible is None else exact.select(truth.visible.reshape(-1).numpy())
 
 
-def _way(truth: Truth, snapshot: int, obj: CalibrationObject) -> Tensor:
+def _image_motion(truth: Truth, snapshot: int, obj: CalibrationObject) -> Tensor:
     """How far each marker moves from a moment before a snapshot to a moment after it: (C, N, 2) pixels."""
     assert truth.motion is not None
     before, after = (

@@ -39,7 +39,7 @@ class Corruption(StrictRecord):
     def apply(self, views: Views, image_size: Tensor, generator: torch.Generator) -> Corrupted:
         """Corrupt views of labelled points.
 
-        As many random numbers are drawn whatever the values are, so that of two corruptions from equal generators the
+        The number of random draws does not depend on the values, so that of two corruptions from equal generators the
         larger one hits the same fiducials and more.
 
         Args:

@@ -115,19 +115,21 @@ def second_look(truth: CropTruth, generator: torch.Generator) -> CropTruth:
 def _photograph(place: Tensor, radius: Tensor, draw: Draw) -> tuple[Tensor, Tensor]:
     """Render markers (B, C, N, 2) of crop-pixel radii (B, C, N): crops (B, C, S, S), and which are to be seen."""
     batch, count = place.shape[:2], place.shape[2]
-    hidden = draw.unit(*batch, count) < draw.often(0.5, 0.45, *batch)[..., None]
-    velocity = draw.direction(*batch, of=2) * (draw.often(0.4, 1.0, *batch).square() * 9)[..., None]
+    hidden = draw.unit(*batch, count) < draw.sometimes(0.5, 0.45, *batch)[..., None]
+    velocity = draw.direction(*batch, of=2) * (draw.sometimes(0.4, 1.0, *batch).square() * 9)[..., None]
     velocities = velocity[:, :, None] * (1 + 0.1 * draw.normal(*batch, count, 1))
-    blur = 0.35 + draw.often(0.4, 1.8, *batch)
-    uneven = draw.often(0.5, 0.8, *batch)[..., None]
+    blur = 0.35 + draw.sometimes(0.4, 1.8, *batch)
+    uneven = draw.sometimes(0.5, 0.8, *batch)[..., None]
     brightness = (uneven * draw.normal(*batch, count)).clamp(-2, 1).exp()
     cut = torch.where(
-        draw.unit(*batch, count) < draw.often(0.3, 0.8, *batch)[..., None], draw.between(-0.6, 0.6, *batch, count), 9.0
+        draw.unit(*batch, count) < draw.sometimes(0.3, 0.8, *batch)[..., None],
+        draw.between(-0.6, 0.6, *batch, count),
+        9.0,
     )
     markers = _Spots(place, radius, brightness * ~hidden, velocities, cut)
 
     false = 28
-    shown = draw.unit(*batch, false) < draw.often(0.6, 1.0, *batch)[..., None] ** 1.5
+    shown = draw.unit(*batch, false) < draw.sometimes(0.6, 1.0, *batch)[..., None] ** 1.5
     typical = radius.clamp(0.3, 4).mean(-1, keepdim=True)
     strays = _Spots(
         draw.between(-2, SIZE + 1, *batch, false, 2),
@@ -139,7 +141,7 @@ def _photograph(place: Tensor, radius: Tensor, draw: Draw) -> tuple[Tensor, Tens
     light = _add_spots(_join(markers, strays), blur, draw) + _background(batch, draw)
     light = light.clamp(max=draw.between(0.7, 3.0, *batch)[..., None, None])
     noise = draw.between(math.log(0.0015), math.log(0.22), *batch).exp()
-    shot = draw.often(0.5, 1.0, *batch)[..., None, None] * light.clamp(min=0)
+    shot = draw.sometimes(0.5, 1.0, *batch)[..., None, None] * light.clamp(min=0)
     level = light + noise[..., None, None] * (1 + shot).sqrt() * draw.normal(*light.shape)
     # Some crops reach over the image's border.
     columns = torch.arange(SIZE, device=light.device)
@@ -171,9 +173,9 @@ def degrade_crops(
     draw, count = Draw(generator), len(crops)
     outside, light = crops.isnan(), crops.nan_to_num()
     size = torch.where(seen, radius, torch.nan).nanmedian(-1).values.nan_to_num(1.0).clamp(0.4, 4.0)
-    light = _smear(light, draw.often(0.4, 1.5, count) * size, draw.often(0.4, 2.0, count) * size, draw)
+    light = _smear(light, draw.sometimes(0.4, 1.5, count) * size, draw.sometimes(0.4, 2.0, count) * size, draw)
     batch, dots = torch.Size((count, 1)), 28
-    shown = draw.unit(*batch, dots) < draw.often(0.5, 1.0, *batch)[..., None] ** 1.5
+    shown = draw.unit(*batch, dots) < draw.sometimes(0.5, 1.0, *batch)[..., None] ** 1.5
     spots = _Spots(
         draw.between(-2, SIZE + 1, *batch, dots, 2),
         size[:, None, None] * draw.between(-0.5, 0.5, *batch, dots).exp(),
@@ -186,7 +188,7 @@ def degrade_crops(
     light = light + cover * (level[:, None, None] - light)
     where = place.round().clamp(0, SIZE - 1).long()
     hidden = cover.flatten(1).gather(1, where[..., 1] * SIZE + where[..., 0]) > 0.5
-    dark = draw.often(0.4, 1.0, count)[:, None, None] * light.clamp(min=0)
+    dark = draw.sometimes(0.4, 1.0, count)[:, None, None] * light.clamp(min=0)
     noise = torch.where(draw.unit(count) < 0.5, draw.between(math.log(0.003), math.log(0.5), count).exp(), 0.0)
     light = light + noise[:, None, None] * (1 + dark).sqrt() * draw.normal(*light.shape)
     return light.masked_fill(outside, torch.nan), seen & ~hidden
@@ -274,7 +276,7 @@ def _background(batch: torch.Size, draw: Draw) -> Tensor:
     one = torch.ones(1, 1, 1, 1, device=draw.generator.device)
     slow = draw.normal(math.prod(batch), 1, 5, 5)
     slow = functional.interpolate(slow, (SIZE, SIZE), mode="bicubic", align_corners=True)[:, 0].unflatten(0, batch)
-    ground = slow * draw.often(0.5, 0.4, *batch)[..., None, None]
+    ground = slow * draw.sometimes(0.5, 0.4, *batch)[..., None, None]
     steps = torch.linspace(-1, 1, SIZE, device=one.device)
 
     def wave(*shape: int) -> Tensor:
@@ -286,13 +288,14 @@ def _background(batch: torch.Size, draw: Draw) -> Tensor:
 
     along, _ = wave()
     stripes = (
-        torch.sin(along * draw.between(5, 60, *batch)[..., None, None]) * draw.often(0.25, 0.5, *batch)[..., None, None]
+        torch.sin(along * draw.between(5, 60, *batch)[..., None, None])
+        * draw.sometimes(0.25, 0.5, *batch)[..., None, None]
     )
     edge_along, _ = wave()
-    edge = torch.sigmoid(edge_along * 50) * draw.often(0.25, 0.8, *batch)[..., None, None]
+    edge = torch.sigmoid(edge_along * 50) * draw.sometimes(0.25, 0.8, *batch)[..., None, None]
     along, across = wave(3)
     long, wide = draw.between(0.05, 0.5, *batch, 3), draw.between(0.008, 0.06, *batch, 3)
-    amount = draw.often(0.4, 1.8, *batch, 3)
+    amount = draw.sometimes(0.4, 1.8, *batch, 3)
     streaks = torch.exp(-(along / long[..., None, None]).pow(4) - (across / wide[..., None, None]).square())
     return ground + stripes + edge + (streaks * amount[..., None, None]).sum(2)
 

@@ -182,7 +182,7 @@ DIFFICULTIES = {
     "defocus": Difficulty(defocus=(5.0, 12.0), clutter=ClutterModel(neighbours=0.35)),
     # Dim, moved and cluttered at once.
     "combined": replace(HAND, peak_snr=(2.0, 5.0), clutter=CLUTTER, hidden=0.15, vignetting=0.3, row_noise=0.5),
-    # Edges cut half of the markers, of which they hide 30 to 70 % of the diameter, and drapes cut more.
+    # Edges cut half of the markers and hide 30 to 70 % of their diameters; drapes cut more.
     "half-hidden": Difficulty(cut=0.5, clutter=ClutterModel(drapes=2)),
     # Real spheres: dark towards the limb, dirty, with highlights, lit through a lens that darkens the corners.
     "uneven": Difficulty(limb=(0.2, 0.9), bumps=4, bump_gain=(-0.9, 0.6), clutter=ClutterModel(), vignetting=0.4),

@@ -42,7 +42,7 @@ class Draw:
         """Zeros, to put beside the others."""
         return torch.zeros(shape, device=self.generator.device)
 
-    def often(self, share: float, largest: float, *shape: int) -> Tensor:
+    def sometimes(self, share: float, largest: float, *shape: int) -> Tensor:
         """Zero in most draws; in a share of them uniform up to the largest."""
         return torch.where(self.unit(*shape) < share, self.between(0, largest, *shape), 0.0)
 

@@ -36,7 +36,7 @@ class Patches:
     kind: Tensor  # (M,) BlobKind
 
     def select(self, rows: Tensor) -> Patches:
-        """Keep some patches."""
+        """Keep some of the M patches, by a mask (M,) or indices."""
         return Patches(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
@@ -76,7 +76,7 @@ def expose_patches(patches: Patches, generator: torch.Generator) -> tuple[Tensor
     full = torch.where(draw.unit(count) < 0.15, draw.between(0.4, 1.0, count), torch.inf)
     grey = grey.minimum(full[:, None, None])
     noise = draw.between(math.log(0.004), math.log(0.3), count).exp()[:, None, None]
-    shot = draw.often(0.5, 1.0, count)[:, None, None] * grey.clamp(min=0)
+    shot = draw.sometimes(0.5, 1.0, count)[:, None, None] * grey.clamp(min=0)
     grey = grey + noise * (1 + shot).sqrt() * draw.normal(*grey.shape)
     # The expected radius comes from the rig, or only from the other blobs of the frame.
     doubt = torch.where(draw.unit(count) < 0.5, 0.04, 0.15)
@@ -135,9 +135,9 @@ def _chunk(count: int, trouble: Trouble, draw: Draw) -> Patches:
         surface = replace(surface, limb=draw.between(0, 0.9, count, 1), bumps=_bumps(count, draw)[:, None])
     smear = None
     if trouble.smeared:
-        length = draw.often(0.6, PATH, count) * expected * (0.0 if trouble.false else 1.0)
+        length = draw.sometimes(0.6, PATH, count) * expected * (0.0 if trouble.false else 1.0)
         path = draw.direction(count, of=2) * length[:, None]
-        smear = Smear(path[:, None], (draw.often(0.5, DEFOCUS, count) * expected)[:, None])
+        smear = Smear(path[:, None], (draw.sometimes(0.5, DEFOCUS, count) * expected)[:, None])
     spots = Spots(offset[:, None], (root @ root.mT)[:, None], light, light > 0, light, surface, smear)
     if trouble.merged or trouble.company:
         spots = _add_neighbour(spots, expected, (0.7, 2.0) if trouble.merged else (2.3, 4.0), draw)
@@ -188,6 +188,6 @@ def _ground(count: int, draw: Draw) -> Tensor:
     steps = torch.linspace(-1, 1, PATCH_SIZE, device=draw.generator.device)
     angle = draw.between(0, 2 * math.pi, 2, count)[..., None, None]
     along = steps * angle.cos() + steps[:, None] * angle.sin()
-    slope = along[0] * draw.often(0.5, 0.3, count)[:, None, None]
+    slope = along[0] * draw.sometimes(0.5, 0.3, count)[:, None, None]
     edge = torch.sigmoid((along[1] - draw.between(-1, 1, count)[:, None, None]) * 30)
-    return slope + edge * draw.often(0.15, 0.6, count)[:, None, None]
+    return slope + edge * draw.sometimes(0.15, 0.6, count)[:, None, None]

@@ -76,7 +76,7 @@ class SimulatedRig:
         self._base = self._base.retract(step)
 
     def pose(self, seconds: float) -> RigidTransform:
-        """Where the object is carried: rig_from_object."""
+        """Where the object is after some seconds: rig_from_object (), mm."""
         sway = [math.sin(2 * math.pi * seconds / period + k) for k, period in enumerate(PERIODS)]
         turn = [most * math.sin(2 * math.pi * seconds / period + 2 * k) for k, (most, period) in enumerate(TURNS)]
         rotation = rotation_from_vector(torch.tensor(turn, dtype=torch.float64))
@@ -106,10 +106,10 @@ class SimulatedRig:
         (frames,) = simulate_frames(Truth(small, pose, uv), self.obj, FrameModel(), self._generator)
         for camera, name in enumerate(small.camera_names):
             if self.away or camera in self.covered:
-                frames[name] = self._dark(frames[name])
+                frames[name] = self._darken(frames[name])
         return frames
 
-    def _dark(self, frame: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
+    def _darken(self, frame: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
         return self._random.normal(DARK, 2.0, frame.shape).clip(0, 255).astype(np.uint8)
 
 

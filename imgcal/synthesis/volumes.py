@@ -33,7 +33,7 @@ DRAWS = 20_000
 TURNS = 1.5
 """Radians, standard deviation of each component of the rotation vectors between which an object turns."""
 TRIALS, FINE = 64, 16
-"""Controls of a spline of which the speed is measured, and steps from control to control."""
+"""Controls of the spline whose speed is measured, and steps from control to control."""
 MOST_CONTROLS = 1_000_000
 OUTER = 0.05
 """Share of what is seen that is left out at each side of a volume that is looked for."""
@@ -50,11 +50,11 @@ def sample_path(
     """
     duration = (count - 1) / hand.rate
 
-    def drawn_turns(number: int) -> Floats:
+    def draw_turns(number: int) -> Floats:
         return TURNS * torch.randn(number, 3, generator=generator, dtype=torch.float64).numpy()
 
     places = _spline(lambda number: sample_volume(volume, number, generator).numpy(), _lengths, hand.speed, duration)
-    turns = _spline(drawn_turns, _angles, math.radians(hand.turning), duration)
+    turns = _spline(draw_turns, _angles, math.radians(hand.turning), duration)
     times = np.arange(count) / hand.rate
 
     def at(times: Floats) -> RigidTransform:
@@ -145,15 +145,15 @@ def sample_volume(volume: ConvexVolume, count: int, generator: torch.Generator) 
     """
     corners = torch.tensor((volume.low, volume.high), dtype=torch.float64)
 
-    def in_box(number: int) -> Tensor:
+    def draw_in_box(number: int) -> Tensor:
         unit = torch.rand(number, 3, generator=generator, dtype=torch.float64)
         return torch.lerp(corners[0], corners[1], unit)
 
     if volume.is_box:
-        return in_box(count)
+        return draw_in_box(count)
     found = torch.empty(0, 3, dtype=torch.float64)
     while len(found) < count:
-        places = in_box(max(2 * (count - len(found)), 64))
+        places = draw_in_box(max(2 * (count - len(found)), 64))
         found = torch.cat((found, places[torch.from_numpy(volume.contains(places.numpy()))]))
     return found[:count]
 

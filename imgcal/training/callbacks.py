@@ -30,7 +30,7 @@ class Callbacks:
         """
 
     def on_step(self, run: Run, seconds: float) -> None:
-        """Handle a finished step, after so many seconds of training. Called often, so it must return fast."""
+        """Handle a finished step, after `seconds` of training. Called often, so it must return fast."""
 
     def on_checkpoint(self, run: Run, state: TrainingState, result: Result) -> None:
         """Handle a checkpoint: the state that the rest of the run depends on, and the current result network.

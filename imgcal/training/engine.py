@@ -17,11 +17,18 @@ from accelerate.utils import broadcast
 from torch import Tensor, nn
 
 from imgcal.errors import InputError, RefusedError
-from imgcal.networks import drawing_from
+from imgcal.networks import use_generators
 from imgcal.training.callbacks import Callbacks, DivergedError
 from imgcal.training.continuation import gather_state, restore
 from imgcal.training.experiment import Experiment, TrainingConfig
-from imgcal.training.optimization import Schedule, freeze, learning, make_average, make_optimizer, update_average
+from imgcal.training.optimization import (
+    Schedule,
+    freeze,
+    make_average,
+    make_optimizer,
+    set_training_mode,
+    update_average,
+)
 from imgcal.training.run import Best, Pending, Run
 from imgcal.training.state import TrainingState
 
@@ -95,7 +102,7 @@ def prepare(experiment: Experiment, state: TrainingState | None = None) -> Run:
     weights = torch.Generator().manual_seed(settings.seed)
     task = experiment.make_task(device, batch_size, weights, fresh=state is None)
     freeze(task.network, experiment.optimizer.freeze)
-    learning(task.network)
+    set_training_mode(task.network)
     if settings.channels_last:
         task.network.to(memory_format=torch.channels_last)
     data, layers = stream_seeds(settings.seed, accelerator.process_index)
@@ -171,7 +178,7 @@ def _backward(run: Run, parts: int) -> dict[str, Tensor]:
     if run.experiment.training.compile == "graphs":
         torch.compiler.cudagraph_mark_step_begin()
     batch = run.task.batch(run.batch_size, run.generator)
-    with drawing_from(*run.dropout), autocast(run):
+    with use_generators(*run.dropout), autocast(run):
         answer = run.task.predict(run.network, batch)
     loss = run.judge(answer, batch, run.step)
     run.accelerator.backward(loss.total / parts)
@@ -223,7 +230,7 @@ def validation(run: Run, network: nn.Module) -> dict[str, float]:
         return run.task.validate(predict)
     finally:
         if was_training:
-            learning(network)
+            set_training_mode(network)
 
 
 def validate(run: Run, listener: Callbacks, extra: bool) -> None:

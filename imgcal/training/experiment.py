@@ -72,11 +72,11 @@ class TrainingConfig(StrictModel):
     log_every: Count = 50  # steps between two rows of metrics
     validate_every: Count = 500  # steps between two validations
     validation_rigs: Annotated[int, Field(ge=0, le=10**6)] = 512  # rigs (images, ...) to validate on; 0 = none
-    patience: Count | None = None  # end the run after so many validations without improvement; the best is the result
+    patience: Count | None = None  # end the run after this many validations without improvement; the best is the result
     save_every: Count = 500  # steps between two states to resume from
 
     @model_validator(mode="after")
-    def _ends(self) -> TrainingConfig:
+    def _check_limits(self) -> TrainingConfig:
         if self.steps is None and self.minutes is None:
             raise ValueError("found neither `steps` nor `minutes`, expected one of them")
         if self.patience is not None and not self.validation_rigs:

@@ -17,8 +17,8 @@ from imgcal.networks import (
     InfraredConfig,
     InfraredNetwork,
     Queries,
-    drawing_from,
     normalize_crops,
+    use_generators,
     warm_start,
 )
 from imgcal.synthesis import degrade_crops, host_generator, render_crops, sample_scenes, second_look
@@ -97,7 +97,7 @@ class InfraredTask(Task[CropBatch, Evidence]):
             raise InputError(
                 f"training: {wrong[0]}: found {found}, expected a multiple of the {CAMERAS} cameras of a rig"
             )
-        with drawing_from(weights):
+        with use_generators(weights):
             network = InfraredNetwork(experiment.network)
         starts = experiment.training.starts
         self.untrained = warm_start(starts, network) if fresh and starts else ()

@@ -42,7 +42,7 @@ TURN_DEG, ASIDE = 1.5, 0.01
 BESIDE = 3.0
 """Patch pixels, each way, within which markers are beside the middle of their patches."""
 BRIGHT_PIXEL = 559
-"""Of the 576 pixels of a patch, in ascending order: as bright as its marker, whatever a few pixels show."""
+"""Rank of a pixel among the 576 of a patch, in ascending order, that is as bright as its marker; ignores glints."""
 LARGEST_PATCH_SIGMA = 1.0
 """Pixels: where a projection is known less well, it says nothing of a marker's exact place."""
 LEAST_SEEN = 3
@@ -54,7 +54,7 @@ LARGEST_SIGMA = 1.0
 FARTHEST = 4.0
 """Standard deviations (plus 1.5 pixels) from its projection beyond which a measured marker is another one."""
 HELD_OUT = 5
-"""One of so many stretches of snapshots in a row is held out."""
+"""Number of stretches of snapshots in a row of which one is held out."""
 LEAST_SNAPSHOTS = 5
 """Smallest number of snapshots that can be split; with fewer, cameras are held out."""
 

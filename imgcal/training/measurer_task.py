@@ -17,8 +17,8 @@ from imgcal.networks import (
     Measurer,
     MeasurerCheckpoint,
     MeasurerConfig,
-    drawing_from,
     normalize_crops,
+    use_generators,
     warm_start,
 )
 from imgcal.synthesis import Patches, expose_patches, host_generator, render_patches
@@ -81,7 +81,7 @@ class MeasurerTask(Task[PatchBatch, Measured]):
         fresh: bool,
     ) -> None:
         """Build the task; see `Experiment.make_task`."""
-        with drawing_from(weights):
+        with use_generators(weights):
             network = Measurer(experiment.network)
         starts = experiment.training.starts
         self.untrained = warm_start(starts, network) if fresh and starts else ()

@@ -69,7 +69,7 @@ def freeze(network: nn.Module, names: Iterable[str]) -> None:
         raise InputError(f"optimizer: freeze: found {', '.join(names)}, which leaves nothing to train")
 
 
-def learning(network: nn.Module) -> nn.Module:
+def set_training_mode(network: nn.Module) -> nn.Module:
     """Put a network into training mode, except frozen batch normalization: its running means count as weights."""
     network.train()
     for module in network.modules():

@@ -7,7 +7,6 @@ from .moved_camera import Kind, MovedCamera, MovedError
 from .observations import UNUSABLE, BlobFlag, BlobKind, Detections, Observations
 from .parameter_vectors import pack21, unpack18, unpack21
 from .placement import CROP_MARGIN, PATCH_SIZE, CropPlacement
-from .posterior import RigPosterior
 from .prediction import Prediction, Views
 from .rig import (
     PARAMETER_KINDS,
@@ -17,6 +16,7 @@ from .rig import (
     SHOWN_UNITS,
     CameraRig,
     DriftRate,
+    RigPosterior,
     RigPrior,
     parameter_names,
 )

@@ -197,7 +197,7 @@ class CalibrationObject:
         return cls(
             torch.cat([part.points for part in parts]),
             torch.cat([part.colours for part in parts]),
-            torch.cat([_or_zero(part.radius, part.points) for part in parts]) if has_radius else None,
+            torch.cat([_radius_or_zero(part.radius, part.points) for part in parts]) if has_radius else None,
             " + ".join(names),
             tolerance=torch.cat([part.granted for part in parts]) if has_tolerance else None,
             parts=parts,
@@ -262,10 +262,10 @@ class CalibrationObject:
         """Tolerance of each fiducial, (N,) mm: zero where none is given."""
         return torch.zeros_like(self.points[:, 0]) if self.tolerance is None else self.tolerance
 
-    def taken_as_exact(self) -> CalibrationObject:
+    def as_exact(self) -> CalibrationObject:
         """Return the object without its tolerances and modes."""
         soft = self.modes is not None or not self.exact
-        parts = tuple(part.taken_as_exact() for part in self.parts)
+        parts = tuple(part.as_exact() for part in self.parts)
         return replace(self, tolerance=None, scale_tolerance=0.0, modes=None, parts=parts) if soft else self
 
     @property
@@ -352,7 +352,7 @@ class CalibrationObject:
         return (Symmetry(np.eye(3), np.zeros(3), np.arange(len(points)), 0.0), *rest)
 
 
-def _or_zero(radius: Tensor | None, points: Tensor) -> Tensor:
+def _radius_or_zero(radius: Tensor | None, points: Tensor) -> Tensor:
     """Radii (N,) mm of fiducials; zeros for points."""
     return torch.zeros_like(points[:, 0]) if radius is None else radius.to(points)
 

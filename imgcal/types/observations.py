@@ -89,7 +89,7 @@ class Detections:
         return np.bincount(self.camera[rows], minlength=len(self.camera_names))
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Detections:
-        """Keep the given rows (mask or indices); names of cameras and snapshots stay."""
+        """Keep some of the M blobs, given as a mask (M,) or as indices; names of cameras and snapshots stay."""
         return replace(
             self,
             **{
@@ -124,7 +124,7 @@ class Observations:
     __repr__ = brief_repr
 
     def of_snapshots(self, rows: Tensor | Sequence[int] | int) -> Observations:
-        """Keep some snapshots, or some captures if those are the first axis."""
+        """Keep some entries of the first axis, by mask or indices: snapshots (S,), or captures of a batch."""
         shake = None if self.shake is None else self.shake[rows]
         return Observations(self.uv[rows], self.sigma[rows], self.seen[rows], shake)
 

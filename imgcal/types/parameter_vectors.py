@@ -30,7 +30,7 @@ def pack21(rig: CameraRig) -> Tensor:
 
 
 def pack18(rig: CameraRig) -> Tensor:
-    """Pack the paper's 18 network outputs per camera: `pack21` with a 6D rotation for the matrix; (*B, C, 18)."""
+    """Pack the paper's 18 network outputs per camera, `pack21` with a 6D rotation for the matrix: (*B, C, 13 + D)."""
     return torch.cat((sixd_from_rotation(rig.cam_from_rig.rotation), _pack_rest(rig)), dim=-1)
 
 
@@ -47,7 +47,7 @@ def unpack21(packed: Tensor, like: CameraRig) -> CameraRig:
 
 
 def unpack18(packed: Tensor, like: CameraRig) -> CameraRig:
-    """Invert `pack18`; the 6D rotation is orthogonalized; names and image sizes come from `like`."""
+    """Invert `pack18`: (*B, C, 13 + D) to rigs (*B), orthogonalizing the 6D rotation; the rest as for `unpack21`."""
     return _unpack(rotation_from_6d(packed[..., :6]), packed[..., 6:], like)
 
 

@@ -1,4 +1,4 @@
-"""`CameraRig`: intrinsics and extrinsics of any number of cameras, with any leading batch axes."""
+"""`CameraRig`: intrinsics and extrinsics of any number of cameras, with any leading batch axes; `RigPosterior`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -29,9 +29,6 @@ from imgcal.geometry import (
 )
 from imgcal.types.volume import ConvexVolume
 from renderers import is_traced
-
-if TYPE_CHECKING:
-    from imgcal.types.posterior import RigPosterior
 
 PINHOLE = (
     "rotation_x", "rotation_y", "rotation_z", "position_x", "position_y", "position_z", "fx", "fy", "cx", "cy",
@@ -391,7 +388,7 @@ class CameraRig:
         return self.map_tensors(lambda tensor, axes: tensor.reshape(*batch, *tensor.shape[-axes:]))
 
     def map_tensors(self, function: Callable[[Tensor, int], Tensor]) -> CameraRig:
-        """Apply `function(tensor, number of its axes that are not batch)` to every tensor that has batch axes."""
+        """Apply `function(tensor, number of its last axes that are not batch)` to every tensor with batch axes *B."""
         return replace(
             self,
             focal_length=function(self.focal_length, 2),
@@ -406,3 +403,33 @@ class CameraRig:
         """Change the floating-point type, move to a device, or both."""
         moved = self.map_tensors(lambda tensor, _: tensor.to(dtype=dtype, device=device))
         return replace(moved, image_size=self.image_size.to(device=device))
+
+
+@dataclass(frozen=True)
+class RigPosterior:
+    """Joint posterior of a rig's values and the object's shape, in the form of `monitoring.RigBelief`.
+
+    D = K C + M errors: K for each of C cameras, in units of `unit`, and M for the object, in standard deviations.
+    """
+
+    rig: CameraRig  # the most probable one, float64, without batch axes
+    points: Tensor  # (N, 3) mm, fiducials from the object's file
+    tolerance: Tensor  # (N,) mm, one standard deviation of each coordinate; zeros = exact
+    scale_tolerance: float
+    object_offset: Tensor  # (M,) in standard deviations of that tolerance; M = 0 where the object is exact
+    factor: Tensor  # (D, D) lower Cholesky factor of the information
+    unit: Tensor  # (C, K) rad, mm, pixels, 1
+    snapshots: int  # number of snapshots that it is based on
+    time: float | None = None  # s since the epoch, when it was made; None = unknown
+
+    def belongs_to(self, rig: CameraRig) -> bool:
+        """Tell whether this describes a rig with exactly these values, not one that has been changed since."""
+        mine, others = (
+            (one.cam_from_rig.rotation, one.cam_from_rig.translation, one.focal_length, one.principal_point,
+             one.distortion)
+            for one in (self.rig, rig)
+        )  # fmt: skip
+        return all(
+            a.shape == b.shape and bool((a.double() - b.double()).abs().max() <= 1e-9 * (1 + a.double().abs().max()))
+            for a, b in zip(mine, others, strict=True)
+        )

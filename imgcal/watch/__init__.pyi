@@ -28,7 +28,7 @@ from .marker_files import MarkerFile
 from .metrics import Metrics, Tally
 from .open_igt_link import OpenIGTLink, listening_address
 from .pose_files import PoseFile
-from .pose_publisher import PosePublisher
+from .pose_zeromq import PosePublisher
 from .poses import PoseRecord, Poses, PoseSink
 from .qualisys import Qualisys
 from .recordings import BlobTable, Videos, holds_videos

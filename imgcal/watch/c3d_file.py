@@ -131,19 +131,19 @@ def _parameters(labels: Sequence[str], rate: float, scale: float, frames: int) -
     """The parameter section, and the offsets of the values in it."""
     groups: dict[str, dict[str, tuple[int, tuple[int, ...], bytes]]] = {
         "POINT": {
-            "USED": _whole(len(labels)),
+            "USED": _integers(len(labels)),
             "SCALE": _real(-scale),
             "RATE": _real(rate),
-            "DATA_START": _whole(0),
-            "FRAMES": _whole(frames),
+            "DATA_START": _integers(0),
+            "FRAMES": _integers(frames),
             "UNITS": _text("mm"),
             **_labels("LABELS", labels),
             **_labels("DESCRIPTIONS", labels),  # some readers need them
         },
-        "ANALOG": {"USED": _whole(0), "GEN_SCALE": _real(1.0), "RATE": _real(0.0)},
+        "ANALOG": {"USED": _integers(0), "GEN_SCALE": _real(1.0), "RATE": _real(0.0)},
         "TRIAL": {
-            "ACTUAL_START_FIELD": _whole(1, 0),
-            "ACTUAL_END_FIELD": _whole(frames, 0),
+            "ACTUAL_START_FIELD": _integers(1, 0),
+            "ACTUAL_END_FIELD": _integers(frames, 0),
             "CAMERA_RATE": _real(rate),
         },
         "MANUFACTURER": {"COMPANY": _text("imgcal"), "SOFTWARE": _text("imgcal")},
@@ -163,7 +163,7 @@ def _parameters(labels: Sequence[str], rate: float, scale: float, frames: int) -
     return bytes(section), places
 
 
-def _whole(*values: int) -> tuple[int, tuple[int, ...], bytes]:
+def _integers(*values: int) -> tuple[int, tuple[int, ...], bytes]:
     """Encode 16-bit integers."""
     sizes = () if len(values) == 1 else (len(values),)
     return INTEGER, sizes, struct.pack(f"<{len(values)}H", *values)

@@ -42,7 +42,7 @@ class Folder:
         """Whether all files that existed at the start have been read; those are a recording, which waits."""
         return self._caught_up.is_set()
 
-    def known_before(self) -> int:
+    def count_processed(self) -> int:
         """Count the existing snapshots that were processed before."""
         if self.after is None:
             return 0
@@ -117,7 +117,7 @@ class Folder:
             if not camera.gives_up(path, now):
                 return None
             return Unreadable(str(error), name)
-        camera.done(path)
+        camera.mark_done(path)
         if self.remove:
             self._read_files.append(path)
         return Exposure(name, changed, frame, path.stem)
@@ -153,7 +153,7 @@ class _Camera:
         self._since = {name: since for name, since in self._since.items() if name in growing}
         return steady
 
-    def done(self, path: Path) -> None:
+    def mark_done(self, path: Path) -> None:
         """Mark a file as processed, in bounded memory."""
         self._growing.pop(path.name, None)
         self._since.pop(path.name, None)
@@ -167,7 +167,7 @@ class _Camera:
         """Tell whether a stable file has been unreadable for too long."""
         if now - self._since.setdefault(path.name, now) < GIVEN_UP:
             return False
-        self.done(path)
+        self.mark_done(path)
         return True
 
     def _is_new(self, name: str) -> bool:

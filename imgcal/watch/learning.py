@@ -39,7 +39,7 @@ SUBJECTS = ("ir-cnn", "measurer-cnn")
 """The networks that are adapted together: one finds the markers, the other measures their centres."""
 LEARNING, DATASET, ADAPTED, CANDIDATE, ADAPTED_CARD = "learning", "dataset", "adapted", "candidate", "README.md"
 TURN = 5
-"""Of so many stretches of time in a row, the last is held out."""
+"""Number of stretches of time in a row of which the last is held out."""
 APART = 0.1
 """RMS motion of the object's points between two kept snapshots, in radii of the object, at least."""
 LARGEST_LAG = 0.5
@@ -96,7 +96,7 @@ class Moment:
 
 @dataclass(frozen=True)
 class LearningTask:
-    """What the process is told at its start."""
+    """What the process needs to know at its start."""
 
     folder: Path
     obj: CalibrationObject
@@ -259,7 +259,7 @@ class Learning:
         if not added:
             return
         self._last, self._busy = state.time, True
-        blobs = state.detections.select(~np.isin(state.detections.camera, _unclear(state, clear)))
+        blobs = state.detections.select(~np.isin(state.detections.camera, _cameras_without_clear_frame(state, clear)))
         with self._changed:
             self._waiting = Moment(self._number, held_out, clear, blobs, state.rig, pose, displaced)
             self._changed.notify()
@@ -287,10 +287,10 @@ class Learning:
                     return
                 self._send(process.stdin, moment)
         except InputError as error:  # the adapted networks cannot be read
-            self._tell(Outcome(f"learning has ended: {error}", failed=True))
+            self._add_outcome(Outcome(f"learning has ended: {error}", failed=True))
         except (OSError, EOFError, ValueError):  # the process has ended, or is being ended
             if not self._closing:
-                self._tell(Outcome("learning has ended: its process ended unexpectedly", failed=True))
+                self._add_outcome(Outcome("learning has ended: its process ended unexpectedly", failed=True))
 
     def _answer(self, stream: Any) -> None:
         """Receive what the process says until it is ready for another snapshot."""
@@ -303,13 +303,13 @@ class Learning:
                 networks = adapted_networks(self.task.folder)
                 said = replace(said, proposer=None if networks is None else run_networks(networks))
             self.trainings += not said.failed
-            self._tell(said)
+            self._add_outcome(said)
 
     def _send(self, stream: Any, message: Any) -> None:
         with self._writing:
             send(stream, message)
 
-    def _tell(self, outcome: Outcome) -> None:
+    def _add_outcome(self, outcome: Outcome) -> None:
         with self._changed:
             self._outcomes.append(outcome)
 
@@ -382,6 +382,6 @@ def _clear_frames(state: RigState, frames: Mapping[str, Frame | None]) -> dict[s
     }
 
 
-def _unclear(state: RigState, clear: Mapping[str, Frame | None]) -> list[int]:
+def _cameras_without_clear_frame(state: RigState, clear: Mapping[str, Frame | None]) -> list[int]:
     """Numbers of the cameras without a clear frame."""
     return [camera for camera, name in enumerate(state.factory.camera_names) if clear[name] is None]

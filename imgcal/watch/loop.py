@@ -49,7 +49,7 @@ class Keeper(Protocol):
     def update(
         self, source: Mapping[str, Frame | None] | Detections, time: float, silent: Collection[str] = ()
     ) -> RigState:
-        """Learn from a snapshot; `silent`: cameras without data."""
+        """Learn from a snapshot: frames (H, W) by camera, or blobs; `time` in s since the epoch; `silent`: no data."""
 
     def saved(self, progress: dict[str, Any]) -> Writable:
         """Copy the state, within milliseconds, together with the position in the source."""
@@ -69,7 +69,7 @@ class Page(Protocol):
     """A page that shows the state to people."""
 
     def publish(self, state: RigState, frames: Mapping[str, Frame | None] | None) -> None:
-        """Take the state after a snapshot; must return at once."""
+        """Take the state after a snapshot, and its frames (H, W) by camera if there are any; must return at once."""
 
     def tell(self, event: Event) -> None:
         """Take an event without a snapshot; must return at once."""

@@ -20,7 +20,7 @@ MOST_PENDING = 32
 OUT_AFTER = 10
 """Successive snapshots without a camera after which it is no longer waited for."""
 INTERVALS, LEAST_INTERVALS = 8, 3
-"""Number of intervals between exposures of a camera whose median predicts its next one; until there are so many, it is
+"""Number of intervals between exposures of a camera whose median predicts its next one; with fewer, it is
 always due."""
 BEGINNING = 3.0
 """Time (s) to wait for a camera with few exposures: it may send once a second."""
@@ -54,12 +54,12 @@ class TimedSnapshot:
     name: str | None = None  # if the source names snapshots
 
     def frames(self, camera_names: tuple[str, ...]) -> dict[str, Frame | None]:
-        """Frame of each camera; None = no frame, or blobs."""
+        """Frame (H, W) of each camera; None = no frame, or blobs."""
         contents = {name: self.exposures[name].content for name in camera_names if name in self.exposures}
         return {name: None if isinstance(found := contents.get(name), CameraBlobs) else found for name in camera_names}
 
     def source(self, camera_names: tuple[str, ...]) -> dict[str, Frame | None] | Detections:
-        """Input for a keeper: frames by camera, or blobs if the source sends those."""
+        """Input for a keeper: frames (H, W) by camera, or blobs if the source sends those."""
         given = [
             (camera, content)
             for camera, name in enumerate(camera_names)
@@ -182,7 +182,7 @@ class Synchronizer:
     def release_due(self, now: float) -> tuple[TimedSnapshot, ...]:
         """Release snapshots that are due; call this now and then while nothing comes."""
         done: list[TimedSnapshot] = []
-        while self._pending and self._may_go(self._pending[0], now):
+        while self._pending and self._is_complete(self._pending[0], now):
             done.append(self._has_continued(self._pending.pop(0)))
         return self._drop_unsynchronized(done)
 
@@ -234,7 +234,7 @@ class Synchronizer:
         self._pending.insert(later[0] if name is None and later else len(self._pending), new)
         return new
 
-    def _may_go(self, pending: _Pending, now: float) -> bool:
+    def _is_complete(self, pending: _Pending, now: float) -> bool:
         if len(self._pending) > MOST_PENDING or all(
             name in pending.exposures or not self._is_due(name, pending) for name in self._active_cameras()
         ):

@@ -37,7 +37,7 @@ def held_out(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> 
     observations, poses = accepted_observations(associate(detections, rig, obj), rig, obj)
     even = replace(observations, sigma=torch.ones_like(observations.sigma))
     fixed = torch.zeros(rig.num_cameras, rig.num_parameters, dtype=torch.float64)
-    fit = estimate(even, rig, obj.taken_as_exact(), poses, prior_std=fixed, options=PLAIN)
+    fit = estimate(even, rig, obj.as_exact(), poses, prior_std=fixed, options=PLAIN)
     distance = fit.residual.norm(dim=-1)[observations.seen]
     return {"rms": float(distance.square().mean().sqrt()), "median": float(distance.median()), "n": len(distance)}
 

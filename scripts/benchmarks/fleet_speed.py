@@ -163,7 +163,7 @@ def bytes_moved(folder: Path) -> dict[str, Any]:
         read = sum(file.stat().st_size for file in files) if path.is_dir() else path.stat().st_size
         rows = [process(item, Settings()) for item in items[: 1 if kind == FRAMES else 8]]  # all different
         dataset = Dataset(Path(tempfile.mkdtemp(dir=folder)))
-        with dataset.written() as writer:
+        with dataset.open_writer() as writer:
             writer.add([row for row in rows if row is not None])
         found[kind] = {
             "read": read,

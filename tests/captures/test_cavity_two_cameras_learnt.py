@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import imgcal
-from imgcal.cli import watch_learning as module
-from imgcal.cli.watch_learning import Learner
+from imgcal.cli import learning_process as module
+from imgcal.cli.learning_process import Learner
 from imgcal.detection import DetectionOptions
 from imgcal.pipeline import load_proposer
 from imgcal.watch import SUBJECTS, LearningPlan, LearningTask, Moment

@@ -8,7 +8,7 @@ import torch
 
 from renderers import additive_splatting, additive_splatting_cpu
 from renderers.additive_splatting import Splats
-from renderers.additive_splatting_cpu import IMAGES_PER_THREAD, NOWHERE, REACH, draw, drawn, windows
+from renderers.additive_splatting_cpu import IMAGES_PER_THREAD, NOWHERE, REACH, draw, draw_new, windows
 
 SIZE = (17, 23)
 
@@ -27,7 +27,7 @@ def splats(images: int, count: int = 4, dtype: torch.dtype = torch.float64) -> S
 def test_images_are_those_of_the_tensors_in_any_number_of_threads(images: int) -> None:
     given = splats(images)
     expected = additive_splatting.splat_additively(given, SIZE)
-    torch.testing.assert_close(drawn(given, SIZE)[0], expected, rtol=0, atol=1e-14)
+    torch.testing.assert_close(draw_new(given, SIZE)[0], expected, rtol=0, atol=1e-14)
     images_ = torch.full_like(expected, torch.nan)
     draw(images_, given)
     torch.testing.assert_close(images_, expected, rtol=0, atol=1e-14)
@@ -58,7 +58,7 @@ def test_what_is_not_finite_or_far_away_is_not_drawn() -> None:
     given.uv[0, 0, 0], given.uv[0, 1, 1] = torch.nan, torch.inf
     given.uv[0, 2], given.uv[0, 3] = torch.tensor([1e30, 3.0]), torch.tensor([5.0, -900.0])
     few = Splats(*(x[:, 4:] for x in given))
-    torch.testing.assert_close(drawn(given, SIZE)[0], drawn(few, SIZE)[0], rtol=0, atol=1e-15)
+    torch.testing.assert_close(draw_new(given, SIZE)[0], draw_new(few, SIZE)[0], rtol=0, atol=1e-15)
 
 
 def test_windows_are_no_larger_than_the_image_asks_for() -> None:
@@ -67,10 +67,10 @@ def test_windows_are_no_larger_than_the_image_asks_for() -> None:
     steps, _ = windows(given, max(SIZE))
     assert steps.shape[-1] <= 2 * max(SIZE) + 2
     torch.testing.assert_close(
-        drawn(given, SIZE)[0], additive_splatting.splat_additively(given, SIZE), rtol=1e-12, atol=1e-12
+        draw_new(given, SIZE)[0], additive_splatting.splat_additively(given, SIZE), rtol=1e-12, atol=1e-12
     )
 
 
 def test_no_splats_leave_images_black() -> None:
-    assert not drawn(splats(2, 0), SIZE)[0].any()
-    assert additive_splatting_cpu.drawn(splats(0), SIZE)[0].shape == (0, 3, *SIZE)
+    assert not draw_new(splats(2, 0), SIZE)[0].any()
+    assert additive_splatting_cpu.draw_new(splats(0), SIZE)[0].shape == (0, 3, *SIZE)

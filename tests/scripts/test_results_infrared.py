@@ -6,7 +6,7 @@ import torch
 import imgcal
 from imgcal.association import Snapshot
 from imgcal.geometry import RigidTransform, geodesic_angle
-from imgcal.networks import InfraredConfig, InfraredNetwork, drawing_from
+from imgcal.networks import InfraredConfig, InfraredNetwork, use_generators
 from imgcal.synthesis import simulate_truth, true_detections
 from imgcal.types import Detections, RigPrior
 from scripts.results import infrared_families, saliency
@@ -82,7 +82,7 @@ def test_families_stand_with_their_spread_over_seeds(tmp_path: Path) -> None:
 
 
 def test_networks_are_compared_on_the_same_crops(tmp_path: Path) -> None:
-    with drawing_from(torch.Generator().manual_seed(0)):
+    with use_generators(torch.Generator().manual_seed(0)):
         network = InfraredNetwork(InfraredConfig(encoder="vit-small", channels=4, blocks=1)).eval()
     once, again = (infrared_families.on_crops(network, 24) for _ in range(2))
     assert once == again
@@ -101,7 +101,7 @@ def test_what_is_looked_at_lies_within_a_distance() -> None:
 
 
 def test_only_pixels_that_a_network_sees_count() -> None:
-    with drawing_from(torch.Generator().manual_seed(0)):
+    with use_generators(torch.Generator().manual_seed(0)):
         network = InfraredNetwork(InfraredConfig(encoder="cnn-small", channels=4, blocks=1)).eval()
     batch = saliency.crops_of(network, 4)
     found = saliency.saliency(network, batch, torch.zeros(4, dtype=torch.long))

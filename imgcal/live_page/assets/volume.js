@@ -70,7 +70,8 @@ function drawVolumeMaps() {
     const title2 = inward && title === "From the front" ? "From the side" : title;
     return make("figure", {}, map(advice, limits, title2, across, up, hidden));
   }));
-  const key = limits.map((limit, k) => [`c${k}`, `${k ? "" : "below "}${digits(limit, 1)}`]).concat([[`c${CLASSES - 1}`, "more mm"]]);
+  const edges = limits.map((limit) => digits(limit, 1)), between = edges.slice(1).map((edge, k) => `${edges[k]}–${edge}`);
+  const key = [`below ${edges[0]} mm`, ...between, `above ${edges.at(-1)}`].map((text, k) => [`c${k}`, text]);
   $("maps-key").replaceChildren(
     ...key.map(([kind, text]) => make("span", {}, make("svg", { viewBox: "0 0 13 13", "aria-hidden": "true" }, make("rect", { class: kind, width: 13, height: 13, rx: 2 })), text)),
     make("span", {}, make("svg", { viewBox: "0 0 13 13", "aria-hidden": "true" }, make("rect", { class: "blank", width: 13, height: 13, rx: 2, fill: "var(--panel)", stroke: "var(--line)" })), "seen by fewer than two cameras"),

@@ -88,7 +88,7 @@ def test_labels_of_the_input_make_rows():
     assert found.part_of_rows.tolist() == [0, 1, 0, 1]
     assert found.before_rows.tolist() == [-1, -1, 0, 1]
     assert torch.equal(torch.from_numpy(found.columns(obj).sum((1, 2))), torch.tensor([5, 2, 5, 2]))
-    repeated = found.repeated(obj)
+    repeated = found.repeat_unlabelled(obj)
     clutter = int((true < 0).sum())
     assert len(repeated) == len(blobs) + clutter
 

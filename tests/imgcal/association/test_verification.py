@@ -12,7 +12,7 @@ from imgcal.association.hypotheses import Poses
 from imgcal.association.verification import (
     STAGES,
     Scene,
-    certain,
+    drop_uncertain_labels,
     evidence,
     fit,
     is_settled,
@@ -112,7 +112,7 @@ def test_rough_labels_are_refined_to_the_true_ones(scene, snapshot) -> None:
     tilted = rotation_from_vector(torch.tensor([0.02, -0.03, 0.01]).double()) @ snapshot.pose.rotation
     poses = Poses(tilted.numpy()[None], snapshot.poses().translation + 5.0)
     fits = refine(scene, start(scene, poses, rough[None]))
-    np.testing.assert_array_equal(certain(scene, fits, *ODDS).labels[0], truth)
+    np.testing.assert_array_equal(drop_uncertain_labels(scene, fits, *ODDS).labels[0], truth)
     np.testing.assert_array_equal(settle_labels(scene, fits).labels, fits.labels)
 
 
@@ -125,7 +125,7 @@ def test_a_false_blob_near_its_fiducial_is_not_certain(scene, snapshot) -> None:
     near = replace(scene, blobs=replace(scene.blobs, uv=uv))
     wrong = truth.copy()
     wrong[0, missing] = false
-    judged = certain(near, fit(near, started(near, snapshot, wrong)), *ODDS)
+    judged = drop_uncertain_labels(near, fit(near, started(near, snapshot, wrong)), *ODDS)
     assert judged.labels[0, 0, missing] == -1
     assert ((judged.labels[0] == truth) | (judged.labels[0] == -1)).all()
 
@@ -138,7 +138,7 @@ def test_two_blobs_in_one_place_are_not_certain(scene, snapshot) -> None:
     uv[0, false] = uv[0, truth[0, other]] + [0.15, 0.1]
     double = replace(scene, blobs=replace(scene.blobs, uv=uv))
     fits = refine(double, started(double, snapshot, truth))
-    uncertain = certain(double, fits, *ODDS).labels[0]
+    uncertain = drop_uncertain_labels(double, fits, *ODDS).labels[0]
     assert uncertain[0, other] in (-1, truth[0, other], false)
     assert (np.delete(uncertain, other, axis=1) == np.delete(truth, other, axis=1)).mean() > 0.9
 

@@ -65,6 +65,6 @@ def test_hurried_input(tmp_path: Path, capsys: pytest.CaptureFixture[str], monke
         said = capsys.readouterr().err
         assert expected in said and said.count("\n") == 1
     assert not (tmp_path / "o").exists()
-    with Dataset(tmp_path / "o").written():
+    with Dataset(tmp_path / "o").open_writer():
         assert main(["fleet", str(tmp_path / "good.csv"), *out]) == 2
     assert "another run is writing to it" in capsys.readouterr().err

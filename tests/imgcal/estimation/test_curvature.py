@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imgcal.estimation import EstimationOptions, curvature, estimate
+from imgcal.estimation import EstimationOptions, camera_covariance, curvature, estimate
 from imgcal.estimation.curvature import curvature_covariance
 from imgcal.synthesis import PhysicalDrift, RelativeDrift
 
@@ -71,3 +71,16 @@ def test_fewer_pairs_serve_where_the_posterior_is_hardly_curved(simulate, monkey
     assert not torch.equal(rough, precise)
     monkeypatch.setattr(curvature, "MOST_PAIRS", curvature.LEAST_PAIRS)
     assert torch.equal(rough, curvature_covariance(found, pixels(found), NARROW))
+
+
+@pytest.mark.parametrize("tolerance", [None, 0.3])
+def test_that_of_the_cameras_parameters_is_the_one_of_rigs_that_step(simulate, tolerance) -> None:
+    found = at_truth(simulate, 1.0, tolerance)
+    centre = found.rig.map_tensors(lambda tensor, _: tensor.unsqueeze(1))
+    flat = camera_covariance(found, curved=False)
+    by_rigs = curvature_covariance(found, lambda rigs, _: rigs.local(centre).flatten(-2), flat)
+    assert (by_rigs.diagonal(dim1=1, dim2=2) > 1e-6 * flat.diagonal(dim1=1, dim2=2)).any()
+    # The logarithm of a rotation by several vectors is their sum only to first order.
+    std = flat.diagonal(dim1=1, dim2=2).sqrt()
+    error = (camera_covariance(found) - flat - by_rigs) / (std[:, :, None] * std[:, None])
+    assert error.abs().max() < 1e-4

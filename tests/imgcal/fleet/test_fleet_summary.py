@@ -22,7 +22,7 @@ def dataset(tmp_path: Path) -> Dataset:
         device = "d0" if number == 9 else f"d{number}"
         given = (("temperature", 20.0 + number), *([("hours", 1.0)] if number else []))
         rows.append(process(Item(number, str(path), "T4", "asymmetric8", device, 86400.0 * number, given), Settings()))
-    with dataset.written() as writer:
+    with dataset.open_writer() as writer:
         writer.add([row for row in rows if row is not None])
         writer.add([failed_row(Item(11, "x", "T4", "cube8", "d11", None), "crashed", "signal: 9")])
     return dataset
@@ -63,7 +63,7 @@ def test_rigs_of_other_lenses_are_another_kind_and_their_values_have_their_own_n
         write_capture(tmp_path / f"{number}.csv", number, rig)
         item = Item(number, str(tmp_path / f"{number}.csv"), name, "asymmetric8", f"d{number}", None)
         rows.append(process(item, Settings()))
-    with dataset.written() as writer:
+    with dataset.open_writer() as writer:
         writer.add([row for row in rows if row is not None])
     kept = dataset.latest(("cameras", "lenses", "parameters", "offset", "status")).to_pylist()
     assert {row["status"] for row in kept} == {"ok"}

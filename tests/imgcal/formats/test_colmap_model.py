@@ -8,8 +8,8 @@ from imgcal.formats.colmap_model import (
     ColmapImage,
     ColmapRig,
     model_from_rig,
+    pose_numbers,
     rig_from_model,
-    seven,
 )
 from imgcal.formats.foreign_rig import FormatError
 from imgcal.formats.values import rotation_from_vector
@@ -105,4 +105,4 @@ def test_a_rig_taken_apart() -> None:
     together = compose(sensor, rig_from_world)
     assert np.allclose(together[1], images_[2].pose[1])
     assert np.allclose(compose(together, inverse(images_[2].pose))[0], np.eye(3))
-    assert np.allclose(seven((np.eye(3), np.ones(3))), [1, 0, 0, 0, 1, 1, 1])
+    assert np.allclose(pose_numbers((np.eye(3), np.ones(3))), [1, 0, 0, 0, 1, 1, 1])

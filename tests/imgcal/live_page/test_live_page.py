@@ -106,7 +106,7 @@ def test_what_cannot_be_shown_is_said_once_and_all_else_is_shown(o10, asymmetric
             time.sleep(0.2)
         assert len(reader.wait("events", lambda content: len(content) == 5)) == 5
         assert reader.wait("state", lambda content: content["snapshot"] == 4)
-        page._pass_on(iter([("picture", lambda: {"camera": "of no number"})]))  # what the server cannot take
+        page._send_all(iter([("picture", lambda: {"camera": "of no number"})]))  # what the server cannot take
         end = time.monotonic() + 60
         while len(told) < 2 and time.monotonic() < end:
             time.sleep(0.05)

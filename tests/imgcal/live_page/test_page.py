@@ -113,6 +113,14 @@ def test_the_page_fits_and_reads_in_any_size(browser, request, cameras, width, s
         assert tab.wrong == []
 
 
+def test_the_key_of_the_maps_says_from_where_to_where_each_colour_goes(browser, calm):
+    with opened(browser, calm.url) as tab:
+        tab.wait_for_function("() => document.querySelector('#maps-key span') !== null", timeout=120_000)
+        first, *between, last, _ = tab.locator("#maps-key span").all_inner_texts()
+    assert re.fullmatch(r"below [\d.]+ mm", first) and re.fullmatch(r"above [\d.]+", last)
+    assert between and all(re.fullmatch(r"[\d.]+–[\d.]+", words) for words in between)
+
+
 def test_a_camera_that_moved_is_on_the_page_soon(browser, calm, o10, asymmetric8):
     with opened(browser, calm.url) as tab:
         says(tab, "as calibrated")

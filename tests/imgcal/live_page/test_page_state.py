@@ -32,7 +32,7 @@ def test_nothing_grows_however_long_it_runs(board, o10, asymmetric8):
         board.update("event", events)
     assert len(board.notes.events) == MOST_EVENTS and board.notes.count == MOST_EVENTS + 50
     assert len(board.contents()["volume"]["visited"]) == MOST_VISITED
-    assert set(board.everything()) == {"hello", "layout", "controls", "history", "events", "volume", "state"}
+    assert set(board.full_state()) == {"hello", "layout", "controls", "history", "events", "volume", "state"}
 
 
 def test_the_token_is_in_no_message(board, o10, asymmetric8):
@@ -93,4 +93,4 @@ def test_a_picture_replaces_the_one_before(board, o10, asymmetric8):
         message = board.update("picture", picture_message(state, 1, frames))
     assert list(message) == ["picture:1"] and content(message)["jpeg"]
     assert content(board.update("picture", picture_message(state, 0, frames)))["jpeg"] is None
-    assert sum(key.startswith("picture") for key in board.everything()) == 2
+    assert sum(key.startswith("picture") for key in board.full_state()) == 2

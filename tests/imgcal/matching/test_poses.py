@@ -11,8 +11,8 @@ from imgcal.matching.poses import (
     Matcher,
     Scene,
     all_turns,
-    anywhere,
     distinct_turns,
+    search_one_camera,
     turn_object,
     turns_around,
 )
@@ -72,5 +72,5 @@ def test_a_pose_of_which_nothing_is_known_is_among_those_found_in_one_camera(giv
     turns = distinct_turns(scene.obj, 4608)
     near = turns[np.argsort(angle(RigidTransform(torch.from_numpy(turns), torch.zeros(len(turns), 3)), true))]
     some = np.concatenate((near[:20], turns[:400]))  # a part of the search: its time grows with the number
-    found = anywhere(Matcher.on(scene, maps.pool(8), 4 * scene.drift), 0, some, 30)
+    found = search_one_camera(Matcher.on(scene, maps.pool(8), 4 * scene.drift), 0, some, 30)
     assert angle(found, true).min() < 15

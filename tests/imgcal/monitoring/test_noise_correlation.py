@@ -12,7 +12,7 @@ from imgcal.monitoring.noise_correlation import (
     LEAST_WEIGHT,
     MEMORY_SNAPSHOTS,
     NoiseCorrelation,
-    longest_time,
+    usual_time,
 )
 from imgcal.types import Observations
 
@@ -78,19 +78,19 @@ def test_a_large_error_passes_in_less_time_than_the_correlation_of_small_ones() 
     assert noise.episode(0, 30 * usual) == 24
 
 
-def test_a_calibrated_rig_expects_long_errors_until_it_knows_better() -> None:
+def test_a_calibrated_rig_expects_what_is_usual_until_it_knows_better() -> None:
     noise = NoiseCorrelation(2)
-    noise.expect_longest()
-    assert noise.time.tolist() == [longest_time(FASTEST)] * 2
+    noise.expect_usual()
+    assert noise.time.tolist() == [usual_time(FASTEST)] * 2
     noise.pass_time(1.0)
-    noise.expect_longest()
-    assert noise.time.tolist() == pytest.approx([1.0, 1.0], abs=0.02)
+    noise.expect_usual()
+    assert noise.time.tolist() == pytest.approx([1.0, 1.0], abs=1e-3)
     noise.interval = FASTEST
     for number in range(512):
-        noise.expect_longest()
+        noise.expect_usual()
         noise.add(observations(), torch.randn(1, 2, 5, 2, dtype=torch.float64))
         if FIRST_MEASUREMENTS[0] <= number < 200:
-            assert float(noise.time.min()) >= longest_time(FASTEST)  # too few to tell
+            assert float(noise.time.min()) >= usual_time(FASTEST)  # too few to tell
     assert float(noise.time.max()) < 3
 
 

@@ -14,11 +14,11 @@ from imgcal.networks import (
     InfraredNetwork,
     Measurer,
     MeasurerConfig,
-    drawing_from,
     load_program,
     normalize_crops,
     save_exported,
     save_onnx,
+    use_generators,
 )
 from imgcal.networks.export import _measurer, _points, _query, difference
 from imgcal.synthesis import render_crops, sample_scenes
@@ -86,7 +86,7 @@ def test_the_shipped_measurer_says_the_same_of_rendered_patches(runtime, tmp_pat
 
 @pytest.mark.parametrize("kind", [pytest.param("points", marks=pytest.mark.slow), "measurer vit", "query vit"])
 def test_other_networks_say_the_same(runtime, tmp_path, kind):
-    with drawing_from(torch.Generator().manual_seed(0)):
+    with use_generators(torch.Generator().manual_seed(0)):
         if kind == "points":
             network = make("points", trunk={"width": 32, "depth": 1, "later_depth": 1, "passes": 2})
             for parameter in network.parameters():

@@ -9,7 +9,8 @@ import torch
 import imgcal
 from imgcal.monitoring import RigBelief
 from imgcal.online import RigKeeper
-from imgcal.online.drift_watch import EVERY_SECONDS, SETTLED_SNAPSHOTS, DriftWatch, replace_cameras
+from imgcal.online.drift_watch import EVERY_SECONDS, DriftWatch, replace_cameras
+from imgcal.online.keeper_memory import DRIFT_FROM
 from scripts.benchmarks.rig_streams import Stream
 
 
@@ -121,8 +122,8 @@ def test_cameras_are_replaced() -> None:
 def test_the_drift_of_a_rig_that_began_with_its_factory_values_is_measured_once_it_is_learnt() -> None:
     made = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 3)
     with RigKeeper(made.factory, made.obj) as keeper:
-        for number in range(SETTLED_SNAPSHOTS + 6):
+        for number in range(DRIFT_FROM + 6):
             keeper.update(made.snapshot(number), 2.0 * EVERY_SECONDS * number)
         since = keeper._memory.drift_watch.since
     assert set(since) == set(range(4))
-    assert all(time >= 2.0 * EVERY_SECONDS * (SETTLED_SNAPSHOTS - 2) for time in since.values())
+    assert all(time >= 2.0 * EVERY_SECONDS * (DRIFT_FROM - 2) for time in since.values())

@@ -12,7 +12,7 @@ from imgcal.types import RigPrior
 
 def results(folder: Path) -> Dataset:
     dataset = Dataset(folder)
-    with dataset.written() as writer:
+    with dataset.open_writer() as writer:
         for number, status in enumerate(["ok", "ok", "refused"]):
             day = datetime.datetime(2026, 1, 1 + number, tzinfo=datetime.UTC).timestamp()
             row = failed_row(Item(number, "c", "T4", "cube8", f"<b>{number}", day), status, "identity: & unclear")

@@ -9,9 +9,9 @@ def test_numbers_are_what_they_say() -> None:
     values = draw.between(-2.0, 3.0, 4000)
     assert -2 <= float(values.min()) < -1.9
     assert 2.9 < float(values.max()) < 3
-    often = draw.often(0.25, 4.0, 4000)
-    assert 0.2 < float((often > 0).float().mean()) < 0.3
-    assert float(often.max()) < 4
+    some = draw.sometimes(0.25, 4.0, 4000)
+    assert 0.2 < float((some > 0).float().mean()) < 0.3
+    assert float(some.max()) < 4
     torch.testing.assert_close(draw.direction(10, of=2).norm(dim=-1), torch.ones(10))
 
 

@@ -12,12 +12,12 @@ from imgcal.training.optimization import (
     Schedule,
     cosine,
     freeze,
-    learning,
     make_average,
     make_optimizer,
     optimizer_settings,
     optimizer_tensors,
     restore_optimizer,
+    set_training_mode,
     update_average,
 )
 
@@ -62,10 +62,10 @@ def test_an_unknown_group_is_named():
 def test_frozen_batch_normalization_keeps_its_means():
     network = Grouped()
     freeze(network, ["rest"])
-    assert learning(network).training and not network.norm.training and network.head.training
+    assert set_training_mode(network).training and not network.norm.training and network.head.training
     assert not network.norm.weight.requires_grad and network.head.weight.requires_grad
     freeze(other := Grouped(), ["heads"])
-    assert learning(other).norm.training
+    assert set_training_mode(other).norm.training
 
 
 SMALL = {"embed_dim": 12, "depth": 2, "num_heads": 2}

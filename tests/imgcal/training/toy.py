@@ -6,7 +6,7 @@ from torch import nn
 from imgcal.cli.main import run as command
 from imgcal.cli.training_folder import train_in
 from imgcal.geometry import RigidTransform, rotation_from_6d
-from imgcal.networks import Network, Parameterization, drawing_from, factory
+from imgcal.networks import Network, Parameterization, factory, use_generators
 from imgcal.synthesis import ImageOptions
 from imgcal.training import engine, load_experiment
 from imgcal.training.engine import save
@@ -42,7 +42,7 @@ class Toy(Network):
     def __init__(self, config, factory, obj, drift_std, generator, images=None):
         super().__init__(Parameterization(factory, obj, drift_std), self.takes and (images or self.takes))
         self.register_buffer("prior_std", drift_std)
-        with drawing_from(generator):
+        with use_generators(generator):
             self.make_layers(factory, obj)
 
     def make_layers(self, factory, obj):

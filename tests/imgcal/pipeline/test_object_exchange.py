@@ -7,7 +7,7 @@ import pytest
 
 import imgcal
 from imgcal.errors import RefusedError
-from imgcal.pipeline.object_size import find_step, measure_sizes
+from imgcal.pipeline.object_exchange import find_step, measure_sizes
 from imgcal.types import Detections
 from scripts.benchmarks.replayed_stream import combined
 from scripts.benchmarks.rig_streams import Conditions, Stream

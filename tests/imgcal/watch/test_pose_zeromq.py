@@ -4,7 +4,7 @@ import pytest
 
 from imgcal.errors import InputError
 from imgcal.watch import PosePublisher
-from imgcal.watch.pose_publisher import QUEUED
+from imgcal.watch.pose_zeromq import QUEUED
 from tests.imgcal.watch.test_poses import record
 
 zmq = pytest.importorskip("zmq")

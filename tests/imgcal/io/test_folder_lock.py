@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.io import holding, own_folder
+from imgcal.io import folder_lock, holding
 
 HOLD = (
     "import sys; from imgcal.io import holding\nwith holding(sys.argv[1]): print('held', flush=True); sys.stdin.read()"
@@ -55,8 +55,8 @@ def test_where_there_are_no_locks_nobody_is_kept_out(locks, tmp_path, monkeypatc
         raise OSError(os.strerror(95))
 
     if locks is None:
-        monkeypatch.setattr(own_folder, "fcntl", None)
-    elif own_folder.fcntl is not None:
-        monkeypatch.setattr(own_folder.fcntl, "flock", refuse)
+        monkeypatch.setattr(folder_lock, "fcntl", None)
+    elif folder_lock.fcntl is not None:
+        monkeypatch.setattr(folder_lock.fcntl, "flock", refuse)
     with holding(tmp_path), holding(tmp_path) as folder:
         assert folder == tmp_path

@@ -59,8 +59,8 @@ GRACE = 6.0  # s in which a training has to stop after the watching process has 
 NEAR = 5.0  # px within which a claim is right
 TURNED_DEG, ASIDE = 1.0, 0.01  # errors of the pose that networks are given: degrees, and parts of the distance
 SIGMAS = 2.0  # by which an adapted network must be better
-LATEST = 3  # one of so many held-out snapshots, the latest, in whose light it must not be worse
-LESS_EXACT, EXACT = 1.25, 0.3  # its error: at most so many times the other's, unless it is so small (px)
+LATEST = 3  # it must not be worse on the latest of the held-out snapshots either, one in three
+LESS_EXACT, EXACT = 1.25, 0.3  # largest ratio of its error to the other's, unless it is below EXACT (px)
 GROWTH = 1.5  # times the snapshots that had been taken at the last training, until the next
 
 CARD = """# Networks adapted to a rig
@@ -395,7 +395,7 @@ def main() -> None:
 
 
 def _leave(ended: threading.Event, writing: threading.Lock, unfinished: Path) -> None:
-    """End the process a while after nobody feeds it, whatever it is doing, but between two files."""
+    """End the process a while after its pipe has closed, between two files."""
     ended.wait()
     time.sleep(GRACE)
     with writing:

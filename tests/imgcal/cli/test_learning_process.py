@@ -16,9 +16,9 @@ import pytest
 import torch
 
 from imgcal.association import Proposal, proposal_rows
-from imgcal.cli import watch_learning as module
+from imgcal.cli import learning_process as module
+from imgcal.cli.learning_process import Learner, Scores, ask
 from imgcal.cli.main import main
-from imgcal.cli.watch_learning import Learner, Scores, ask
 from imgcal.detection import DetectionOptions
 from imgcal.io import data_path, load_object, model_file, read_rig, save_detections
 from imgcal.networks import load_infrared, load_measurer
@@ -270,7 +270,7 @@ import os, pickle, signal, sys, time
 from imgcal.watch import Learning, learning
 learning.LOWEST = 0  # a busy machine would not let it begin
 moments, task = pickle.loads(sys.stdin.buffer.read())
-with Learning(task, "from imgcal.cli.watch_learning import main; main()") as process:
+with Learning(task, "from imgcal.cli.learning_process import main; main()") as process:
     for moment in moments:
         while process._busy:
             time.sleep(0.05)
