@@ -63,7 +63,8 @@ VAGUE = 3.0  # px: minimum sigma at which a fiducial is not proposed
 TILES_AT_ONCE = 8  # more would not fit into the caches and the memory
 STEPS = 9  # compared displacements of a camera: none, and the lattice steps around it
 SAME_PLACE = 4.0  # crop pixels within which two displacements give the same place
-LEAST_AHEAD = 2.0  # minimum lead, in markers, of the best displacement
+SHARED_PLACE = 0.4  # of the distance between neighbouring fiducials, within which two displacements share a place
+LEAST_AHEAD = 2.0  # minimum lead, in markers at the border, of the best displacement
 
 Fit = tuple[CameraRig, RigidTransform]
 """The most probable rig, and poses (1,)."""
@@ -219,17 +220,19 @@ class _View:
         rig, window = self.snapshot.rig, self.network.config.close_window
         steps = self.ask(rig, pose).displacements(STEPS)
         looks = [self.ask(rig, pose, window, aside) for aside in steps]
-        found = torch.stack([look.found_by_camera for look in looks])
-        best, cameras = found.argmax(0), torch.arange(rig.num_cameras)
         claimed = [self.observations(look) for look in looks]
         uv, seen = torch.cat([each.uv for each in claimed]), torch.cat([each.seen for each in claimed])  # (K, C, N)
-        both = seen & seen[best, cameras]
-        near = SAME_PLACE * self._join(self.tiles.placement.scale[:, None].expand_as(self.tiles.counts))
-        one = both & ((uv - uv[best, cameras]).norm(dim=-1) < near)
-        # Steps that show the same markers in the same places are not rivals.
-        rivals = found.masked_fill(2 * one.sum(-1) > both.sum(-1), 0.0)
-        ahead = found.amax(0) - rivals.amax(0)
-        sure = ahead >= LEAST_AHEAD
+        scale = self._join(self.tiles.placement.scale[:, None].expand_as(self.tiles.counts))
+        both = seen & seen[:, None]
+        one = both & ((uv - uv[:, None]).norm(dim=-1) < SAME_PLACE * scale)
+        same = 2 * one.sum(-1) > both.sum(-1)  # steps that show the same markers in the same places are not rivals
+        probability = torch.stack([self._join(look.claims.probability) for look in looks])
+        places = self.expect(rig, pose).uv + (steps[:, :, None] * scale[..., None]).to(uv)
+        inside = self._join(self.tiles.counts).bool()
+        leads = leads_at_border(places, torch.where(inside, probability, 0.0), inside)
+        least = leads.masked_fill(same, torch.inf).amin(1)  # (K, C) over the rival that comes closest
+        ahead, best = least.max(0)
+        sure, cameras = (ahead >= LEAST_AHEAD) & ahead.isfinite(), torch.arange(rig.num_cameras)
         most = -math.log(CHANCE) * float(ahead[sure].sum())
         view = replace(self, tiles=self.tiles.select_cameras(sure), most=most)
         return view, view.ask(rig, pose, window, steps[best, cameras])
@@ -363,6 +366,37 @@ class _View:
         uv, sigma, radius = (values[0].numpy() for values in (observations.uv, observations.sigma, expected.radius))
         rows = proposal_rows(uv, sigma, seen.numpy(), radius, snapshot.blobs)
         return Proposal(rows, poses[0], margin)
+
+
+def leads_at_border(places: Tensor, probability: Tensor, inside: Tensor) -> Tensor:
+    """Compare displacements of a pattern by what they find where the other one expects nothing.
+
+    Displaced by a step, a lattice covers itself except at its border. Where both displacements expect some fiducial,
+    the network finds one for either, and differs only in how well lens and perspective fit there.
+
+    Args:
+        places: (K, C, N, 2) pixels, where K displacements expect fiducials.
+        probability: (K, C, N) that the fiducial is visible there.
+        inside: (C, N) fiducials to compare.
+
+    Returns:
+        Expected number of fiducials (K, K, C) that the first displacement finds where the second expects none, less
+        those of the second.
+    """
+    count = len(places)
+    leads = probability.new_zeros(count, count, places.shape[1])
+    for camera, rows in enumerate(inside):
+        if rows.sum() < 2:
+            continue
+        at, found = places[:, camera, rows], probability[:, camera, rows]
+        apart = torch.cdist(at[0], at[0]).fill_diagonal_(torch.inf).amin(1).median()
+        for first in range(count):
+            for second in range(first):
+                distance = torch.cdist(at[first], at[second])
+                alone = [distance.amin(axis) > SHARED_PLACE * apart for axis in (1, 0)]
+                lead = (found[first] * alone[0]).sum() - (found[second] * alone[1]).sum()
+                leads[first, second, camera], leads[second, first, camera] = lead, -lead
+    return leads
 
 
 def _mask_frame(frame: np.ndarray | None, mask: np.ndarray | None) -> np.ndarray | None:
