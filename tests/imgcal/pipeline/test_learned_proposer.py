@@ -14,6 +14,7 @@ from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import data_path
 from imgcal.networks import Evidence, Expectation, InfraredNetwork, Measured, Measurer, Queries
 from imgcal.pipeline import LearnedMeasurer, LearnedProposer, load_proposer
+from imgcal.pipeline.learned_proposer import leads_at_border
 from imgcal.synthesis import DIFFICULTIES, FrameModel, PhysicalDrift, Truth, simulate_frames, simulate_truth
 from imgcal.types import Detections, RigPrior
 from tests.imgcal.pipeline.oracles import Blind, sure_of
@@ -252,3 +253,19 @@ def test_a_measurer_is_told_to_calibrate_by_name(dim: tuple[Truth, Snapshot]) ->
     assert not torch.equal(fitted.rig.focal_length, read.rig.focal_length)
     uv = read.rig.expand(1).project(read.rig_from_object.apply(OBJ.points)).uv
     assert float((uv - truth.uv).square().mean().sqrt()) < 1.5
+
+
+def test_steps_of_a_lattice_differ_at_its_border() -> None:
+    column, row = torch.meshgrid(torch.arange(6.0), torch.arange(5.0), indexing="ij")
+    lattice = 20 * torch.stack((column, row), -1).flatten(0, 1)
+    beside = lattice + torch.tensor([21.0, 0.5])  # a step, not quite: lens and perspective
+    places = torch.stack((lattice, beside))[:, None]
+    probability = torch.full((2, 1, 30), 0.7)
+    probability[1] = 0.9  # where both expect dots, the network likes the wrong step more ...
+    probability[0, 0, :5], probability[1, 0, -5:] = 0.9, 0.2  # ... but beyond the border there is nothing
+    assert probability[1].sum() > probability[0].sum()
+    leads = leads_at_border(places, probability, torch.ones(1, 30, dtype=torch.bool))
+    assert leads[0, 1].tolist() == pytest.approx([5 * (0.9 - 0.2)])
+    torch.testing.assert_close(leads, -leads.transpose(0, 1))
+    none = leads_at_border(places, probability, torch.zeros(1, 30, dtype=torch.bool))
+    assert not none.any()
