@@ -6,7 +6,7 @@ better centred windows, so that good views help bad ones. The claims are proposa
 them like blobs.
 
 Objects of many small markers are processed in tiles. Within a lattice, neighbours look alike one step aside. All tiles
-of a camera decide jointly which step shows most of its markers; if the decision is close, the camera is left out.
+of a camera decide jointly, at the border of the lattice, which step is right; if that is close, the camera is left out.
 """
 
 from __future__ import annotations
