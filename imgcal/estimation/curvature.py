@@ -66,9 +66,8 @@ def curvature_covariance(estimate: Estimate, quantity: Callable[[CameraRig, Tens
     """
 
     def change(x: Step, follow: Step) -> Tensor:
-        there, back = quantity(*_step_rigs(estimate.problem, estimate.solution.state, _add_negatives(x), follow)).chunk(
-            2, 1
-        )
+        rigs = _step_rigs(estimate.problem, estimate.solution.state, _add_negatives(x), follow)
+        there, back = quantity(*rigs).chunk(2, dim=1)
         return 0.5 * (there + back)
 
     found = _mean_square(estimate, change, flat.reshape(-1, *flat.shape[-2:]))

@@ -228,11 +228,10 @@ class _View:
         same = 2 * one.sum(-1) > both.sum(-1)  # steps that show the same markers in the same places are not rivals
         probability = torch.stack([self._join(look.claims.probability) for look in looks])
         places = self.expect(rig, pose).uv + (steps[:, :, None] * scale[..., None]).to(uv)
-        inside = self._join(self.tiles.counts).bool()
-        leads = leads_at_border(places, torch.where(inside, probability, 0.0), inside)
-        least = leads.masked_fill(same, torch.inf).amin(1)  # (K, C) over the rival that comes closest
-        ahead, best = least.max(0)
-        sure, cameras = (ahead >= LEAST_AHEAD) & ahead.isfinite(), torch.arange(rig.num_cameras)
+        leads = leads_at_border(places, probability, self._join(self.tiles.counts))
+        least = leads.masked_fill(same, torch.inf).amin(1)  # (K, C) over the rival that comes closest ...
+        ahead, best = torch.minimum(least, probability.sum(-1)).max(0)  # ... or over nothing at all
+        sure, cameras = ahead >= LEAST_AHEAD, torch.arange(rig.num_cameras)
         most = -math.log(CHANCE) * float(ahead[sure].sum())
         view = replace(self, tiles=self.tiles.select_cameras(sure), most=most)
         return view, view.ask(rig, pose, window, steps[best, cameras])

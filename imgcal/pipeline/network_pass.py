@@ -33,11 +33,6 @@ class NetworkPass:
         return (self.claims.probability.view(self.asked.shape) * self.tiles.counts).sum((1, 2))
 
     @cached_property
-    def found_by_camera(self) -> Tensor:
-        """Expected number of visible fiducials in each camera at the only pose: (C,)."""
-        return self.tiles.sum_by_camera(self.claims.probability, self.rig.num_cameras)
-
-    @cached_property
     def count(self) -> int:
         """Number of fiducials in view at the first pose."""
         return int((self.asked[0] & self.tiles.counts).sum())
