@@ -23,6 +23,10 @@ LEAST_SIGHT = 0.6
 """Number of possible fiducials, as a share of the fiducials in view, for a camera to see the object."""
 LEAST_BLOBS = 3
 """Minimum number of blobs for a camera to see the object at all."""
+IN_PLACE, LEAST_IN_PLACE = 1.0, 2
+"""Distance (px) within which a blob lies where a fiducial is predicted, and the number of such blobs, beside the share
+`LEAST_EXPLAINED`, that show that a camera stands where it stood, labelled or not: a wand seen end-on merges into too
+few blobs for labels."""
 TURNS = (0.02, 0.1, 0.4)
 """Radians, one standard deviation per axis: possible rotations of a camera in the search for it."""
 
@@ -70,14 +74,39 @@ def find_displaced_cameras(
     spare = np.maximum(spare_blobs(blobs, rig.num_cameras) - usual, 0)
     if not ((spare >= LEAST_BLOBS) & (labelled <= LEAST_EXPLAINED * (labelled + spare))).any():
         return np.zeros(rig.num_cameras, dtype=bool)  # whatever is in view
-    projection = rig.project(pose.apply(obj.points), obj.radius)
-    size = rig.image_size.numpy()[:, None]
-    uv = projection.uv.numpy()
-    inside = ((uv > MARGIN * size) & (uv < (1 - MARGIN) * size)).all(-1) & projection.visible.numpy()
-    expected = inside.sum(-1)
+    expected = _predict(rig, obj, pose)[1].sum(-1)
     unexplained = np.minimum(expected - labelled, spare)
     few = labelled <= LEAST_EXPLAINED * (labelled + unexplained)
     return np.asarray(few & (unexplained >= np.maximum(LEAST_BLOBS, LEAST_SIGHT * expected)))
+
+
+def find_standing_cameras(
+    blobs: Detections, rig: CameraRig, obj: CalibrationObject, pose: RigidTransform
+) -> NDArray[np.bool_]:
+    """Find cameras whose blobs, labelled or not, lie where the rig predicts the object: (C,) bool.
+
+    Args:
+        blobs: of one snapshot.
+        rig: as last estimated.
+        obj: the calibration object.
+        pose: rig_from_object of this snapshot.
+    """
+    standing = np.zeros(rig.num_cameras, dtype=bool)
+    for camera, (places, inside) in enumerate(zip(*_predict(rig, obj, pose), strict=True)):
+        between = blobs.uv[blobs.camera == camera][:, None] - places[inside]
+        taken = (np.hypot(*np.moveaxis(between, -1, 0)) < IN_PLACE).any(1).sum()
+        standing[camera] = taken >= max(LEAST_IN_PLACE, LEAST_EXPLAINED * inside.sum())
+    return standing
+
+
+def _predict(
+    rig: CameraRig, obj: CalibrationObject, pose: RigidTransform
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Predicted images (C, N, 2) px of the fiducials, and which of them (C, N) are surely in view."""
+    projection = rig.project(pose.apply(obj.points), obj.radius)
+    size = rig.image_size.numpy()[:, None]
+    uv = projection.uv.numpy()
+    return uv, ((uv > MARGIN * size) & (uv < (1 - MARGIN) * size)).all(-1) & projection.visible.numpy()
 
 
 def relabel_moved_camera(

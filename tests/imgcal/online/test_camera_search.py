@@ -121,6 +121,16 @@ def test_a_camera_that_only_lost_its_labels_has_not_moved(stream) -> None:
     assert labels.tolist() == list(range(len(own))) and checked.labels == 32
 
 
+@pytest.mark.parametrize(("in_place", "missing"), [(2, True), (3, False)])
+def test_a_third_of_the_object_in_place_is_not_elsewhere(stream, tries, in_place, missing) -> None:
+    """The others merge: a wand seen end-on leaves too few blobs for labels, among false ones."""
+    pose = stream.poses[0]
+    uv = stream.true.project(pose.apply(stream.obj.points), stream.obj.radius).uv[CAMERA, :in_place].numpy()
+    own = np.concatenate([strangers(6), uv + 0.1])
+    _, missed = Search(4).label_lost_cameras(seen(stream, own), known(stream), 0.0, 0)
+    assert missed == (frozenset({CAMERA}) if missing else frozenset())
+
+
 def test_where_a_camera_was_found_it_is_found_again_without_a_search(stream, monkeypatch) -> None:
     turned = stream.bumped([CAMERA], 20.0)
     pose = stream.poses[0]
