@@ -45,11 +45,16 @@ def drop_merged(labelled: Associations, poses: RigidTransform, rig: CameraRig, o
     hidden = image.visible.numpy() & labelled.columns(obj)
     hidden[snapshot, camera, detections.fiducial[rows]] = False
     doubtful = np.flatnonzero(hidden[snapshot, camera].any(-1))
-    where = snapshot[doubtful], camera[doubtful]
-    places, labels = image.uv.numpy()[where], detections.fiducial[rows[doubtful]]  # (M, N, 2), (M,)
-    apart = np.linalg.norm(places - places[np.arange(len(labels)), labels, None], axis=-1)
-    near = hidden[where] & (apart < merging_distance(labelled, rows[doubtful])[:, None])
-    merged = rows[doubtful[near.any(-1)]]
+    if not len(doubtful):
+        return labelled
+    reach, uv = merging_distance(labelled, rows[doubtful]), image.uv.numpy()
+    spacing, where = 2 * reach.max(), (snapshot[doubtful], camera[doubtful])
+    frame = np.arange(hidden[..., 0].size).reshape(hidden.shape[:2])  # frames lie side by side in the tree
+    tree = cKDTree(np.column_stack((uv[hidden], spacing * frame[hidden.nonzero()[:2]])))
+    places = np.column_stack((uv[*where, detections.fiducial[rows[doubtful]]], spacing * frame[where]))
+    apart, known = np.full(len(places), np.inf), np.isfinite(places).all(1)
+    apart[known], _ = tree.query(places[known], distance_upper_bound=reach.max())
+    merged = rows[doubtful[apart < reach]]
     if not len(merged):
         return labelled
     fiducial, flags = detections.fiducial.copy(), detections.flags.copy()

@@ -11,7 +11,7 @@ from imgcal.association.merging import MOST_REACH
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import load_object
 from imgcal.synthesis import arrange_rig
-from imgcal.types import BlobFlag, Detections
+from imgcal.types import BlobFlag, CalibrationObject, Detections
 
 RIG = arrange_rig("ring", 3, 3000.0, height=0.0)
 WAND = load_object("wand4")
@@ -57,6 +57,27 @@ def dropped(labelled):
 @pytest.mark.parametrize("radius", [2.0, np.nan])
 def test_a_blob_of_several_markers_loses_its_label(radius):
     assert dropped(seen(radius)) == [(0, 1)]
+
+
+def test_of_many_markers_those_near_one_without_a_blob_lose_their_labels():
+    generator = np.random.default_rng(0)
+    points = torch.from_numpy(generator.uniform(-150, 150, (200, 3)))
+    uv = RIG.expand(2).project(POSES.apply(points)).uv.numpy()
+    has_blob = generator.random(uv.shape[:3]) < 0.9
+    snapshot, camera, fiducial = np.nonzero(has_blob)
+    radius = generator.uniform(0.5, 4.0, len(camera))
+    table = Detections(
+        uv=uv[has_blob], sigma=np.full(len(camera), SIGMA), camera=camera, snapshot=snapshot, fiducial=fiducial,
+        radius=radius, flags=np.zeros(len(camera), dtype=np.uint8),
+        camera_names=RIG.camera_names, snapshot_names=("0", "1"),
+    )  # fmt: skip
+    labelled = labels(table)
+    reach = merging_distance(labelled, np.arange(len(table)))
+    apart = np.linalg.norm(uv[snapshot, camera] - table.uv[:, None], axis=-1)
+    expected = (~has_blob[snapshot, camera] & (apart < reach[:, None])).any(1)
+    assert 0.02 < expected.mean() < 0.9
+    left = drop_merged(labelled, POSES, RIG, CalibrationObject(points, torch.ones_like(points)))
+    np.testing.assert_array_equal(left.detections.fiducial < 0, expected)
 
 
 def test_a_marker_whose_neighbours_have_blobs_of_their_own_is_not_merged():
