@@ -1,14 +1,16 @@
 """The solver's fast path on CPUs: `levenberg_marquardt.minimize` compiled to one loop per rig, without temporaries.
 
 `linearization.py`, `schur.py` and `levenberg_marquardt.py` do the same in tensors, on any device; tests compare the
-two. Names, units and layouts are the same. Rigs of a batch run in parallel.
+two. Names, units and layouts are the same. Rigs of a batch run in parallel. Everything is computed in double precision,
+whatever the type of the tensors: one type is compiled.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
@@ -38,6 +40,8 @@ from imgcal.geometry import RigidTransform, kernels, lens_codes
 from imgcal.types import CameraRig
 from renderers.compiling import njit
 
+Part = TypeVar("Part", Problem, State, Solution, NormalEquations)
+
 LOSS_CODES = {"squared": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
 
 
@@ -47,13 +51,16 @@ def minimize(
     """Do the work of `levenberg_marquardt.minimize` for tensors on the CPU.
 
     Args:
-        problem: the problem, batch axis B; one floating-point type throughout.
+        problem: the problem, batch axis B; one floating-point type throughout, which the solution has, too.
         start: first guess.
         loss: a key of `LOSS_CODES`.
         threshold: the loss's threshold in standard deviations.
         max_iterations: linearizations at most, for each rig.
         tolerance: see `levenberg_marquardt.minimize`.
     """
+    if problem.uv.dtype != torch.float64:
+        exact = _convert(problem, torch.float64), _convert(start, torch.float64)
+        return _convert(minimize(*exact, loss, threshold, max_iterations, tolerance), problem.uv.dtype)
     count = len(problem.uv)
     if count == 1:
         return RigSolver(problem).minimize(problem, start, loss, threshold, max_iterations, tolerance)
@@ -124,6 +131,9 @@ def _threads_of_torch() -> Iterator[None]:
 
 def linearize(problem: Problem, state: State, loss: str, threshold: float) -> NormalEquations:
     """Do the work of `linearization.linearize` for tensors on the CPU, without gradients; the loss as in `minimize`."""
+    if problem.uv.dtype != torch.float64:
+        exact = _convert(problem, torch.float64), _convert(state, torch.float64)
+        return _convert(linearize(*exact, loss, threshold), problem.uv.dtype)
     own_std, state = _object_spread(problem, state, len(problem.uv))
     blocks = _Blocks.of(problem, len(problem.uv))
     shared, given = shared_arrays(problem), _arrays((*_problem_arrays(problem), own_std))
@@ -133,6 +143,19 @@ def linearize(problem: Problem, state: State, loss: str, threshold: float) -> No
         given_here, state_here, blocks_here = (tuple(array[b] for array in arrays) for arrays in (given, states, parts))
         cost[b] = linearize_rig((*shared, *given_here), state_here, blocks_here, *limits, steady)
     return blocks.equations()
+
+
+def _convert(given: Part, dtype: torch.dtype) -> Part:
+    """Change the floating-point type of all tensors."""
+
+    def changed(value: Any) -> Any:
+        if isinstance(value, Tensor):
+            return value.to(dtype) if value.is_floating_point() else value
+        if isinstance(value, CameraRig):
+            return value.to(dtype)
+        return _convert(value, dtype) if is_dataclass(value) else value
+
+    return replace(given, **{one.name: changed(getattr(given, one.name)) for one in fields(given)})
 
 
 @dataclass(frozen=True)
