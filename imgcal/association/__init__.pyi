@@ -4,7 +4,7 @@ from .blobs import pattern_prior, undistort
 from .identification import identify, relocalize, track
 from .identity import Identity, IdentityOptions, PipelineOptions, Status, orient
 from .lights import Lights, align_camera, align_rig, associate_lights, background_rows, image_error, predicted_misses
-from .merging import drop_merged, find_merged, merging_distance
+from .merging import drop_merged, find_merged, merging_distance, merging_reach
 from .proposals import Proposal, Proposer, Sight, Snapshot, judge, proposal_rows
 from .series import (
     Associations,
@@ -51,6 +51,7 @@ __all__ = [
     "lattice_shifts",
     "match_to_rig",
     "merging_distance",
+    "merging_reach",
     "mutual_nearest",
     "near_symmetries",
     "orient",

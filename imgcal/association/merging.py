@@ -84,12 +84,16 @@ def find_merged(
         return found
     reach = np.zeros(seen.shape)
     named = np.flatnonzero(blobs.fiducial >= 0)
-    radius = blobs.radius[named]
-    reach[blobs.camera[named], blobs.fiducial[named]] = np.where(np.isnan(radius), MOST_REACH, 2 * radius + BLUR)
+    reach[blobs.camera[named], blobs.fiducial[named]] = merging_reach(blobs.radius[named])
     apart = np.linalg.norm(uv[cameras] - uv[cameras, fiducials][:, None], axis=-1)  # (M, N)
     rows, near = (seen[cameras] & (apart < reach[cameras])).nonzero()
     found[cameras[rows], near] = True
     return found
+
+
+def merging_reach(radius: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance (px) between two markers of a radius (M,) px, NaN = unknown, below which they may be one blob: (M,)."""
+    return np.where(np.isnan(radius), MOST_REACH, 2 * radius + BLUR)
 
 
 def merging_distance(labelled: Associations, rows: NDArray[np.int64]) -> NDArray[np.float64]:

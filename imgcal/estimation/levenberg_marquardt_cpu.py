@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import numba
@@ -40,7 +40,7 @@ from imgcal.geometry import RigidTransform, kernels, lens_codes
 from imgcal.types import CameraRig
 from renderers.compiling import njit
 
-Part = TypeVar("Part", Problem, State, Solution, NormalEquations)
+Part = TypeVar("Part", bound=Problem | State | Solution | NormalEquations | ObjectEquations)
 
 LOSS_CODES = {"squared": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
 
@@ -153,7 +153,7 @@ def _convert(given: Part, dtype: torch.dtype) -> Part:
             return value.to(dtype) if value.is_floating_point() else value
         if isinstance(value, CameraRig):
             return value.to(dtype)
-        return _convert(value, dtype) if is_dataclass(value) else value
+        return _convert(value, dtype) if isinstance(value, State | NormalEquations | ObjectEquations) else value
 
     return replace(given, **{one.name: changed(getattr(given, one.name)) for one in fields(given)})
 

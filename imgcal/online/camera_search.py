@@ -26,7 +26,7 @@ from imgcal.online.prediction_labels import (
     LEAST_BLOBS,
     LEAST_EXPLAINED,
     find_displaced_cameras,
-    find_standing_cameras,
+    may_stand,
     relabel_moved_camera,
     spare_blobs,
 )
@@ -122,8 +122,8 @@ class Search:
 
         Returns:
             The snapshot with the labels of the cameras that were found (`off`: elsewhere, so they have moved), and the
-            cameras that were not found, unless they have blobs where the object should be. Chance labels of cameras
-            that are searched for or in doubt are removed.
+            cameras that were not found, unless they need not have moved. Chance labels of cameras that are searched
+            for or in doubt are removed.
         """
         pose = checked.rig_from_object[0]
         checked = self._drop_chance_labels(checked, known, doubted)
@@ -148,8 +148,7 @@ class Search:
             named[rows] = labels
             blobs, sought.found = replace(blobs, fiducial=named), number
             found.append(camera)
-        if missed:
-            missed -= set(np.flatnonzero(find_standing_cameras(blobs, known.rig, known.obj, pose)).tolist())
+        missed = {camera for camera in missed if not may_stand(blobs, camera, known.rig, known.obj, pose)}
         checked = replace(checked, blobs=blobs, labels=int((blobs.fiducial >= 0).sum()))
         return self._weigh(checked, found, known) if found else checked, frozenset(missed)
 

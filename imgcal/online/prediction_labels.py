@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.association import PipelineOptions, distances_to_nearest, mutual_nearest, track
+from imgcal.association import PipelineOptions, distances_to_nearest, merging_reach, mutual_nearest, track
 from imgcal.geometry import RigidTransform
-from imgcal.medians import median
+from imgcal.medians import median, median_of_known
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
 TOO_NEAR = 0.6
@@ -80,23 +80,32 @@ def find_displaced_cameras(
     return np.asarray(few & (unexplained >= np.maximum(LEAST_BLOBS, LEAST_SIGHT * expected)))
 
 
-def find_standing_cameras(
-    blobs: Detections, rig: CameraRig, obj: CalibrationObject, pose: RigidTransform
-) -> NDArray[np.bool_]:
-    """Find cameras whose blobs, labelled or not, lie where the rig predicts the object: (C,) bool.
+def may_stand(blobs: Detections, camera: int, rig: CameraRig, obj: CalibrationObject, pose: RigidTransform) -> bool:
+    """Tell whether a camera need not have moved although the object has no labels in it.
+
+    Blobs lie where the rig predicts the object, or its markers merge into too few blobs, as those of a wand do that is
+    seen end-on.
 
     Args:
         blobs: of one snapshot.
+        camera: its number; it has blobs.
         rig: as last estimated.
         obj: the calibration object.
         pose: rig_from_object of this snapshot.
     """
-    standing = np.zeros(rig.num_cameras, dtype=bool)
-    for camera, (places, inside) in enumerate(zip(*_predict(rig, obj, pose), strict=True)):
-        between = blobs.uv[blobs.camera == camera][:, None] - places[inside]
-        taken = (np.hypot(*np.moveaxis(between, -1, 0)) < IN_PLACE).any(1).sum()
-        standing[camera] = taken >= max(LEAST_IN_PLACE, LEAST_EXPLAINED * inside.sum())
-    return standing
+    own, (uv, inside) = blobs.select(blobs.camera == camera), _predict(rig.select([camera]), obj, pose)
+    places = uv[inside]
+    in_place = int((_distances(own.uv, places) < IN_PLACE).any(1).sum())
+    if in_place >= max(LEAST_IN_PLACE, LEAST_EXPLAINED * len(places)):
+        return True
+    near = _distances(places, places) < merging_reach(median_of_known(own.radius))
+    apart = int((near.sum(1) == 1).sum())
+    return apart < LEAST_BLOBS <= len(places)
+
+
+def _distances(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances (M, N) between points (M, 2) and points (N, 2)."""
+    return np.asarray(np.linalg.norm(first[:, None] - second, axis=-1))
 
 
 def _predict(

@@ -6,15 +6,20 @@ import numpy as np
 import pytest
 import torch
 
+import imgcal
 from imgcal.association import PipelineOptions
+from imgcal.geometry import RigidTransform
 from imgcal.online.prediction_labels import (
     TOO_NEAR,
     find_displaced_cameras,
+    may_stand,
     near_prediction,
     relabel_moved_camera,
     spare_blobs,
     widen_poses,
 )
+from imgcal.synthesis import arrange_rig
+from imgcal.types import Detections
 from tests.imgcal.streams import Stream
 
 CAMERA = 3
@@ -109,3 +114,17 @@ def test_widened_lets_a_camera_be_within_a_turn_and_as_far_off(stream) -> None:
     assert torch.equal(
         widen_poses(wide, stream.rig, [CAMERA], stream.poses[0], stream.obj, 0.01), wide
     )  # never narrower
+
+
+@pytest.mark.parametrize(("camera", "stands"), [(0, True), (1, False)])
+def test_a_wand_seen_end_on_says_nothing_about_its_camera(camera: int, stands: bool) -> None:
+    """Three of its four markers merge; the blobs are false ones."""
+    rig, wand = arrange_rig("ring", 3, 3000.0, height=0.0), imgcal.load_object("wand4")
+    pose = RigidTransform(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    count, places = 5, np.random.default_rng(0).uniform(0, 200, (5, 2))  # in a corner
+    zeros = np.zeros(count, dtype=np.int64)
+    blobs = Detections(
+        places, np.full(count, 0.1), zeros + camera, zeros, zeros - 1, np.full(count, 5.0), zeros.astype(np.uint8),
+        rig.camera_names, ("0",),
+    )  # fmt: skip
+    assert may_stand(blobs, camera, rig, wand, pose) == stands
