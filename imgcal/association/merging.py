@@ -103,8 +103,8 @@ def merging_distance(labelled: Associations, rows: NDArray[np.int64]) -> NDArray
     its camera is used.
     """
     detections = labelled.detections
-    reach, camera = 2 * detections.radius[rows] + BLUR, detections.camera[rows]
-    unknown = np.isnan(reach)
+    reach, camera = merging_reach(detections.radius[rows]), detections.camera[rows]
+    unknown = np.isnan(detections.radius[rows])
     if unknown.any():
         reach[unknown] = _closest_distances(detections.select(detections.fiducial >= 0), camera.max() + 1)[
             camera[unknown]

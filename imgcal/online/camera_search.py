@@ -122,8 +122,8 @@ class Search:
 
         Returns:
             The snapshot with the labels of the cameras that were found (`off`: elsewhere, so they have moved), and the
-            cameras that were not found, unless they need not have moved. Chance labels of cameras that are searched
-            for or in doubt are removed.
+            cameras that were not found and must have moved. Chance labels of cameras that are searched for or in doubt
+            are removed.
         """
         pose = checked.rig_from_object[0]
         checked = self._drop_chance_labels(checked, known, doubted)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from imgcal.association import PipelineOptions, distances_to_nearest, merging_reach, mutual_nearest, track
@@ -83,8 +84,8 @@ def find_displaced_cameras(
 def may_stand(blobs: Detections, camera: int, rig: CameraRig, obj: CalibrationObject, pose: RigidTransform) -> bool:
     """Tell whether a camera need not have moved although the object has no labels in it.
 
-    Blobs lie where the rig predicts the object, or its markers merge into too few blobs, as those of a wand do that is
-    seen end-on.
+    Blobs lie where the rig predicts the object, or its markers merge into too few blobs, like those of a wand seen
+    end-on.
 
     Args:
         blobs: of one snapshot.
@@ -95,17 +96,12 @@ def may_stand(blobs: Detections, camera: int, rig: CameraRig, obj: CalibrationOb
     """
     own, (uv, inside) = blobs.select(blobs.camera == camera), _predict(rig.select([camera]), obj, pose)
     places = uv[inside]
-    in_place = int((_distances(own.uv, places) < IN_PLACE).any(1).sum())
+    in_place = int((cdist(own.uv, places) < IN_PLACE).any(1).sum())
     if in_place >= max(LEAST_IN_PLACE, LEAST_EXPLAINED * len(places)):
         return True
-    near = _distances(places, places) < merging_reach(median_of_known(own.radius))
+    near = cdist(places, places) < merging_reach(median_of_known(own.radius))
     apart = int((near.sum(1) == 1).sum())
     return apart < LEAST_BLOBS <= len(places)
-
-
-def _distances(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances (M, N) between points (M, 2) and points (N, 2)."""
-    return np.asarray(np.linalg.norm(first[:, None] - second, axis=-1))
 
 
 def _predict(

@@ -109,7 +109,7 @@ def draw(result: Mapping[str, Any], path: Path) -> None:
 
 
 def _stages(cameras: int) -> Sequence[str]:
-    """What is timed with so many cameras: a running rig's matrices would need gigabytes and minutes with hundreds."""
+    """Stages to time with so many cameras; with hundreds, a running rig's matrices would need gigabytes and minutes."""
     return [stage for stage in AXES["cameras"] if stage != RUNNING or cameras <= MOST_RUNNING]
 
 
