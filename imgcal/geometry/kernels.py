@@ -120,6 +120,16 @@ def cholesky_solve(lower, right):
 
 
 @njit(fastmath=FAST)
+def mirror(matrix):
+    """Copy the lower triangle to the upper one, tile by tile: whole columns of a large matrix do not fit the cache."""
+    size, tile = len(matrix), 32
+    for first in range(0, size, tile):
+        for i in range(first, size):
+            for j in range(first, min(first + tile, i)):
+                matrix[j, i] = matrix[i, j]
+
+
+@njit(fastmath=FAST)
 def subtract_gram(matrix, tall):
     """Subtract tall.T @ tall from the lower triangle; the number of rows must be divisible by three (6, 15, 18)."""
     # Three rows at once: the matrix is read and written a third as often. Cameras that see nothing, and rotations of a

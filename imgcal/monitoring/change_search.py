@@ -22,6 +22,8 @@ ALARM_CHI2 = 60.0
 SCREEN_CHI2 = 20.0
 """Score of the quick test (`screen`) that triggers the exact one. The quick score may be a third of the exact one when
 half of the information is new."""
+SCREENED_CAMERAS = 10
+"""Cameras up to which it is that; beyond, it grows so that chance triggers no more exact tests than with so many."""
 REMAINING_CHI2 = 20.0
 """Minimum score without the episode that supports the change most; wrong labels or passing errors leave nothing."""
 
@@ -52,7 +54,8 @@ def find_alarm(
     """
     ages = {age for age, (every, at) in SLOW_TESTS.items() if age <= len(recent) and count % every == at}
     screened = recent.screen()
-    if screened.max() >= SCREEN_CHI2:
+    suspicion = SCREEN_CHI2 + 2 * math.log(max(1.0, screened.shape[1] / SCREENED_CAMERAS))
+    if screened.max() >= suspicion:
         ages.add(int(SCREENED_AGES[int(screened.max(1).argmax())]))
     for age in sorted(ages):
         scores = recent.test(age).scores()

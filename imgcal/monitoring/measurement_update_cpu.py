@@ -47,6 +47,8 @@ damped steps have failed: far from the belief their direction is only approximat
 LOOSEN_AFTER, LOOSER = 12, 1.5
 """After this many iterations the tolerance grows by this factor in each: steps shrink slowly if snapshots contradict
 a belief."""
+LARGE = 256
+"""From this size on, LAPACK factorizes a matrix faster than a compiled loop does."""
 
 
 @dataclass(frozen=True)
@@ -177,10 +179,9 @@ def _absorb(shared, seen, known_rig, known, rigs, states, blocks, matrices, brou
             if done:
                 if damping > 0 and not _factorize(gathered, 0.0, factor):
                     return best, 2, cost
+                kernels.mirror(gathered)
                 for i in range(wide):
-                    for j in range(i):
-                        gathered[j, i] = gathered[i, j]
-                        factor[j, i] = 0.0
+                    factor[i, i + 1 :] = 0.0
                 return best, 0, cost
             damping = 0.0 if damping <= 1e-6 else damping / 8
         else:
@@ -210,7 +211,13 @@ def _factorize(matrix, damping, factor):
         for j in range(i + 1):
             factor[i, j] = matrix[i, j]
         factor[i, i] *= 1 + damping
-    return kernels.cholesky(factor)
+    if len(matrix) < LARGE:
+        return kernels.cholesky(factor)
+    try:
+        factor[:] = np.linalg.cholesky(factor)
+    except Exception:  # numba supports no narrower one
+        return False
+    return True
 
 
 @njit(cache=True, fastmath=kernels.FAST)

@@ -36,6 +36,8 @@ LEAST_SIGMAS = 3.0
 MISFIT_LEAD = 30.0
 """Log odds against the next best explanation at which a change of the object is believed without a suspected camera:
 a bad fit has many causes."""
+LEAST_GAIN = MISFIT_LEAD / 2
+"""Gain of log likelihood below which no part of the object is asked for it; half, because fits are not exact."""
 
 # When the object is tested: snapshots fit worse than usual, or the first ones have never fitted.
 SNAPSHOTS_PER_FALSE_ALARM = 1e9
@@ -69,6 +71,26 @@ def free_object(belief: RigBelief, fiducial: int | None, by: float = ONE_MM) -> 
     spread[wide + rows] = (SCALE_CHANGE if fiducial is None else by) / std[rows].clamp_min(1e-6)
     covariance = torch.cholesky_inverse(belief.factor) + spread.square().diag()
     return replace(belief, factor=cholesky_factor(torch.cholesky_inverse(cholesky_factor(covariance))))
+
+
+def may_have_changed(case: Case) -> bool:
+    """Tell whether a change of some part of the object may lead by `MISFIT_LEAD`, before all parts are weighed.
+
+    No part improves the fit by more than all fiducials together, each free by `ONE_MM`. Larger changes of scale than
+    that allows improve it by far more than the lead.
+    """
+    obj = case.before.obj
+    if obj.unknown_markers:
+        return False
+    if obj.num_fiducials > PRINT_FIDUCIALS:  # one part
+        return True
+    observations, poses = stack_snapshots(case.latest)
+    try:
+        steady = absorb(case.before, observations, poses, case.options)
+        free = absorb(free_object(case.before, SHAPE), observations, poses, case.options)
+    except RefusedError:
+        return True
+    return 0.5 * (steady.chi2 - free.chi2) >= LEAST_GAIN
 
 
 def _rows(known: int, fiducial: int | None) -> Tensor:

@@ -31,7 +31,7 @@ from imgcal.monitoring.lens_misfit import LensMisfit
 from imgcal.monitoring.lens_warming import Warmed
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.noise_correlation import NoiseCorrelation
-from imgcal.monitoring.object_change import MISFIT_LEAD, Misfit, ObjectChanged, has_never_fitted
+from imgcal.monitoring.object_change import MISFIT_LEAD, Misfit, ObjectChanged, has_never_fitted, may_have_changed
 from imgcal.monitoring.pending_change import Change, PendingChange, free_cameras
 from imgcal.monitoring.quarantine import Quarantine
 from imgcal.monitoring.recent_snapshots import RecentSnapshots
@@ -544,6 +544,8 @@ class RigMonitor:
         """
         case = Case(before, snapshots, pauses, len(snapshots), self.filter.options)
         with contextlib.suppress(RefusedError):  # nothing explains these snapshots
+            if not may_have_changed(case) and weigh(case, (Steady(), Warmed())).best.name == Steady.name:
+                return None
             verdict = weigh(case)
             sure = Steady.name in verdict.explained and verdict.lead >= MISFIT_LEAD
             if sure and verdict.best.name in (ObjectChanged.name, Warmed.name):

@@ -31,7 +31,7 @@ from imgcal.online.prediction_labels import (
     spare_blobs,
 )
 from imgcal.online.resection import labels_at, resect_camera
-from imgcal.types import CalibrationObject, CameraRig, Detections
+from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 
 REMEMBERED = 64
 """Number of latest snapshots to keep for a missing camera."""
@@ -52,7 +52,7 @@ class Surroundings:
     """What is known where a camera is searched for."""
 
     belief: RigBelief
-    widest: Tensor  # (C, K) upper limit of the standard deviations: the factory calibration's
+    factory: CameraRig  # no camera is less certain than here
     obj: CalibrationObject  # as currently estimated
     options: PipelineOptions
 
@@ -64,7 +64,7 @@ class Surroundings:
     @cached_property
     def std(self) -> Tensor:
         """Uncertainty of the rig with a margin: (C, K). Slow; computed only when a camera is searched for."""
-        return torch.minimum(2 * self.belief.std(), self.widest)
+        return torch.minimum(2 * self.belief.std(), (self.factory.prior or RigPrior()).std(self.factory))
 
 
 @dataclass

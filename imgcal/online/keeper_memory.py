@@ -155,7 +155,7 @@ class KeeperMemory:
         """The rig and its uncertainty with a margin; None = nothing but the factory calibration is known."""
         if not self.monitor.filter.count:
             return None
-        return Surroundings(self.belief, (self.prior.prior or RigPrior()).std(self.prior), self.obj_now, self.options)
+        return Surroundings(self.belief, self.prior, self.obj_now, self.options)
 
     @property
     def best_known(self) -> frozenset[int]:

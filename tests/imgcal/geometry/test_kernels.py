@@ -42,6 +42,14 @@ def test_subtract_gram_fills_the_lower_triangle() -> None:
     assert np.allclose(found, np.triu(matrix, 1) + np.tril(matrix - tall.T @ tall), rtol=0, atol=1e-14)
 
 
+@pytest.mark.parametrize("size", [1, 31, 32, 33, 100])
+def test_mirror_fills_the_upper_triangle(size: int) -> None:
+    matrix = np.random.default_rng(size).standard_normal((size, size))
+    expected = np.tril(matrix) + np.tril(matrix, -1).T
+    kernels.mirror(matrix)
+    np.testing.assert_array_equal(matrix, expected)
+
+
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 def test_ranks_are_those_of_sorted_values(kind: type) -> None:
     random = np.random.default_rng(3)

@@ -1,9 +1,14 @@
 """Which cameras have changed, and when: asked of the latest snapshots."""
 
+import contextlib
 import math
 
+import numpy as np
+import pytest
+
+from imgcal.errors import RefusedError
 from imgcal.monitoring.change_search import ALARM_CHI2, changed_cameras, find_alarm, likeliest_age, likeliest_camera
-from imgcal.monitoring.recent_snapshots import RecentSnapshots
+from imgcal.monitoring.recent_snapshots import SCREENED_AGES, RecentSnapshots
 from scripts.benchmarks.rig_streams import Bump, Slip
 from tests.imgcal.monitoring.followed import followed
 
@@ -34,6 +39,26 @@ def test_two_cameras_are_found_and_what_is_known_is_not_found_again() -> None:
     free, evidence = changed_cameras(turned.recent, 6, {1: "rotation"}, *INDEPENDENT)
     assert free == {1: "rotation", 3: None} and evidence.keys() == {3}
     assert likeliest_camera(turned.recent.test(6), (0, 2, 3)) == 3
+
+
+@pytest.mark.parametrize(("cameras", "suspected"), [(4, True), (10, True), (64, False)])
+def test_chance_triggers_no_more_tests_of_a_rig_with_many_cameras(cameras: int, suspected: bool) -> None:
+    asked = []
+
+    class Recent:
+        def __len__(self) -> int:
+            return 10
+
+        def screen(self) -> np.ndarray:
+            return np.full((len(SCREENED_AGES), cameras), 22.0)
+
+        def test(self, age: int) -> None:
+            asked.append(age)
+            raise RefusedError("asked")
+
+    with contextlib.suppress(RefusedError):
+        find_alarm(Recent(), 1, lambda camera, shift: 1, [0.0] * cameras)
+    assert bool(asked) == suspected
 
 
 def test_what_may_be_one_passing_error_is_no_alarm() -> None:

@@ -1,5 +1,6 @@
 """The compiled loop against the same in tensors."""
 
+import math
 from dataclasses import fields, replace
 
 import pytest
@@ -10,8 +11,10 @@ from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions, displace, error_between
 from imgcal.geometry import rotation_from_vector
 from imgcal.monitoring import MeasurementUpdate, RigBelief, absorb
+from imgcal.monitoring.measurement_update_cpu import LARGE
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import Observations
+from scripts.results.runtime import ring
 from tests.imgcal.monitoring.measurement_update_in_tensors import update_in_tensors
 
 NOISE = 0.1
@@ -65,6 +68,21 @@ def test_both_find_the_same(loose: bool, radius: bool, loss) -> None:
     later = tuple(x[:1] for x in (observations.uv, observations.sigma, observations.seen))
     again = (first.belief, Observations(*later), first.rig_from_object[:1], options)
     same(absorb(*again), update_in_tensors(*again))
+
+
+def test_both_find_the_same_for_a_rig_with_so_many_cameras_that_lapack_factorizes() -> None:
+    factory = ring(20)
+    obj, generator = imgcal.load_object("asymmetric8"), torch.Generator().manual_seed(4)
+    truth = simulate_truth(factory, obj, 2, generator, PhysicalDrift())
+    uv = truth.uv + NOISE * torch.randn(truth.uv.shape, generator=generator, dtype=torch.float64)
+    seen = torch.ones(uv.shape[:-1], dtype=torch.bool)
+    observations = Observations(uv, torch.full(seen.shape, NOISE, dtype=torch.float64), seen)
+    belief = RigBelief.of_prior(factory, obj)
+    assert len(belief.factor) >= LARGE
+    same(*(function(belief, observations, truth.rig_from_object) for function in (absorb, update_in_tensors)))
+    broken = replace(belief, factor=belief.factor * math.nan)
+    with pytest.raises(RefusedError, match="these observations"):
+        absorb(broken, observations, truth.rig_from_object)
 
 
 def test_both_refuse_a_snapshot_without_a_pose() -> None:

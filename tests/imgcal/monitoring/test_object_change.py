@@ -10,7 +10,14 @@ import imgcal
 from imgcal.monitoring import SHAPE, RigBelief, RigFilter, RigMonitor, absorb, object_change
 from imgcal.monitoring.case import Case
 from imgcal.monitoring.explanations import weigh
-from imgcal.monitoring.object_change import LEAST_USUAL, MISFIT_LEAD, Misfit, ObjectChanged, has_never_fitted
+from imgcal.monitoring.object_change import (
+    LEAST_USUAL,
+    MISFIT_LEAD,
+    Misfit,
+    ObjectChanged,
+    has_never_fitted,
+    may_have_changed,
+)
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import Observations
 from renderers import palette
@@ -106,6 +113,40 @@ def test_an_object_that_never_was_as_its_file_says_is_told_however_it_is_turned(
         found += [] if update.object_change is None else [update.object_change]
     assert [(change.fiducial, change.since) for change in found] == [(SHAPE, 0)]
     assert found[0].size == pytest.approx(_apart(obj.points, other), abs=5 * found[0].sigma)
+
+
+def changed_case(change: str, generator: torch.Generator) -> Case:
+    """Six snapshots of an object that has changed, after ten."""
+    factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    truth, points = simulate_truth(factory, obj, 16, generator, PhysicalDrift()), obj.points.clone()
+    if change == "fiducial":
+        points[5] += torch.tensor([0.6, -0.5, 0.6])
+    elif change == "shape":
+        points += 0.5 * torch.randn(8, 3, generator=generator, dtype=torch.float64)
+    elif change.startswith("scale"):
+        points = points.mean(0) + (1 + float(change.split()[1])) * (points - points.mean(0))
+    follows, snapshots = RigFilter(factory, obj), []
+    for s in range(16):
+        image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(obj.points if s < 10 else points))
+        uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
+        if change == "bad labels" and s >= 10:
+            uv[0, :, s % 8] += 3.0
+        there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), image.visible)
+        if s < 10:
+            follows.update(there, truth.rig_from_object[s : s + 1])
+        snapshots.append((there, truth.rig_from_object[s : s + 1]))
+    return Case(follows.belief, snapshots[10:], [1 / 60] * 6, 6)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("change", ["nothing", "bad labels", "fiducial", "shape", "scale 0.01", "scale 0.1"])
+def test_one_fit_tells_whether_parts_of_the_object_are_worth_weighing(change: str, seed: int) -> None:
+    case = changed_case(change, torch.Generator().manual_seed(seed))
+    verdict = weigh(case)
+    gained = verdict.evidence(ObjectChanged.name) - verdict.evidence("steady") >= MISFIT_LEAD
+    assert may_have_changed(case) >= gained
+    if change != "bad labels":  # which may look like a change
+        assert may_have_changed(case) == gained == (change != "nothing")
 
 
 def test_few_questions_are_asked_of_a_print(monkeypatch: pytest.MonkeyPatch) -> None:

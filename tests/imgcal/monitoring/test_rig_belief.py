@@ -26,6 +26,16 @@ def test_nothing_is_learnt_of_motions_of_the_whole_rig(made) -> None:
     torch.testing.assert_close(after, before, rtol=1e-4, atol=1e-4 * float(before.max()))
 
 
+def test_standard_deviations_are_those_of_the_covariance(made) -> None:
+    factory, obj, _, _ = made
+    for belief in (
+        RigBelief.of_prior(factory, obj),
+        absorb(RigBelief.of_prior(factory, obj), *snapshots(made, 0, 3)).belief,
+    ):
+        expected = belief.covariance().diagonal().sqrt().view(belief.unit.shape)
+        torch.testing.assert_close(belief.std(), expected, rtol=1e-9, atol=0)
+
+
 def test_time_widens_what_is_known_and_moves_nothing(made) -> None:
     factory, obj, _, _ = made
     rate = DriftRate(focal_length=1e-3, principal_point=2.0, distortion=1e-3, rotation=1e-3, position=1.0)

@@ -40,8 +40,9 @@ def tries(monkeypatch):
 
 
 def known(stream: Stream) -> Surroundings:
-    std = 0.1 * stream.rig.prior.std(stream.rig)
-    return Surroundings(RigBelief.of_prior(stream.true, stream.obj, std), std, stream.obj, PipelineOptions())
+    std = 0.05 * stream.rig.prior.std(stream.rig)
+    belief = RigBelief.of_prior(stream.true, stream.obj, std)
+    return Surroundings(belief, stream.rig, stream.obj, PipelineOptions())
 
 
 def seen(stream: Stream, own: np.ndarray | None, fiducial: int = -1) -> Checked:
