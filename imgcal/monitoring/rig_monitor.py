@@ -258,7 +258,7 @@ class RigMonitor:
         for camera in case.cameras:
             seen = [one for one in case.latest if bool(one[0].seen[0, camera].any())]
             shifts = [_shift(case.before, snapshot, camera) for snapshot in seen]
-            shift = sorted(shifts)[len(shifts) // 2] if shifts else 0.0
+            shift = sorted(shifts)[(len(shifts) - 1) // 2] if shifts else 0.0  # of two, both must be
             if shift >= least[camera] and self.noise.episode(camera, shift) <= max(lasted, 1):
                 found.append(camera)
         return tuple(found)

@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from imgcal.monitoring.pending_change import PendingChange
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Observations
 from scripts.benchmarks.rig_streams import Bump, Conditions, Slip, Stream
+from tests.imgcal.monitoring.followed import followed as steadily
 
 NOISE = 0.1
 SIZES = {"rotation": math.radians(0.1), "position": 1.0, "focal_length": 3.0, "principal_point": 1.0}
@@ -320,3 +322,16 @@ def test_of_two_cameras_in_quarantine_only_the_one_whose_image_is_shifted_has_mo
     assert {camera for _, camera in told} == {1}
     assert told[0][0] <= 60 + 30  # half a second: the error of camera 2 may pass for longer
     assert not monitor.quarantine.cameras
+
+
+@pytest.mark.parametrize(("shifts", "shifted"), [((2.0, 2.0), (2,)), ((2.0, 0.0), ()), ((2.0, 2.0, 0.0), (2,))])
+def test_a_camera_that_sees_the_object_in_its_place_again_has_not_moved(shifts: tuple[float, ...], shifted) -> None:
+    made, monitor = steadily(20), RigMonitor(RigFilter(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")))
+    monitor.noise.time[:], monitor.noise.lasting[:] = 4.0, 0.05
+    latest = []
+    for (observations, pose), shift in zip(made.snapshots[-len(shifts) :], shifts, strict=True):
+        uv = observations.uv.clone()
+        uv[0, 2, :, 0] += shift
+        latest.append((replace(observations, uv=uv), pose))
+    case = Case(made.filter.belief, latest, [1 / 60] * len(latest), len(latest), cameras=(2,))
+    assert monitor._shifted_cameras(case, lasted=100) == shifted
