@@ -60,6 +60,9 @@ EPISODE, LEAST_EPISODE = 2.0, 3
 PERSISTENT = 1e-3
 """Error probability of the evidence that must remain on either side of a step without its most supportive half, where
 errors are correlated: a camera that has moved stays there, but the error of a second or two ends."""
+MOST_EPISODES, OUTERMOST = 4.0, 4
+"""Longest time, in episodes, between a step and the nearer end of a capture in which an error may have passed, and the
+part of that time, one in so many snapshots, that shows it."""
 LEAST_LABELS = 2
 """Smallest number of labels from which the shift of a camera's image in a snapshot is computed."""
 
@@ -290,6 +293,7 @@ def find_moves(
                 and change.is_certain
                 and divided.cost_per_label(new) <= MOST_MISFIT * left
                 and _outlasts_an_episode(places, divided, step.camera, least_significant(candidates, FALSE_ALARM), left)
+                and not _passed(places, divided, step.camera, options, left)
             ):
                 doubts[new] = _doubts(places, step)
                 places, noise = divided, left
@@ -349,6 +353,28 @@ def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: fl
             if rest.blocks.statistics([camera], np.array([row]))[0, 0] < enough * noise:
                 return False
     return True
+
+
+def _passed(places: Places, divided: Places, camera: int, options: EstimationOptions, noise: float) -> bool:
+    """Check whether a camera that left its place near an end of the capture is in it at that end: an error passed.
+
+    Arguments as for `_outlasts_an_episode`. Both places are estimated without the outermost snapshots in question.
+    """
+    new, row = len(divided.camera) - 1, divided.first[-1]
+    shown = np.flatnonzero(places.seen[:, camera])
+    before, after = shown[shown < row], shown[shown >= row]
+    near, own, other = (before, camera, new) if len(before) < len(after) else (after, new, camera)
+    moments = np.unique(places.moment[near])
+    if len(moments) > MOST_EPISODES * divided.episode(divided.camera[new]):
+        return False
+    count = max(1, len(moments) // OUTERMOST)
+    outer = near[np.isin(places.moment[near], moments[:count] if near is before else moments[-count:])]
+    without = places.drop_labels(camera, outer).divide(Step(camera, row, 0.0, np.zeros(0)), options)
+    judged = replace(divided, state=without.state)
+    here, there = (float(judged.costs(place)[outer].sum()) for place in (own, other))
+    labels = int((divided.problem.root_weight[0][outer, own] > 0).sum())
+    least = 0.5 * least_significant(1, PERSISTENT) * noise
+    return there <= MOST_MISFIT * noise * labels and here - there >= least
 
 
 def _doubts(places: Places, step: Step) -> set[int]:

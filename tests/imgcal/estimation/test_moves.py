@@ -9,7 +9,7 @@ import torch
 from imgcal.association import accepted_observations, associate
 from imgcal.estimation import EstimationOptions, estimate, find_moves
 from imgcal.estimation.change_points import Step, dispersion
-from imgcal.estimation.moves import Change, Places, _outlasts_an_episode
+from imgcal.estimation.moves import Change, Places, _outlasts_an_episode, _passed
 from scripts.benchmarks import camera_faults as faults
 
 CAMERA, FIRST, COUNT = 3, 15, 30
@@ -103,6 +103,23 @@ def test_an_error_that_ends_is_no_step_however_much_of_it_remains_without_an_epi
     noise = dispersion(divided.blocks, divided.seen)
     assert divided.episode(CAMERA) < len(off)
     assert not _outlasts_an_episode(places, divided, CAMERA, 0.2 * statistic / noise, noise)
+
+
+@pytest.mark.parametrize(("first", "left"), [(1, 0.0), (53, 0.0), (46, 0.4)])
+def test_a_camera_that_is_in_its_place_again_at_the_end_has_not_moved(first: int, left: float) -> None:
+    rig, wand, truth = faults.wand_in_a_room(60, 1)
+    observations, _ = accepted_observations(associate(faults.blobs(truth, 1, labelled=True), rig, wand), rig, wand)
+    off = torch.tensor([0.79, 0.63, 0.41, 0.46, 0.55, 0.39], dtype=torch.float64)  # px, recorded in a room
+    uv, last = lasting(observations.uv, 0.04), first + len(off)
+    uv[first:last, CAMERA, :, 0] -= off[:, None]
+    uv[last:, CAMERA, :, 0] -= left
+    fit = estimate(replace(observations, uv=uv, sigma=torch.full_like(observations.sigma, 0.06)), rig, wand)
+    places = Places(fit.problem, fit.solution.state, tuple(range(10)), (0,) * 10, np.arange(len(fit.problem.uv[0])))
+    divided = places.divide(Step(CAMERA, last if first == 1 else first, 0.0, np.zeros(10)), OPTIONS)
+    assert _passed(places, divided, CAMERA, OPTIONS, dispersion(divided.blocks, divided.seen)) == (left == 0)
+    names = tuple(str(s) for s in range(60))
+    moved = find_moves(fit.problem, fit.solution.state, rig.camera_names, names, OPTIONS)
+    assert [move.camera for move in moved] == (["cam04"] if left else [])
 
 
 def test_where_errors_do_not_last_every_snapshot_counts():
