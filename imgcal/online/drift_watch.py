@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
@@ -62,9 +62,11 @@ class DriftWatch:
         self.looked = time
         std = relative_std(belief)
         if self.reference is None or self.std is None:
-            self._begin(range(len(self.names)), belief, std, time)
+            self.reference, self.std = belief.rig, std
+            self.since |= dict.fromkeys(range(len(self.names)), time)
             return []
-        change = Gauge.from_majority(belief.rig, self.reference).difference(belief.rig, self.reference)
+        aligned = Gauge.from_majority(belief.rig, self.reference).align(belief.rig, self.reference)
+        change = aligned.local(self.reference)
         events, restarted = [], set(unsettled)
         for camera in range(len(self.names)):
             if camera in unsettled:
@@ -76,7 +78,8 @@ class DriftWatch:
             if found is not None:
                 events.append(self._event(camera, *found, std[camera], time, number))
                 restarted.add(camera)
-        self._begin(restarted, belief, std, time)
+        if restarted:
+            self._restart(sorted(restarted), aligned, std, time)
         return events
 
     def _largest(
@@ -109,16 +112,12 @@ class DriftWatch:
         message = f"{name} {HOW[kind]} {size:.2g} {unit} in {minutes:.1f} minutes"
         return Event(time, number, "drift", name, self.since[camera], kind, size, sigma, unit, message=message)
 
-    def _begin(self, cameras: Iterable[int], belief: RigBelief, std: Tensor, time: float) -> None:
-        """Start measuring the drift of some cameras."""
-        chosen = sorted(cameras)
-        if self.reference is None or self.std is None:
-            self.reference, self.std = belief.rig, std
-        elif chosen:
-            now = Gauge.from_majority(belief.rig, self.reference).align(belief.rig, self.reference)
-            self.reference, self.std = replace_cameras(self.reference, now, chosen), self.std.clone()
-            self.std[chosen] = std[chosen]
-        self.since |= dict.fromkeys(chosen, time)
+    def _restart(self, cameras: list[int], now: CameraRig, std: Tensor, time: float) -> None:
+        """Measure the drift of some cameras from now on; `now`: the rig, aligned with the reference."""
+        assert self.reference is not None and self.std is not None
+        self.reference, self.std = replace_cameras(self.reference, now, cameras), self.std.clone()
+        self.std[cameras] = std[cameras]
+        self.since |= dict.fromkeys(cameras, time)
 
 
 def _image_shifts(camera: CameraRig, changes: Tensor, points: Tensor) -> list[float]:
