@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 
 import torch
 
 from imgcal.errors import RefusedError
 from imgcal.monitoring.case import Case, Explanation, Variant
-from imgcal.monitoring.rig_belief import RigBelief, cholesky_factor
+from imgcal.monitoring.rig_belief import RigBelief
 from imgcal.types import PARAMETER_KINDS
 
 MISFIT = 4.0
@@ -45,4 +44,4 @@ def widen_distortion(belief: RigBelief, cameras: Sequence[int]) -> RigBelief:
     for camera in cameras:
         own = slice(camera * width + first, (camera + 1) * width)
         covariance[own, own] *= MISFIT**2
-    return replace(belief, factor=cholesky_factor(torch.cholesky_inverse(cholesky_factor(covariance))))
+    return belief.with_covariance(covariance)

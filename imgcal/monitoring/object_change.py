@@ -16,7 +16,7 @@ from imgcal.monitoring.case import SHAPE, Case, Explanation, Finding, ObjectChan
 from imgcal.monitoring.cusum import Cusum, RunningMedian
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.pending_change import free_cameras
-from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, cholesky_factor
+from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
 
 # Prior standard deviations of a change.
 ONE_MM = 3.0
@@ -70,7 +70,7 @@ def free_object(belief: RigBelief, fiducial: int | None, by: float = ONE_MM) -> 
     spread = torch.zeros(wide + known, dtype=torch.float64)
     spread[wide + rows] = (SCALE_CHANGE if fiducial is None else by) / std[rows].clamp_min(1e-6)
     covariance = torch.cholesky_inverse(belief.factor) + spread.square().diag()
-    return replace(belief, factor=cholesky_factor(torch.cholesky_inverse(cholesky_factor(covariance))))
+    return belief.with_covariance(covariance)
 
 
 def may_have_changed(case: Case) -> bool:

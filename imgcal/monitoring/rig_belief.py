@@ -115,6 +115,17 @@ class RigBelief:
         step = step_by_error(self.rig) * self.unit[:, None, :]
         return torch.einsum("cij,cjdk,dlk->cidl", step, blocks, step).reshape(wide, wide)
 
+    def with_covariance(self, covariance: Tensor) -> RigBelief:
+        """Replace what is known by a joint covariance (D, D) of all errors in their units.
+
+        Raises:
+            RefusedError: it is not positive definite.
+        """
+        information = torch.cholesky_inverse(cholesky_factor(covariance))
+        belief = replace(self, factor=cholesky_factor(information))
+        vars(belief)["information"] = information  # the property would multiply the factor out again
+        return belief
+
     def std(self) -> Tensor:
         """One standard deviation of every parameter: (C, K)."""
         inverse, _ = dtrtri(self.factor.numpy().T)  # of the factor, transposed: a third of the work of a covariance
@@ -189,7 +200,7 @@ def widen(belief: RigBelief, variance: Tensor) -> RigBelief:
     """Add variances (C, K) to some parameters, in the units and order of `CameraRig.parameter_names`."""
     covariance = torch.cholesky_inverse(belief.factor)
     add_blocks(covariance, error_covariance(belief, variance))
-    return replace(belief, factor=cholesky_factor(torch.cholesky_inverse(cholesky_factor(covariance))))
+    return belief.with_covariance(covariance)
 
 
 def widen_along(belief: RigBelief, steps: Tensor) -> RigBelief:
@@ -198,7 +209,7 @@ def widen_along(belief: RigBelief, steps: Tensor) -> RigBelief:
     error = (_error_by_step(belief) @ steps[..., None]).flatten(1)
     wide = error.shape[1]
     covariance[:wide, :wide] += error.mT @ error
-    return replace(belief, factor=cholesky_factor(torch.cholesky_inverse(cholesky_factor(covariance))))
+    return belief.with_covariance(covariance)
 
 
 def error_covariance(belief: RigBelief, variance: Tensor) -> Tensor:

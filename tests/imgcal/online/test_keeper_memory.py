@@ -25,7 +25,8 @@ def test_what_has_been_learnt_is_forgotten_but_for_the_factory() -> None:
     memory = made.learn(USUAL_SNAPSHOTS)
     assert memory.most_usual < 2.0
     known = memory.surroundings
-    assert known is not None and bool((known.std[:, 6] < known.widest[:, 6]).all())
+    prior = (memory.prior.prior or imgcal.types.RigPrior()).std(memory.prior)
+    assert known is not None and bool((known.std[:, 6] < prior[:, 6]).all())
     factory = memory.factory
     memory.reset()
     assert memory.factory is factory and memory.surroundings is None and memory.most_usual == np.inf
