@@ -51,10 +51,9 @@ SMOOTHING = 0.1
 EPISODE, EPISODE_SECONDS = 2.0, 1.0
 """How long a passing error may last: correlation times, and at least this many seconds. On the recorded wand, the mean
 shift of a camera over 0.8 s reaches 6 times its usual persistent error, and 3.5 times over 1.5 s."""
-LARGEST, LARGE_EPISODE_SECONDS = 10.0, 0.5
+LARGEST, LARGE_EPISODE_SECONDS = 10.0, 0.4
 """Errors larger than this many times the usual persistent error last no longer than those seconds. A target at the edge
-of an image, behind somebody's arm, or with wrong labels stays so for a while, and may seem to be shifted by pixels: on
-the recorded wand for at most 29 frames at 60 Hz."""
+of an image, behind somebody's arm, or with wrong labels stays so for a while, and may seem to be shifted by pixels."""
 LEAST_LASTING = 0.05
 """Pixels: least size of persistent errors, as measured on ten well calibrated infrared cameras."""
 LEAST_SHIFT = 6.0

@@ -57,6 +57,10 @@ RECENT_MOVE, LEAST_AGAIN = 16, 8
 """A second move of a camera within the first number of snapshots is doubted, and takes the second to decide: a late
 camera seems to have moved in any two successive snapshots, but not in eight."""
 
+FADED = 0.5
+"""Share of its first shift below which the image of a camera in quarantine has an error that is passing. A camera that
+rolled may be off by as little elsewhere in its image, so it waits for another episode only."""
+
 
 @dataclass(frozen=True)
 class MonitorUpdate:
@@ -233,9 +237,10 @@ class RigMonitor:
             return found
         snapshot, belief = (observations, found.update.rig_from_object[-1:]), found.update.belief
         shifts = {camera: _shift(belief, snapshot, camera) for camera in cameras}
-        if any(self._error_begins(belief, camera, shift) for camera, shift in shifts.items()):
-            quarantine.expect_passing()
         episode = min(self.noise.episode(camera, shift) for camera, shift in shifts.items())
+        begins = any(self._error_begins(belief, camera, shift) for camera, shift in shifts.items())
+        if begins or any(self._error_fades(belief, camera, shift, episode) for camera, shift in shifts.items()):
+            quarantine.expect_passing()
         if quarantine.observe(observations, seconds, episode):
             with contextlib.suppress(RefusedError):  # undecided, or they do not see enough
                 found = self._diagnose_quarantine(found)
@@ -246,11 +251,24 @@ class RigMonitor:
         least = self.noise.least_shifts[camera]
         if shift < least:
             return False
-        poses = [pose for _, pose in self._recent.latest(len(self._recent))[0]]
+        return any(earlier < least for earlier in self._earlier_shifts(belief, camera, 1))
+
+    def _error_fades(self, belief: RigBelief, camera: int, shift: float, episode: int) -> bool:
+        """Tell whether an image is off by much less than at first when an episode ends; a moved camera's stays off."""
+        quarantine = self.quarantine
+        if not quarantine.passing or quarantine.snapshots < episode or not shift:
+            return False
+        earlier = self._earlier_shifts(belief, camera, episode)
+        first = sorted(earlier[len(earlier) // 2 :])
+        return bool(first) and shift < FADED * first[len(first) // 2]
+
+    def _earlier_shifts(self, belief: RigBelief, camera: int, most: int) -> list[float]:
+        """Shifts (px) of a camera in quarantine when it last saw the object, the latest first."""
+        poses, found = [pose for _, pose in self._recent.latest(len(self._recent))[0]], list[float]()
         for earlier in zip(reversed(self.quarantine.seen), reversed(poses[:-1]), strict=False):
-            if bool(earlier[0].seen[0, camera].any()):
-                return _shift(belief, earlier, camera) < least
-        return False
+            if len(found) < most and bool(earlier[0].seen[0, camera].any()):
+                found.append(_shift(belief, earlier, camera))
+        return found
 
     def _shifted_cameras(self, case: Case, lasted: int) -> tuple[int, ...]:
         """Suspected cameras whose images are shifted by clearly more than errors that last for so many snapshots."""

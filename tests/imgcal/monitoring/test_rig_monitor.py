@@ -15,6 +15,7 @@ from imgcal.monitoring.case import Case
 from imgcal.monitoring.change_search import ALARM_CHI2
 from imgcal.monitoring.explanations import Diagnosis, Steady, Verdict, weigh
 from imgcal.monitoring.pending_change import PendingChange
+from imgcal.monitoring.rig_monitor import _shift
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Observations
 from scripts.benchmarks.rig_streams import Bump, Conditions, Slip, Stream
@@ -335,3 +336,22 @@ def test_a_camera_that_sees_the_object_in_its_place_again_has_not_moved(shifts: 
         latest.append((replace(observations, uv=uv), pose))
     case = Case(made.filter.belief, latest, [1 / 60] * len(latest), len(latest), cameras=(2,))
     assert monitor._shifted_cameras(case, lasted=100) == shifted
+
+
+@pytest.mark.parametrize(
+    ("shifts", "episode", "fades"),
+    [((3.0, 2.8, 2.0, 0.9), 3, True), ((3.0, 2.8, 2.0, 0.9), 4, False), ((3.0, 2.9, 3.0, 2.8), 3, False)],
+)
+def test_an_error_that_fades_when_an_episode_ends_may_pass(shifts: tuple[float, ...], episode: int, fades) -> None:
+    made, monitor = steadily(20), RigMonitor(RigFilter(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")))
+    monitor.filter, monitor._recent = made.filter, made.recent
+    monitor.quarantine.add([2], uncertain=False)
+    belief = made.filter.belief
+    for number, ((observations, pose), shift) in enumerate(zip(made.snapshots[-len(shifts) :], shifts, strict=True), 1):
+        uv = observations.uv.clone()
+        uv[0, 2, :, 0] += shift
+        off = replace(observations, uv=uv)
+        if number < len(shifts):
+            monitor.quarantine.observe(off, 1 / 60, episode=100)
+        else:
+            assert monitor._error_fades(belief, 2, _shift(belief, (off, pose), 2), episode) == fades
