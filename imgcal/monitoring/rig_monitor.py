@@ -256,7 +256,7 @@ class RigMonitor:
     def _error_fades(self, belief: RigBelief, camera: int, shift: float, episode: int) -> bool:
         """Tell whether an image is off by much less than at first when an episode ends; a moved camera's stays off."""
         quarantine = self.quarantine
-        if not quarantine.passing or quarantine.snapshots < episode or not shift:
+        if not quarantine.passing or quarantine.snapshots < episode or shift < self.noise.least_shifts[camera]:
             return False
         earlier = self._earlier_shifts(belief, camera, episode)
         first = sorted(earlier[len(earlier) // 2 :])
