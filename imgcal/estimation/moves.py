@@ -61,8 +61,8 @@ PERSISTENT = 1e-3
 """Error probability of the evidence that must remain on either side of a step without its most supportive half, where
 errors are correlated: a camera that has moved stays there, but the error of a second or two ends."""
 MOST_EPISODES, OUTERMOST = 4.0, 4
-"""Longest time, in episodes, between a step and the nearer end of a capture in which an error may have passed, and the
-part of that time, one in so many snapshots, that shows it."""
+"""Longest time, in episodes, between a step and the nearer end of a capture for which the step may be an error that has
+passed. Whether it has passed is judged by the outermost of these snapshots, one in so many."""
 LEAST_LABELS = 2
 """Smallest number of labels from which the shift of a camera's image in a snapshot is computed."""
 
@@ -293,7 +293,7 @@ def find_moves(
                 and change.is_certain
                 and divided.cost_per_label(new) <= MOST_MISFIT * left
                 and _outlasts_an_episode(places, divided, step.camera, least_significant(candidates, FALSE_ALARM), left)
-                and not _passed(places, divided, step.camera, options, left)
+                and not _has_passed(places, divided, step.camera, options, left)
             ):
                 doubts[new] = _doubts(places, step)
                 places, noise = divided, left
@@ -355,7 +355,7 @@ def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: fl
     return True
 
 
-def _passed(places: Places, divided: Places, camera: int, options: EstimationOptions, noise: float) -> bool:
+def _has_passed(places: Places, divided: Places, camera: int, options: EstimationOptions, noise: float) -> bool:
     """Check whether a camera that left its place near an end of the capture is in it at that end: an error passed.
 
     Arguments as for `_outlasts_an_episode`. Both places are estimated without the outermost snapshots in question.

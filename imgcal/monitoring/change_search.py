@@ -23,7 +23,8 @@ SCREEN_CHI2 = 20.0
 """Score of the quick test (`screen`) that triggers the exact one. The quick score may be a third of the exact one when
 half of the information is new."""
 SCREENED_CAMERAS = 10
-"""Cameras up to which it is that; beyond, it grows so that chance triggers no more exact tests than with so many."""
+"""Number of cameras up to which that score applies. With more cameras it grows, so that chance does not trigger more
+exact tests."""
 REMAINING_CHI2 = 20.0
 """Minimum score without the episode that supports the change most; wrong labels or passing errors leave nothing."""
 

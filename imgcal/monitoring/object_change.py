@@ -37,7 +37,8 @@ MISFIT_LEAD = 30.0
 """Log odds against the next best explanation at which a change of the object is believed without a suspected camera:
 a bad fit has many causes."""
 LEAST_GAIN = MISFIT_LEAD / 2
-"""Gain of log likelihood below which no part of the object is asked for it; half, because fits are not exact."""
+"""Least gain of log likelihood, with all fiducials free, for which the parts of the object are weighed: half of the
+lead, because fits are not exact."""
 
 # When the object is tested: snapshots fit worse than usual, or the first ones have never fitted.
 SNAPSHOTS_PER_FALSE_ALARM = 1e9
@@ -76,8 +77,8 @@ def free_object(belief: RigBelief, fiducial: int | None, by: float = ONE_MM) -> 
 def may_have_changed(case: Case) -> bool:
     """Tell whether a change of some part of the object may lead by `MISFIT_LEAD`, before all parts are weighed.
 
-    No part improves the fit by more than all fiducials together, each free by `ONE_MM`. Larger changes of scale than
-    that allows improve it by far more than the lead.
+    No part improves the fit by more than all fiducials together, each free by `ONE_MM`. A change of scale that is
+    too large for that still improves it by far more than the lead.
     """
     obj = case.before.obj
     if obj.unknown_markers:

@@ -6,6 +6,8 @@ import contextlib
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
+from statistics import median_high, median_low
 from types import MappingProxyType
 from typing import ClassVar
 
@@ -58,8 +60,8 @@ RECENT_MOVE, LEAST_AGAIN = 16, 8
 camera seems to have moved in any two successive snapshots, but not in eight."""
 
 FADED = 0.5
-"""Share of its first shift below which the image of a camera in quarantine has an error that is passing. A camera that
-rolled may be off by as little elsewhere in its image, so it waits for another episode only."""
+"""An image in quarantine that is off by less than this share of its first shift has an error that is passing. A camera
+that rolled may be off by as little elsewhere in its image: this only delays the decision by an episode."""
 
 
 @dataclass(frozen=True)
@@ -259,16 +261,14 @@ class RigMonitor:
         if not quarantine.passing or quarantine.snapshots < episode or shift < self.noise.least_shifts[camera]:
             return False
         earlier = self._earlier_shifts(belief, camera, episode)
-        first = sorted(earlier[len(earlier) // 2 :])
-        return bool(first) and shift < FADED * first[len(first) // 2]
+        return bool(earlier) and shift < FADED * median_high(earlier[len(earlier) // 2 :])
 
     def _earlier_shifts(self, belief: RigBelief, camera: int, most: int) -> list[float]:
         """Shifts (px) of a camera in quarantine when it last saw the object, the latest first."""
-        poses, found = [pose for _, pose in self._recent.latest(len(self._recent))[0]], list[float]()
-        for earlier in zip(reversed(self.quarantine.seen), reversed(poses[:-1]), strict=False):
-            if len(found) < most and bool(earlier[0].seen[0, camera].any()):
-                found.append(_shift(belief, earlier, camera))
-        return found
+        poses = [pose for _, pose in self._recent.latest(len(self._recent))[0]]
+        earlier = zip(reversed(self.quarantine.seen), reversed(poses[:-1]), strict=False)
+        shown = (snapshot for snapshot in earlier if bool(snapshot[0].seen[0, camera].any()))
+        return [_shift(belief, snapshot, camera) for snapshot in islice(shown, most)]
 
     def _shifted_cameras(self, case: Case, lasted: int) -> tuple[int, ...]:
         """Suspected cameras whose images are shifted by clearly more than errors that last for so many snapshots."""
@@ -276,7 +276,7 @@ class RigMonitor:
         for camera in case.cameras:
             seen = [one for one in case.latest if bool(one[0].seen[0, camera].any())]
             shifts = [_shift(case.before, snapshot, camera) for snapshot in seen]
-            shift = sorted(shifts)[(len(shifts) - 1) // 2] if shifts else 0.0  # of two, both must be
+            shift = median_low(shifts) if shifts else 0.0  # of two, both must be shifted
             if shift >= least[camera] and self.noise.episode(camera, shift) <= max(lasted, 1):
                 found.append(camera)
         return tuple(found)

@@ -9,7 +9,7 @@ import torch
 from imgcal.association import accepted_observations, associate
 from imgcal.estimation import EstimationOptions, estimate, find_moves
 from imgcal.estimation.change_points import Step, dispersion
-from imgcal.estimation.moves import Change, Places, _outlasts_an_episode, _passed
+from imgcal.estimation.moves import Change, Places, _has_passed, _outlasts_an_episode
 from scripts.benchmarks import camera_faults as faults
 
 CAMERA, FIRST, COUNT = 3, 15, 30
@@ -116,7 +116,7 @@ def test_a_camera_that_is_in_its_place_again_at_the_end_has_not_moved(first: int
     fit = estimate(replace(observations, uv=uv, sigma=torch.full_like(observations.sigma, 0.06)), rig, wand)
     places = Places(fit.problem, fit.solution.state, tuple(range(10)), (0,) * 10, np.arange(len(fit.problem.uv[0])))
     divided = places.divide(Step(CAMERA, last if first == 1 else first, 0.0, np.zeros(10)), OPTIONS)
-    assert _passed(places, divided, CAMERA, OPTIONS, dispersion(divided.blocks, divided.seen)) == (left == 0)
+    assert _has_passed(places, divided, CAMERA, OPTIONS, dispersion(divided.blocks, divided.seen)) == (left == 0)
     names = tuple(str(s) for s in range(60))
     moved = find_moves(fit.problem, fit.solution.state, rig.camera_names, names, OPTIONS)
     assert [move.camera for move in moved] == (["cam04"] if left else [])
