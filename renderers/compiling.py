@@ -19,7 +19,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -28,6 +28,7 @@ import numba
 from numba.core import event, sigutils
 from numba.core.compiler_lock import global_compiler_lock
 
+from renderers.interpreting import Interpretable
 from renderers.sources import source_digest
 
 try:
@@ -41,8 +42,13 @@ WAITING = "imgcal:waiting"
 """Kind of the event that lasts while another process compiles what this one needs."""
 
 
-def njit(**options: Any) -> Callable[[Function], Function]:
-    """Apply `numba.njit` with the cache of this package; the options are the same."""
+def njit(*, per_pixel: bool = False, **options: Any) -> Callable[[Function], Function]:
+    """Apply `numba.njit` with the cache of this package.
+
+    Args:
+        per_pixel: the function is too slow to be interpreted (see `renderers.interpreting`).
+        options: of `numba.njit`.
+    """
     # Functions are called from Python or compiled code only: a wrapper for C costs a tenth of the compilation.
     options = {"cache": True, "no_cfunc_wrapper": True} | options
 
@@ -54,7 +60,10 @@ def njit(**options: Any) -> Callable[[Function], Function]:
         before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, cache_folder()  # type: ignore[attr-defined]
         try:
             compiled = numba.njit(**options)(function)
-            return cast(Function, _keep_cached(compiled) if options["cache"] else compiled)
+            if options["cache"]:
+                _keep_cached(compiled)
+            Interpretable(compiled, per_pixel, partial(_is_locked, _name(compiled)))
+            return cast(Function, compiled)
         except RuntimeError:  # nowhere to write: compiled in every process
             return cast(Function, numba.njit(**(options | {"cache": False}))(function))
         finally:
@@ -63,14 +72,18 @@ def njit(**options: Any) -> Callable[[Function], Function]:
     return decorate
 
 
-def _keep_cached(compiled: Any) -> Any:
+def _name(compiled: Any) -> str:
+    return f"{compiled.py_func.__module__}.{compiled.py_func.__qualname__}"
+
+
+def _keep_cached(compiled: Any) -> None:
     """Keep machine code until one of its sources changes, and let one process at a time compile the function.
 
     The others load what that one has saved. Numba numbers the files of a function's signatures without a lock: if two
     processes saved at once, one might find the code of the other under its own name.
     """
     compiled._cache._cache_file._source_stamp = source_digest(compiled.py_func.__module__)
-    name = f"{compiled.py_func.__module__}.{compiled.py_func.__qualname__}"
+    name = _name(compiled)
     compile_now = compiled.compile
 
     def compile_alone(signature: Any) -> Any:
@@ -82,7 +95,20 @@ def _keep_cached(compiled: Any) -> Any:
             return compile_now(signature)
 
     compiled.compile = compile_alone
-    return compiled
+
+
+def _is_locked(name: str) -> bool:
+    """Tell whether another process is compiling the function of this name."""
+    if not (fcntl and cache_folder()):
+        return False
+    try:
+        with Path(cache_folder(), ".locks", name).open("a") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
 
 
 @contextlib.contextmanager

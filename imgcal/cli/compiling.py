@@ -17,6 +17,8 @@ WAIT = "waiting for another process that compiles for this machine"
 HELP = """
 import os, sys, threading
 threading.Thread(target=lambda: (sys.stdin.read(), os._exit(1)), daemon=True).start()  # ends with its parent
+from imgcal.detection.warmup import warm_up_detection
+warm_up_detection()
 from imgcal.machine import without_garbage_collection
 with without_garbage_collection():
     from imgcal.online import warm_up_fits
@@ -78,22 +80,27 @@ def announce_compilation(hint: str = HINT) -> Iterator[list[object]]:
 
 @contextlib.contextmanager
 def help_to_compile() -> Iterator[None]:
-    """Compile in a second process what a calibration needs last, while this one imports and compiles what comes first.
+    """Compile in a second process, while this one imports modules and interprets what is not compiled yet.
 
-    The second process ends with the context: what it has not compiled by then is not needed.
+    The second process ends with the context; the next command goes on where it has stopped.
     """
     helper = None
     if is_useful():
-        with contextlib.suppress(OSError):  # alone, then
+        with contextlib.suppress(OSError):  # alone, then: everything is compiled before it is called
             helper = start_helper()
-            _helpers.append(helper)
-    try:
+    if helper is None:
         yield
+        return
+    from renderers.interpreting import interpret_first
+
+    _helpers.append(helper)
+    try:
+        with interpret_first():
+            yield
     finally:
-        if helper is not None:
-            _helpers.remove(helper)
-            with helper:
-                helper.terminate()
+        _helpers.remove(helper)
+        with helper:
+            helper.terminate()
 
 
 def is_useful() -> bool:

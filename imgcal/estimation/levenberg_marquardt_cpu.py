@@ -18,6 +18,7 @@ import torch
 from numba import prange
 from torch import Tensor
 
+from imgcal.estimation import levenberg_marquardt, linearization
 from imgcal.estimation.levenberg_marquardt import (
     FIRST_GROWTH,
     GREATEST_RELAX,
@@ -36,9 +37,11 @@ from imgcal.estimation.linearization_cpu import (
     select_state,
     turn_all,
 )
+from imgcal.estimation.robust_losses import LossName, NamedLoss
 from imgcal.geometry import RigidTransform, kernels, lens_codes
 from imgcal.types import CameraRig
 from renderers.compiling import njit
+from renderers.interpreting import without_machine_code
 
 Part = TypeVar("Part", bound=Problem | State | Solution | NormalEquations | ObjectEquations)
 
@@ -46,7 +49,7 @@ LOSS_CODES = {"squared": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
 
 
 def minimize(
-    problem: Problem, start: State, loss: str, threshold: float, max_iterations: int, tolerance: float
+    problem: Problem, start: State, loss: LossName, threshold: float, max_iterations: int, tolerance: float
 ) -> Solution:
     """Do the work of `levenberg_marquardt.minimize` for tensors on the CPU.
 
@@ -61,6 +64,9 @@ def minimize(
     if problem.uv.dtype != torch.float64:
         exact = _convert(problem, torch.float64), _convert(start, torch.float64)
         return _convert(minimize(*exact, loss, threshold, max_iterations, tolerance), problem.uv.dtype)
+    if missing := without_machine_code(_minimize_rig):
+        arguments = (problem, start, NamedLoss(loss, threshold), max_iterations, tolerance)
+        return missing.call_twin(torch.no_grad()(levenberg_marquardt.minimize), *arguments)
     count = len(problem.uv)
     if count == 1:
         return RigSolver(problem).minimize(problem, start, loss, threshold, max_iterations, tolerance)
@@ -91,9 +97,11 @@ class RigSolver:
         self._given = (*(array[0] for array in given), own_std)
 
     def minimize(
-        self, problem: Problem, start: State, loss: str, threshold: float, max_iterations: int, tolerance: float
+        self, problem: Problem, start: State, loss: LossName, threshold: float, max_iterations: int, tolerance: float
     ) -> Solution:
         """Do the work of `minimize` for a problem that differs from this one's in its observations."""
+        if without_machine_code(_minimize_rig):
+            return minimize(problem, start, loss, threshold, max_iterations, tolerance)
         uv, root_weight = (array[0] for array in _arrays((problem.uv, problem.root_weight.to(problem.uv))))
         offset = start.object_offset
         own = np.zeros_like(self._given[-1]) if offset is None else offset.detach().numpy()[0]
@@ -129,11 +137,14 @@ def _threads_of_torch() -> Iterator[None]:
         torch.set_num_threads(threads)  # must come last: numba's setting changes OpenMP's, too
 
 
-def linearize(problem: Problem, state: State, loss: str, threshold: float) -> NormalEquations:
+def linearize(problem: Problem, state: State, loss: LossName, threshold: float) -> NormalEquations:
     """Do the work of `linearization.linearize` for tensors on the CPU, without gradients; the loss as in `minimize`."""
     if problem.uv.dtype != torch.float64:
         exact = _convert(problem, torch.float64), _convert(state, torch.float64)
         return _convert(linearize(*exact, loss, threshold), problem.uv.dtype)
+    if missing := without_machine_code(linearize_rig):
+        arguments = (problem, state, NamedLoss(loss, threshold))
+        return missing.call_twin(torch.no_grad()(linearization.linearize), *arguments)
     own_std, state = _object_spread(problem, state, len(problem.uv))
     blocks = _Blocks.of(problem, len(problem.uv))
     shared, given = shared_arrays(problem), _arrays((*_problem_arrays(problem), own_std))

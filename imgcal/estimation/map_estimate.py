@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -20,7 +19,7 @@ from imgcal.estimation.linearization import (
     rig_at,
 )
 from imgcal.estimation.pose_initialization import initial_pose
-from imgcal.estimation.robust_losses import NamedLoss
+from imgcal.estimation.robust_losses import LossName, NamedLoss
 from imgcal.estimation.shape_modes import ModeEvidence
 from imgcal.geometry import RigidTransform
 from imgcal.messages import brief
@@ -42,7 +41,7 @@ class EstimationOptions:
         3.0
     """
 
-    loss: Literal["squared", "huber", "cauchy", "geman_mcclure"] = "huber"
+    loss: LossName = "huber"
     threshold: float = 3.0  # standard deviations, where the loss stops being quadratic
     max_iterations: int = 100  # per attempt; see `minimize`
     tolerance: float = 1e-4  # expected decrease of the cost (half a squared standard deviation) at which to stop

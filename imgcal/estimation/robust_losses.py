@@ -12,6 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+LossName = Literal["squared", "huber", "cauchy", "geman_mcclure"]
 RobustKernel = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
@@ -46,7 +47,7 @@ LOSSES: dict[str, RobustKernel] = {"squared": squared, "huber": huber, "cauchy":
 class NamedLoss:
     """A robust loss by name, for tensors and for compiled loops."""
 
-    name: Literal["squared", "huber", "cauchy", "geman_mcclure"]
+    name: LossName
     threshold: float = 3.0  # standard deviations, where it stops being quadratic
 
     def __call__(self, d2: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ from .lenses import (
 )
 from .object_turns import free_turns, pose_rank
 from .projection import NEAREST_DEPTH, Projection, project_components, project_kornia, resized_pixels
-from .projection_cpu import project_cpu, undistort_cpu
+from .projection_cpu import project_arrays, project_cpu, undistort_cpu
 from .rotations import (
     cross_matrix,
     euler_from_rotation,
@@ -49,6 +49,7 @@ __all__ = [
     "lens_names",
     "lens_width",
     "pose_rank",
+    "project_arrays",
     "project_components",
     "project_cpu",
     "project_kornia",

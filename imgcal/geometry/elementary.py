@@ -14,22 +14,22 @@ from torch import Tensor
 
 def sqrt(x: Tensor) -> Tensor:
     """Square root."""
-    return torch.sqrt(x)
+    return torch.sqrt(x) if isinstance(x, Tensor) else np.sqrt(x)
 
 
 def arctan(x: Tensor) -> Tensor:
     """Arctangent, rad."""
-    return torch.arctan(x)
+    return torch.arctan(x) if isinstance(x, Tensor) else np.arctan(x)
 
 
 def tan(x: Tensor) -> Tensor:
     """Tangent of an angle in rad."""
-    return torch.tan(x)
+    return torch.tan(x) if isinstance(x, Tensor) else np.tan(x)
 
 
 def minimum(x: Tensor, limit: float) -> Tensor:
     """The smaller of the two."""
-    return x.clamp_max(limit)
+    return x.clamp_max(limit) if isinstance(x, Tensor) else min(x, limit)
 
 
 @overload(sqrt)

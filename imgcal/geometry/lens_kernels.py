@@ -28,6 +28,16 @@ LEAST_RADIAL = 0.2  # lower bound in `undistort`: beyond the fold of the image t
 FOLD_SQUARES, FOLD_PARTS = FOLD_RADII.square().numpy(), FOLD_SHARES.numpy()
 
 
+def as_tuple(k, size):
+    """The first coefficients as a tuple, of which compiled code makes variables; `size` is a constant."""
+    return tuple(k[:size])
+
+
+@overload(as_tuple, prefer_literal=True)
+def _as_tuple(k, size):
+    return lambda k, size: to_fixed_tuple(k, size)
+
+
 class CompiledLens(NamedTuple):
     """The compiled functions of one model; `one` and the coefficients k are as in `LensModel`."""
 
@@ -207,7 +217,7 @@ def _image(lens: CompiledLens, size: int) -> Formula:
         per_depth = depth / (squared - radius_squared)
         log_slope = -(squared + radius_squared) / (depth * (squared - radius_squared))
         x, y = px * per_depth, py * per_depth
-        xd, yd, jxx, jxy, jyy, rr, _ = distort(1.0, x, y, to_fixed_tuple(k, size))
+        xd, yd, jxx, jxy, jyy, rr, _ = distort(1.0, x, y, as_tuple(k, size))
         return per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy
 
     return image
@@ -218,7 +228,7 @@ def _coefficients(lens: CompiledLens, size: int) -> Formula:
 
     @compile_as(lens.name, fastmath=FAST)
     def fill(x, y, rr, k, along, down, at, rows):
-        by_coefficients(x, y, rr, to_fixed_tuple(k, size), along, down, at, rows)
+        by_coefficients(x, y, rr, as_tuple(k, size), along, down, at, rows)
         for i in range(at + size, at + len(k)):
             rows[0, i], rows[1, i] = 0.0, 0.0
 
@@ -230,7 +240,7 @@ def _inverse(lens: CompiledLens, size: int) -> Formula:
 
     @compile_as(lens.name)
     def undo(xd, yd, k):
-        return inverse(xd, yd, to_fixed_tuple(k, size))
+        return inverse(xd, yd, as_tuple(k, size))
 
     return undo
 
@@ -250,7 +260,9 @@ def image_of(models, camera, px, py, depth, radius_squared, k):
         x / px; the derivative of log x with respect to depth; x, y, x^2 + y^2, the distorted x and y, and the symmetric
         Jacobian of the distortion: xx, xy, yy.
     """
-    raise NotImplementedError
+    if models is None:
+        return _usual_image(px, py, depth, radius_squared, k)
+    return _any_image(models[camera], px, py, depth, radius_squared, k)
 
 
 @overload(image_of, jit_options={"fastmath": FAST})
@@ -268,7 +280,10 @@ def by_coefficients(models, camera, x, y, rr, k, along, down, at, rows):
     The first row is for distorted x, times `along`; the second for distorted y, times `down`. Coefficients that the
     lens does not have get zero. Like `lenses.distort_by_coefficients`.
     """
-    raise NotImplementedError
+    if models is None:
+        _usual_coefficients(x, y, rr, k, along, down, at, rows)
+    else:
+        _any_coefficients(models[camera], x, y, rr, k, along, down, at, rows)
 
 
 @overload(by_coefficients, jit_options={"fastmath": FAST})
@@ -284,7 +299,7 @@ def _by_coefficients(models, camera, x, y, rr, k, along, down, at, rows):
 
 def width_of(models, k):
     """Number of coefficients, D, of an array (C, D): a constant for default lenses, so that loops are unrolled."""
-    raise NotImplementedError
+    return USUAL_WIDTH if models is None else k.shape[1]
 
 
 @overload(width_of)
@@ -296,7 +311,9 @@ def _width_of(models, k):
 
 def undistort(models, camera, xd, yd, k):
     """Undistorted x, y on the z = 1 plane, accurate to far less than a pixel; `lenses.undistort` is exact."""
-    raise NotImplementedError
+    if models is None:
+        return _usual_inverse(xd, yd, k)
+    return _any_inverse(models[camera], xd, yd, k)
 
 
 @overload(undistort)

@@ -4,18 +4,17 @@
 """
 
 # Compiled functions take their types from their arguments.
-# ruff: noqa: ANN001, ANN202
+# ruff: noqa: ANN001, ANN201, ANN202
 # mypy: allow-untyped-defs, no-check-untyped-defs
 
 from __future__ import annotations
 
 import numpy as np
 import torch
-from numba.np.unsafe.ndarray import to_fixed_tuple
 from torch import Tensor
 
 from imgcal.geometry import kernels
-from imgcal.geometry.lens_kernels import CompiledLens, chain_models, compile_as, compile_each_lens
+from imgcal.geometry.lens_kernels import CompiledLens, as_tuple, chain_models, compile_as, compile_each_lens
 from imgcal.geometry.lens_model import Formula
 from imgcal.geometry.lenses import DEFAULT, ModelNames, lens_codes
 from imgcal.geometry.projection import NEAREST_DEPTH, Projection
@@ -54,7 +53,7 @@ def project_cpu(
     image = np.empty((count, focal_length.shape[1], 4, fiducials), kind)  # u, v, depth, visible
     arrays = [np.ascontiguousarray(tensor.detach().numpy()) for tensor in given]
     sizes = np.ascontiguousarray(image_size.numpy())
-    _project(lens_codes(models, *distortion.shape[-2:]), (points, radius_squared, *arrays, sizes, image))
+    project_arrays(lens_codes(models, *distortion.shape[-2:]), (points, radius_squared, *arrays, sizes, image))
     uv, depth, visible = image[:, :, :2].swapaxes(2, 3), image[:, :, 2], image[:, :, 3] > 0
     return Projection(torch.from_numpy(uv), torch.from_numpy(depth), torch.from_numpy(visible))
 
@@ -80,7 +79,7 @@ def _projection(lens: CompiledLens, size: int) -> Formula:
                 r20, r21, r22, tz = r[2, 0], r[2, 1], r[2, 2], t[2]
                 fx, fy = focal_length[b, c]
                 cx, cy = principal_point[b, c]
-                k = to_fixed_tuple(distortion[b, c], size)
+                k = as_tuple(distortion[b, c], size)
                 width, height = kind(image_size[c, 0]) - half, kind(image_size[c, 1]) - half
                 blind_from = kind(blind(k))
                 for n in range(points.shape[2]):
@@ -105,7 +104,8 @@ _project_all = chain_models("projection", compile_each_lens(_projection))
 
 
 @njit(cache=True)
-def _project(models, given):
+def project_arrays(models, given):
+    """Fill an image (B, C, 4, N) with u, v, depth and visibility; `given` as in `project_cpu`, which calls this."""
     _project_all(models, *given)
 
 
@@ -137,7 +137,7 @@ def _inverse(lens: CompiledLens, size: int) -> Formula:
             for c in range(distorted.shape[1]):
                 if models is not None and models[c] != number:
                     continue
-                k = to_fixed_tuple(lenses[b, c], size)
+                k = as_tuple(lenses[b, c], size)
                 blind_from = blind(k)
                 for n in range(distorted.shape[2]):
                     xd, yd = distorted[b, c, n, 0], distorted[b, c, n, 1]

@@ -1,10 +1,11 @@
 from . import limits
 from .board import Board, BoardKind
 from .calibration_object import MOST_LIGHTS, CalibrationObject, Symmetry
+from .detections import UNUSABLE, BlobFlag, BlobKind, Detections
 from .differences import object_difference, rig_difference
 from .limits import BLOB_RADIUS, FIDUCIAL_RADIUS, MOST_PIXELS, SIGMA, Range, check_object, check_observations, check_rig
 from .moved_camera import Kind, MovedCamera, MovedError
-from .observations import UNUSABLE, BlobFlag, BlobKind, Detections, Observations
+from .observations import Observations
 from .parameter_vectors import pack21, unpack18, unpack21
 from .placement import CROP_MARGIN, PATCH_SIZE, CropPlacement
 from .prediction import Prediction, Views

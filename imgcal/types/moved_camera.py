@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from imgcal.errors import RefusedError
-from imgcal.types.observations import Detections
+from imgcal.types.detections import Detections
 from imgcal.types.rig import SHOWN_UNITS
 
 Kind = Literal["rotation", "position", "focal_length", "unknown"]

@@ -20,6 +20,7 @@ from imgcal.geometry import (
     lens_label,
     lens_names,
     lens_width,
+    project_arrays,
     project_components,
     project_cpu,
     resized_pixels,
@@ -29,6 +30,7 @@ from imgcal.geometry import (
 )
 from imgcal.types.volume import ConvexVolume
 from renderers import is_traced
+from renderers.interpreting import without_machine_code
 
 PINHOLE = (
     "rotation_x", "rotation_y", "rotation_z", "position_x", "position_y", "position_z", "fx", "fy", "cx", "cy",
@@ -275,6 +277,8 @@ class CameraRig:
         if points_rig.device.type != "cpu" or is_traced():
             with torch.no_grad():
                 return self.project(points_rig, radius)
+        if missing := without_machine_code(project_arrays):
+            return missing.call_twin(torch.no_grad()(self.project), points_rig, radius)
         lens = (self.focal_length, self.principal_point, self.distortion)
         return project_cpu(points_rig, self.cam_from_rig, *lens, self.image_size, radius, self.lens_model)
 

@@ -11,6 +11,7 @@ import renderers.compiling
 from imgcal.cli import compiling
 from imgcal.cli.compiling import HINT, NEEDED_LAST, WAIT, announce_compilation, help_to_compile
 from imgcal.estimation import levenberg_marquardt_cpu
+from renderers import interpreting
 
 
 def test_compiling_is_told_once_and_counted(capsys):
@@ -65,6 +66,8 @@ def test_a_second_process_helps_and_ends_with_the_command(cache, monkeypatch, ca
         while not (cache / "here").exists() and time.monotonic() < deadline:
             time.sleep(0.05)
         assert started[0].poll() is None
+        assert interpreting._patience == 1  # meanwhile
+    assert interpreting._patience is None
     assert (cache / "here").exists() and len(started) == 1
     assert started[0].returncode not in (None, 0)  # it was ended
     assert capfd.readouterr() == ("", "")
@@ -84,6 +87,12 @@ def test_no_help_where_it_is_of_no_use(cache, monkeypatch):
     (cache / "estimation_0").mkdir()
     (cache / "estimation_0" / "levenberg_marquardt_cpu._minimize_rig-1.py311.nbi").touch()
     assert not compiling.is_useful()
+
+
+def test_without_help_functions_are_compiled_before_they_are_called(cache, monkeypatch):
+    monkeypatch.setattr(compiling, "is_useful", lambda: False)
+    with help_to_compile():
+        assert interpreting._patience is None
 
 
 def test_what_shows_that_no_help_is_needed_is_a_module_of_compiled_functions():

@@ -9,6 +9,7 @@ import torch
 
 from imgcal.estimation import NormalEquations, Solution, levenberg_marquardt, levenberg_marquardt_cpu
 from imgcal.estimation.robust_losses import LOSSES
+from imgcal.geometry import project_arrays
 
 CASES = [
     ((), 1, 10, 8, None),
@@ -86,6 +87,29 @@ def test_same_minimum_with_an_object_that_is_not_exact(
         torch.testing.assert_close(
             a, b, rtol=1e-2, atol=1e-3 * float(tensors.equations.object.own.abs().max()), msg=name
         )
+
+
+def test_tensors_stand_in_for_missing_machine_code(simulate, monkeypatch) -> None:
+    case = simulate(1, snapshots=3, cameras=2, fiducials=6, radius=None, missing=0.05, noise=0.06)
+    problem = case.problem()
+    start, points = case.start(problem), problem.points.expand(1, -1, -1)
+    calls = (
+        lambda: levenberg_marquardt_cpu.minimize(problem, start, "huber", 4.0, 60, 1e-9).state.offset,
+        lambda: (
+            levenberg_marquardt_cpu.RigSolver(problem).minimize(problem, start, "huber", 4.0, 60, 1e-9).state.offset
+        ),
+        lambda: levenberg_marquardt_cpu.linearize(problem, start, "huber", 4.0).pose,
+        lambda: problem.factory.project_values(points).uv,
+    )
+    compiled = [call() for call in calls]
+    called = []
+    for function in (levenberg_marquardt_cpu._minimize_rig, levenberg_marquardt_cpu.linearize_rig, project_arrays):
+        missing = function.interpretable
+        monkeypatch.setattr(missing, "is_ready", lambda: False)
+        monkeypatch.setattr(missing, "call_twin", lambda twin, *given: called.append(twin) or twin(*given))
+    for call, expected in zip(calls, compiled, strict=True):
+        torch.testing.assert_close(call(), expected, rtol=1e-6, atol=1e-6)
+    assert len(called) == len(calls)
 
 
 def test_single_precision_stays_close(simulate) -> None:
