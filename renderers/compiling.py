@@ -62,7 +62,7 @@ def njit(*, per_pixel: bool = False, **options: Any) -> Callable[[Function], Fun
             compiled = numba.njit(**options)(function)
             if options["cache"]:
                 _keep_cached(compiled)
-            Interpretable(compiled, per_pixel, partial(_is_locked, _name(compiled)))
+            Interpretable(compiled, per_pixel, partial(is_held, _name(compiled)))
             return cast(Function, compiled)
         except RuntimeError:  # nowhere to write: compiled in every process
             return cast(Function, numba.njit(**(options | {"cache": False}))(function))
@@ -97,18 +97,35 @@ def _keep_cached(compiled: Any) -> None:
     compiled.compile = compile_alone
 
 
-def _is_locked(name: str) -> bool:
-    """Tell whether another process is compiling the function of this name."""
-    if not (fcntl and cache_folder()):
-        return False
-    try:
-        with Path(cache_folder(), ".locks", name).open("a") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    return False
+@contextlib.contextmanager
+def hold(name: str) -> Iterator[bool]:
+    """Hold a lock that all processes with the same folder know, unless another holds it.
+
+    Yields:
+        False if another process holds it. True otherwise, also on systems without such locks.
+    """
+    with contextlib.ExitStack() as stack:
+        free = True
+        with contextlib.suppress(OSError):  # a file system without locks, or a folder that cannot be written
+            if fcntl and cache_folder():
+                lock = stack.enter_context(_lock_file(name).open("a"))
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    free = False
+        yield free
+
+
+def is_held(name: str) -> bool:
+    """Tell whether another process holds a lock; the names of functions are locks while they are compiled."""
+    with hold(name) as free:
+        return not free
+
+
+def _lock_file(name: str) -> Path:
+    folder = Path(cache_folder(), ".locks")
+    folder.mkdir(exist_ok=True)
+    return folder / name
 
 
 @contextlib.contextmanager
@@ -116,9 +133,7 @@ def _lock(name: str) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):  # a file system without locks, or a folder that cannot be written
             if fcntl and cache_folder():
-                locks = Path(cache_folder(), ".locks")
-                locks.mkdir(exist_ok=True)
-                lock = stack.enter_context((locks / name).open("a"))
+                lock = stack.enter_context(_lock_file(name).open("a"))
                 try:
                     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:

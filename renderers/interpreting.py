@@ -122,7 +122,7 @@ class Interpretable:
 
     def is_ready(self) -> bool:
         """Tell whether to call the function rather than its twin: it has machine code, or is to be compiled now."""
-        if _patience is None or self.compiled.overloads or self._stored_at() is not None:
+        if _patience is None or self.compiled.overloads:
             return True
         return self.spent >= _patience * sum(one.cost for one in self._with_callees if not one.compiled.overloads)
 
@@ -139,19 +139,16 @@ class Interpretable:
                     new.append(called)
         return found
 
-    def _stored_at(self) -> int | None:
-        """When machine code of the function was stored last, in ns; None = never."""
-        cache = getattr(self.compiled._cache, "_cache_file", None)
-        with contextlib.suppress(OSError):
-            return None if cache is None else Path(cache._index_path).stat().st_mtime_ns
-        return None
-
     def _has_been_stored(self, arguments: tuple[Any, ...]) -> bool:
         """Tell whether machine code for these arguments has been stored since the last question."""
-        stored = self._stored_at()
-        if stored is None or stored == self.stored:
+        cache = self.compiled._cache
+        try:
+            stored = Path(cache._cache_file._index_path).stat().st_mtime_ns
+        except (AttributeError, OSError):  # a function that is not kept; nothing stored yet
             return False
-        self.stored, cache = stored, self.compiled._cache
+        if stored == self.stored:
+            return False
+        self.stored = stored
         types = tuple(map(self.compiled.typeof_pyval, arguments))
         return cache._index_key(types, self.compiled.targetctx.codegen()) in cache._cache_file._load_index()
 

@@ -12,20 +12,15 @@ from pathlib import Path
 import imgcal
 from imgcal.machine import usable_cores
 
+HELPER = "helper"
+"""Lock of the process that compiles in the background."""
+COMPLETE = "first-calibration"
+"""File in the folder of compiled code: all that a calibration needs is there."""
+GO_ON = b"go on"
+"""Told to the helper when the command has ended."""
 HINT = "compiling for this machine: 10 to 60 s, once; `imgcal warmup` compiles everything ahead of time"
 WAIT = "waiting for another process that compiles for this machine"
-HELP = """
-import os, sys, threading
-threading.Thread(target=lambda: (sys.stdin.read(), os._exit(1)), daemon=True).start()  # ends with its parent
-from imgcal.detection.warmup import warm_up_detection
-warm_up_detection()
-from imgcal.machine import without_garbage_collection
-with without_garbage_collection():
-    from imgcal.online import warm_up_fits
-warm_up_fits()
-"""
-NEEDED_LAST = "levenberg_marquardt_cpu.*"  # files of the cache that show that there is nothing to help with
-_helpers: list[subprocess.Popen[bytes]] = []  # running processes that compile for this one
+_helpers: list[subprocess.Popen[bytes]] = []  # processes that compile for this one
 
 
 @contextlib.contextmanager
@@ -82,34 +77,54 @@ def announce_compilation(hint: str = HINT) -> Iterator[list[object]]:
 def help_to_compile() -> Iterator[None]:
     """Compile in a second process, while this one imports modules and interprets what is not compiled yet.
 
-    The second process ends with the context; the next command goes on where it has stopped.
+    The second process goes on until all that a calibration needs is compiled, but ends if the command is interrupted.
     """
     helper = None
     if is_useful():
-        with contextlib.suppress(OSError):  # alone, then: everything is compiled before it is called
+        with contextlib.suppress(OSError):  # alone, then
             helper = start_helper()
-    if helper is None:
+    if helper is None and not is_helped():  # every function is compiled before it is called
         yield
         return
     from renderers.interpreting import interpret_first
 
-    _helpers.append(helper)
-    try:
-        with interpret_first():
+    # PyTorch's threads wait for one another in busy loops, and the helper has one of the cores.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    with interpret_first():
+        if helper is None:
             yield
-    finally:
-        _helpers.remove(helper)
-        with helper:
+            return
+        _helpers.append(helper)
+        try:
+            yield
+        except KeyboardInterrupt:
             helper.terminate()
+            helper.wait()
+            raise
+        finally:
+            if helper.stdin is not None:
+                with contextlib.suppress(BrokenPipeError):
+                    helper.stdin.write(GO_ON)
+                    helper.stdin.close()
 
 
 def is_useful() -> bool:
     """Tell whether a second process can compile beside this one, and leave it where this one finds it."""
-    if not sys.executable or usable_cores() - _load() <= 1:
-        return False
+    return bool(sys.executable) and usable_cores() - _load() > 1 and is_lacking() and not is_helped()
+
+
+def is_lacking() -> bool:
+    """Tell whether the machine code of a calibration is incomplete in the folder that processes share."""
     from renderers.compiling import cache_folder, is_shared
 
-    return is_shared() and not any(Path(cache_folder()).rglob(NEEDED_LAST))
+    return is_shared() and not Path(cache_folder(), COMPLETE).exists()
+
+
+def is_helped() -> bool:
+    """Tell whether the helper of an earlier command is still compiling."""
+    from renderers.compiling import is_held
+
+    return is_held(HELPER)
 
 
 def _load() -> float:
@@ -121,9 +136,11 @@ def _load() -> float:
 
 
 def start_helper() -> subprocess.Popen[bytes]:
-    """Compile the fits in a second process, which has this package and says nothing."""
+    """Start `imgcal.cli.compiler` in a second process, which has this package and says nothing."""
     # Not from the current folder, which anybody may have filled.
     path = os.pathsep.join(filter(None, (str(Path(imgcal.__file__).parents[1]), os.environ.get("PYTHONPATH"))))
     environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-    command, nothing = [sys.executable, "-P", "-c", HELP], subprocess.DEVNULL
-    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=nothing, stderr=nothing, env=environment)
+    command, nothing = [sys.executable, "-P", "-m", "imgcal.cli.compiler"], subprocess.DEVNULL
+    return subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=nothing, stderr=nothing, env=environment, start_new_session=True
+    )

@@ -43,6 +43,8 @@ COMMANDS = (
     "train", "evaluate", "compare", "fleet", "demo", "warmup",
 )  # fmt: skip
 """Each has a class of its name, among the arguments and in the module of its name."""
+HELPED = ("calibrate", "detect")
+"""Those that interpret functions until they are compiled."""
 DESCRIPTION = """Recalibrate infrared multi-camera rigs from images of a known calibration object.
 
 A first try: imgcal calibrate sample:O10 --rig sample:O10 --object sample:O10 --out result
@@ -120,7 +122,7 @@ def _parse(arguments: list[str], stack: contextlib.ExitStack | None) -> Runnable
         given = tyro.cli(_arguments(first), prog=f"imgcal {first}", args=options)
         _check_values(given, options)
         with end_at_once(), without_garbage_collection():  # imports take a while
-            if first == "calibrate" and stack is not None:
+            if first in HELPED and stack is not None:
                 stack.enter_context(help_to_compile())
             command = getattr(import_module(f"imgcal.cli.{first}"), first.capitalize())
         return command(**vars(given))

@@ -1,5 +1,7 @@
+import contextlib
 import os
-import time
+import subprocess
+import sys
 from pathlib import Path
 
 import numba
@@ -8,9 +10,9 @@ from numba import config
 from numba.core import event
 
 import renderers.compiling
-from imgcal.cli import compiling
-from imgcal.cli.compiling import HINT, NEEDED_LAST, WAIT, announce_compilation, help_to_compile
-from imgcal.estimation import levenberg_marquardt_cpu
+from imgcal.cli import compiler, compiling
+from imgcal.cli.compiling import HINT, WAIT, announce_compilation, help_to_compile
+from imgcal.errors import InputError
 from renderers import interpreting
 
 
@@ -54,23 +56,64 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.skipif(renderers.compiling.fcntl is None, reason="no help on Windows")
-def test_a_second_process_helps_and_ends_with_the_command(cache, monkeypatch, capfd):
-    said = "import pathlib, time, imgcal; print('a word'); "
-    monkeypatch.setattr(compiling, "HELP", said + f"pathlib.Path({str(cache / 'here')!r}).touch(); time.sleep(60)")
+@pytest.fixture
+def helpers(cache: Path, monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
+    """The helpers that are started; they wait to be told how the command has ended, and say that."""
     started = []
-    start = compiling.start_helper
-    monkeypatch.setattr(compiling, "start_helper", lambda: started.append(start()) or started[-1])
-    with help_to_compile():
-        deadline = time.monotonic() + 120
-        while not (cache / "here").exists() and time.monotonic() < deadline:
-            time.sleep(0.05)
-        assert started[0].poll() is None
+
+    def start() -> subprocess.Popen[bytes]:
+        code = f"import sys, pathlib; pathlib.Path({str(cache / 'told')!r}).write_bytes(sys.stdin.buffer.read())"
+        started.append(subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE))
+        return started[-1]
+
+    monkeypatch.setattr(compiling, "start_helper", start)
+    monkeypatch.setattr(compiling, "_helpers", [])
+    return started
+
+
+@pytest.mark.skipif(renderers.compiling.fcntl is None, reason="no help on Windows")
+@pytest.mark.parametrize("error", [None, InputError("no such file")])
+def test_a_second_process_helps_and_goes_on_after_the_command(cache, helpers, error):
+    with contextlib.suppress(InputError), help_to_compile():
+        assert helpers[0].poll() is None
         assert interpreting._patience == 1  # meanwhile
+        if error is not None:
+            raise error
     assert interpreting._patience is None
-    assert (cache / "here").exists() and len(started) == 1
-    assert started[0].returncode not in (None, 0)  # it was ended
-    assert capfd.readouterr() == ("", "")
+    assert helpers[0].wait(60) == 0 and len(helpers) == 1
+    assert (cache / "told").read_bytes() == compiling.GO_ON
+
+
+@pytest.mark.skipif(renderers.compiling.fcntl is None, reason="no help on Windows")
+def test_the_second_process_ends_if_the_command_is_interrupted(cache, helpers):
+    with pytest.raises(KeyboardInterrupt), help_to_compile():
+        raise KeyboardInterrupt
+    assert helpers[0].returncode not in (None, 0)
+
+
+@pytest.mark.skipif(renderers.compiling.fcntl is None, reason="no help on Windows")
+def test_a_command_does_not_start_a_second_helper_beside_that_of_another(cache, helpers):
+    code = f"from renderers.compiling import hold\nwith hold({compiling.HELPER!r}): print(flush=True); input()"
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", code], env=environment, **pipes) as other:
+        other.stdout.readline()
+        with help_to_compile():
+            assert interpreting._patience == 1
+        assert not helpers and not compiling.is_useful() and compiling.is_helped()
+        other.communicate(b"\n")
+    assert compiling.is_useful() and not compiling.is_helped()
+
+
+@pytest.mark.skipif(renderers.compiling.fcntl is None, reason="no help on Windows")
+def test_the_helper_leaves_a_mark_when_all_is_compiled(cache, monkeypatch):
+    monkeypatch.setattr(compiler, "_calibrate", lambda: None)
+    monkeypatch.setattr(compiler, "cache_folder", lambda: str(cache))
+    monkeypatch.setattr("imgcal.detection.warmup.warm_up_detection", lambda: None)
+    monkeypatch.setattr(compiler, "_end_if_interrupted", lambda: None)
+    assert compiling.is_useful()
+    compiler.main()
+    assert not compiling.is_useful() and not compiling.is_lacking()
 
 
 def test_no_help_where_it_is_of_no_use(cache, monkeypatch):
@@ -84,8 +127,7 @@ def test_no_help_where_it_is_of_no_use(cache, monkeypatch):
     with monkeypatch.context() as elsewhere:  # a folder of this process alone
         elsewhere.setattr(renderers.compiling, "cache_folder", lambda: "/tmp/imgcal-compiled-x")
         assert not compiling.is_useful()
-    (cache / "estimation_0").mkdir()
-    (cache / "estimation_0" / "levenberg_marquardt_cpu._minimize_rig-1.py311.nbi").touch()
+    (cache / compiling.COMPLETE).touch()
     assert not compiling.is_useful()
 
 
@@ -93,7 +135,3 @@ def test_without_help_functions_are_compiled_before_they_are_called(cache, monke
     monkeypatch.setattr(compiling, "is_useful", lambda: False)
     with help_to_compile():
         assert interpreting._patience is None
-
-
-def test_what_shows_that_no_help_is_needed_is_a_module_of_compiled_functions():
-    assert levenberg_marquardt_cpu.__file__ and Path(levenberg_marquardt_cpu.__file__).match(NEEDED_LAST)
