@@ -18,6 +18,7 @@ COMPLETE = "first-calibration"
 """File in the folder of compiled code: all that a calibration needs is there."""
 GO_ON = b"go on"
 """Told to the helper when the command has ended."""
+THREADS = "OMP_NUM_THREADS"
 HINT = "compiling for this machine: 10 to 60 s, once; `imgcal warmup` compiles everything ahead of time"
 WAIT = "waiting for another process that compiles for this machine"
 _helpers: list[subprocess.Popen[bytes]] = []  # processes that compile for this one
@@ -78,39 +79,53 @@ def help_to_compile() -> Iterator[None]:
     """Compile in a second process, while this one imports modules and interprets what is not compiled yet.
 
     The second process goes on until all that a calibration needs is compiled, but ends if the command is interrupted.
+    Without one, every function is compiled before it is called.
     """
-    helper = None
-    if is_useful():
-        with contextlib.suppress(OSError):  # alone, then
-            helper = start_helper()
-    if helper is None and not is_helped():  # every function is compiled before it is called
+    with contextlib.ExitStack() as stack:
+        helped = is_helped()
+        if not helped and is_useful():
+            with contextlib.suppress(OSError):  # alone, then
+                stack.enter_context(_run_helper())
+                helped = True
+        if helped:
+            stack.enter_context(_interpret())
         yield
-        return
+
+
+@contextlib.contextmanager
+def _run_helper() -> Iterator[None]:
+    helper = start_helper()
+    _helpers.append(helper)
+    try:
+        yield
+    except KeyboardInterrupt:
+        helper.terminate()
+        helper.wait()
+        raise
+    finally:
+        if helper.stdin is not None:
+            with contextlib.suppress(BrokenPipeError), helper.stdin:
+                helper.stdin.write(GO_ON)
+
+
+@contextlib.contextmanager
+def _interpret() -> Iterator[None]:
     from renderers.interpreting import interpret_first
 
-    # PyTorch's threads wait for one another in busy loops, and the helper has one of the cores.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    with interpret_first():
-        if helper is None:
+    # PyTorch's threads would wait for one another in busy loops, because the helper has one of the cores.
+    given = os.environ.get(THREADS)
+    os.environ[THREADS] = given or "1"
+    try:
+        with interpret_first():
             yield
-            return
-        _helpers.append(helper)
-        try:
-            yield
-        except KeyboardInterrupt:
-            helper.terminate()
-            helper.wait()
-            raise
-        finally:
-            if helper.stdin is not None:
-                with contextlib.suppress(BrokenPipeError):
-                    helper.stdin.write(GO_ON)
-                    helper.stdin.close()
+    finally:
+        if given is None:
+            del os.environ[THREADS]
 
 
 def is_useful() -> bool:
     """Tell whether a second process can compile beside this one, and leave it where this one finds it."""
-    return bool(sys.executable) and usable_cores() - _load() > 1 and is_lacking() and not is_helped()
+    return bool(sys.executable) and usable_cores() - _load() > 1 and is_lacking()
 
 
 def is_lacking() -> bool:
@@ -139,7 +154,7 @@ def start_helper() -> subprocess.Popen[bytes]:
     """Start `imgcal.cli.compiler` in a second process, which has this package and says nothing."""
     # Not from the current folder, which anybody may have filled.
     path = os.pathsep.join(filter(None, (str(Path(imgcal.__file__).parents[1]), os.environ.get("PYTHONPATH"))))
-    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": path, THREADS: "1"}
     command, nothing = [sys.executable, "-P", "-m", "imgcal.cli.compiler"], subprocess.DEVNULL
     return subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=nothing, stderr=nothing, env=environment, start_new_session=True

@@ -73,13 +73,14 @@ def helpers(cache: Path, monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Pop
 
 @pytest.mark.skipif(renderers.compiling.fcntl is None, reason="no help on Windows")
 @pytest.mark.parametrize("error", [None, InputError("no such file")])
-def test_a_second_process_helps_and_goes_on_after_the_command(cache, helpers, error):
+def test_a_second_process_helps_and_goes_on_after_the_command(cache, helpers, monkeypatch, error):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     with contextlib.suppress(InputError), help_to_compile():
         assert helpers[0].poll() is None
-        assert interpreting._patience == 1  # meanwhile
+        assert interpreting._patience == 1 and os.environ["OMP_NUM_THREADS"] == "1"  # meanwhile
         if error is not None:
             raise error
-    assert interpreting._patience is None
+    assert interpreting._patience is None and "OMP_NUM_THREADS" not in os.environ
     assert helpers[0].wait(60) == 0 and len(helpers) == 1
     assert (cache / "told").read_bytes() == compiling.GO_ON
 
@@ -100,9 +101,9 @@ def test_a_command_does_not_start_a_second_helper_beside_that_of_another(cache, 
         other.stdout.readline()
         with help_to_compile():
             assert interpreting._patience == 1
-        assert not helpers and not compiling.is_useful() and compiling.is_helped()
+        assert not helpers and compiling.is_helped()
         other.communicate(b"\n")
-    assert compiling.is_useful() and not compiling.is_helped()
+    assert not compiling.is_helped()
 
 
 @pytest.mark.skipif(renderers.compiling.fcntl is None, reason="no help on Windows")
@@ -114,6 +115,14 @@ def test_the_helper_leaves_a_mark_when_all_is_compiled(cache, monkeypatch):
     assert compiling.is_useful()
     compiler.main()
     assert not compiling.is_useful() and not compiling.is_lacking()
+
+
+@pytest.mark.skipif(renderers.compiling.fcntl is None, reason="no help on Windows")
+def test_the_helper_calibrates_the_sample_and_says_nothing():
+    with compiling.start_helper() as helper:
+        helper.communicate(compiling.GO_ON)
+    assert helper.returncode == 0
+    assert not compiling.is_lacking()
 
 
 def test_no_help_where_it_is_of_no_use(cache, monkeypatch):
