@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import os
+import statistics
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,6 +20,8 @@ COMPLETE = "first-calibration"
 """File in the folder of compiled code: all that a calibration needs is there."""
 GO_ON = b"go on"
 """Told to the helper when the command has ended."""
+LOOKS = 9
+"""Counts of running processes, of which the median counts."""
 THREADS = "OMP_NUM_THREADS"
 HINT = "compiling for this machine: 10 to 60 s, once; `imgcal warmup` compiles everything ahead of time"
 WAIT = "waiting for another process that compiles for this machine"
@@ -125,7 +129,7 @@ def _interpret() -> Iterator[None]:
 
 def is_useful() -> bool:
     """Tell whether a second process can compile beside this one, and leave it where this one finds it."""
-    return bool(sys.executable) and usable_cores() - _load() > 1 and is_lacking()
+    return bool(sys.executable) and is_lacking() and usable_cores() - _load() > 1
 
 
 def is_lacking() -> bool:
@@ -143,11 +147,24 @@ def is_helped() -> bool:
 
 
 def _load() -> float:
-    """Processes that wanted a core within the last minute: one that is busy gains nothing from another process."""
+    """Other processes that want a core: this one and a helper gain nothing if they have to share one.
+
+    The average of the last minute would count the installation that comes right before the first command.
+    """
+    try:
+        return statistics.median(_count_running() for _ in range(LOOKS))
+    except OSError:  # not Linux
+        pass
     try:
         return os.getloadavg()[0]
     except (AttributeError, OSError):  # not known on this system
         return 0.0
+
+
+def _count_running() -> int:
+    """Count the other processes of this machine that are running or waiting for a core, in a millisecond."""
+    time.sleep(0.001)
+    return int(Path("/proc/loadavg").read_text("ascii").split()[3].split("/")[0]) - 1
 
 
 def start_helper() -> subprocess.Popen[bytes]:

@@ -52,7 +52,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(renderers.compiling, "cache_folder", lambda: str(tmp_path))
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
-    monkeypatch.setattr(os, "getloadavg", lambda: (0.5, 0.5, 0.5), raising=False)
+    monkeypatch.setattr(compiling, "_load", lambda: 0.5)
     return tmp_path
 
 
@@ -131,13 +131,26 @@ def test_no_help_where_it_is_of_no_use(cache, monkeypatch):
         one.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)
         assert not compiling.is_useful()
     with monkeypatch.context() as busy:
-        busy.setattr(os, "getloadavg", lambda: (1.5, 0.5, 0.5), raising=False)
+        busy.setattr(compiling, "_load", lambda: 1.0)
         assert not compiling.is_useful()
     with monkeypatch.context() as elsewhere:  # a folder of this process alone
         elsewhere.setattr(renderers.compiling, "cache_folder", lambda: "/tmp/imgcal-compiled-x")
         assert not compiling.is_useful()
     (cache / compiling.COMPLETE).touch()
     assert not compiling.is_useful()
+
+
+def test_processes_that_run_now_count_and_not_those_of_a_minute_ago(tmp_path, monkeypatch):
+    running = iter("123456789")
+    monkeypatch.setattr(Path, "read_text", lambda self, encoding: f"9.00 5.00 2.00 {next(running)}/300 4711\n")
+    assert compiling._load() == 5 - 1  # without this process
+
+    def refuse(self: Path, encoding: str) -> str:
+        raise FileNotFoundError(self)
+
+    monkeypatch.setattr(Path, "read_text", refuse)
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.7, 0.5, 0.5), raising=False)
+    assert compiling._load() == 0.7
 
 
 def test_without_help_functions_are_compiled_before_they_are_called(cache, monkeypatch):
