@@ -38,15 +38,16 @@ except ImportError:  # Windows
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+LOCKS = ".locks"
 WAITING = "imgcal:waiting"
 """Kind of the event that lasts while another process compiles what this one needs."""
 
 
-def njit(*, per_pixel: bool = False, **options: Any) -> Callable[[Function], Function]:
+def njit(*, heavy: bool = False, **options: Any) -> Callable[[Function], Function]:
     """Apply `numba.njit` with the cache of this package.
 
     Args:
-        per_pixel: the function is too slow to be interpreted (see `renderers.interpreting`).
+        heavy: the function treats every pixel or pair, and is too slow to be interpreted (`renderers.interpreting`).
         options: of `numba.njit`.
     """
     # Functions are called from Python or compiled code only: a wrapper for C costs a tenth of the compilation.
@@ -62,7 +63,7 @@ def njit(*, per_pixel: bool = False, **options: Any) -> Callable[[Function], Fun
             compiled = numba.njit(**options)(function)
             if options["cache"]:
                 _keep_cached(compiled)
-            Interpretable(compiled, per_pixel, partial(is_held, _name(compiled)))
+            Interpretable(compiled, heavy, partial(is_held, _name(compiled)))
             return cast(Function, compiled)
         except RuntimeError:  # nowhere to write: compiled in every process
             return cast(Function, numba.njit(**(options | {"cache": False}))(function))
@@ -91,55 +92,56 @@ def _keep_cached(compiled: Any) -> None:
             return compile_now(signature)
         # Numba's own lock comes first, as it does for a function that is compiled on behalf of another: threads that
         # took the two in different orders would wait for each other.
-        with global_compiler_lock, _lock(name):
+        with global_compiler_lock, hold(name, wait=True):
             return compile_now(signature)
 
     compiled.compile = compile_alone
 
 
 @contextlib.contextmanager
-def hold(name: str) -> Iterator[bool]:
+def hold(name: str, wait: bool = False) -> Iterator[bool]:
     """Hold a lock that all processes with the same folder know, unless another holds it.
 
+    Args:
+        name: of the lock; functions are locks while they are compiled.
+        wait: until the other gives it up.
+
     Yields:
-        False if another process holds it. True otherwise, also on systems without such locks.
+        Whether the lock is held. True also on systems without such locks.
     """
+    free = True
     with contextlib.ExitStack() as stack:
-        free = True
         with contextlib.suppress(OSError):  # a file system without locks, or a folder that cannot be written
             if fcntl and cache_folder():
                 lock = stack.enter_context(_lock_file(name).open("a"))
                 try:
                     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
-                    free = False
+                    free = wait
+                    if wait:
+                        with event.trigger_event(WAITING, data=name):
+                            fcntl.flock(lock, fcntl.LOCK_EX)
         yield free
 
 
 def is_held(name: str) -> bool:
-    """Tell whether another process holds a lock; the names of functions are locks while they are compiled."""
-    with hold(name) as free:
-        return not free
+    """Tell whether a lock is held, by another process or another thread."""
+    with contextlib.suppress(FileNotFoundError):
+        if fcntl and cache_folder():
+            with Path(cache_folder(), LOCKS, name).open() as lock:
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    return True
+                except OSError:  # a file system without locks
+                    return False
+    return False
 
 
 def _lock_file(name: str) -> Path:
-    folder = Path(cache_folder(), ".locks")
+    folder = Path(cache_folder(), LOCKS)
     folder.mkdir(exist_ok=True)
     return folder / name
-
-
-@contextlib.contextmanager
-def _lock(name: str) -> Iterator[None]:
-    with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError):  # a file system without locks, or a folder that cannot be written
-            if fcntl and cache_folder():
-                lock = stack.enter_context(_lock_file(name).open("a"))
-                try:
-                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    with event.trigger_event(WAITING, data=name):
-                        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
 
 
 class _Rest(event.Listener):

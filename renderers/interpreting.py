@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -23,7 +24,7 @@ Result = TypeVar("Result")
 
 SECONDS_PER_BYTE = 6e-4
 """Seconds that a function takes to compile for each byte of its bytecode, roughly."""
-LARGEST = 100_000
+MOST_ELEMENTS = 20_000
 """Elements of 8 bytes in the arrays of a call that is interpreted; pixels, which have fewer bytes, do not count."""
 LOOK_EVERY = 0.05
 """Seconds between looks for machine code of another process."""
@@ -37,7 +38,7 @@ def interpret_first(patience: float = 1.0) -> Iterator[None]:
 
     Args:
         patience: a function is compiled once interpreting it has taken this many times the estimated time of its
-            compilation; 0 = at once, unless another process is compiling it; infinite = never.
+            compilation, or if its arrays are large; 0 = at once; infinite = only if they are large.
     """
     global _patience
     before, _patience = _patience, patience
@@ -51,7 +52,7 @@ class _Thread(threading.local):
     """What a thread is doing."""
 
     interpreting = False
-    elsewhere = 0.0  # seconds in functions that the one being interpreted has called
+    called = 0.0  # seconds in functions that the one being interpreted has called
 
 
 _thread = _Thread()
@@ -60,40 +61,42 @@ _thread = _Thread()
 class Interpretable:
     """A compiled function that can be interpreted, and how long that has taken so far."""
 
-    def __init__(self, compiled: Any, per_pixel: bool, is_compiled_elsewhere: Callable[[], bool]) -> None:
+    def __init__(self, compiled: Any, heavy: bool, is_being_compiled: Callable[[], bool]) -> None:
         """Decide from now on, whenever there is no machine code for the arguments of a call, what is called.
 
         Args:
             compiled: numba's dispatcher.
-            per_pixel: interpret it only while another process is compiling it.
-            is_compiled_elsewhere: tells whether another process is compiling it now.
+            heavy: interpret it only while it is being compiled.
+            is_being_compiled: tells whether another process, or another thread, is compiling it.
         """
-        self.compiled, self.is_compiled_elsewhere = compiled, is_compiled_elsewhere
-        self.compile, compiled._compile_for_args = compiled._compile_for_args, self.choose
+        self.compiled, self.is_being_compiled = compiled, is_being_compiled
+        self.compile_for, compiled._compile_for_args = compiled._compile_for_args, self.choose
         self.function, code = compiled.py_func, compiled.py_func.__code__
         self.variadic = bool(code.co_flags & inspect.CO_VARARGS)
-        self.cost = 0.0 if per_pixel else SECONDS_PER_BYTE * len(code.co_code)
-        self.spent, self.looked, self.stored = 0.0, 0.0, 0
+        self.seconds = SECONDS_PER_BYTE * len(code.co_code)  # of compilation
+        self.limit = 0.0 if heavy else self.seconds
+        self.spent, self.last_look = 0.0, 0.0
+        self.index: tuple[int, set[Any]] = (0, set())  # when machine code was stored last, and for which arguments
         compiled.interpretable = self
 
     def choose(self, *arguments: Any, **named: Any) -> Any:
         """Return what is to be called with these arguments: machine code, or Python."""
-        if _patience is None or named:
-            return self.compile(*arguments, **named)
+        if _patience is None or named or self.function.__defaults__:
+            return self.compile_for(*arguments, **named)
         now = time.perf_counter()
-        if now - self.looked > LOOK_EVERY:
-            self.looked = now
-            if self._has_been_stored(arguments):
-                return self._load(*arguments)
-        is_due = self.spent >= _patience * self.cost or _count_elements(arguments) > LARGEST
-        return self._load(*arguments) if is_due and not self.is_compiled_elsewhere() else self.interpret
+        if now - self.last_look > LOOK_EVERY:
+            self.last_look = now
+            if self._is_stored(arguments):
+                return self._compile(*arguments)
+        is_due = self._has_been_patient(self.limit) or _count_elements(arguments) > MOST_ELEMENTS
+        return self._compile(*arguments) if is_due and not self.is_being_compiled() else self.interpret
 
     def interpret(self, *arguments: Any) -> Any:
         """Call the function as Python, and count the time without that of the functions that it calls."""
         if self.variadic:  # numba packs the rest
             arguments = (*arguments[:-1], *arguments[-1])
-        outermost, around = not _thread.interpreting, _thread.elsewhere
-        _thread.interpreting, _thread.elsewhere = True, 0.0
+        outermost, around = not _thread.interpreting, _thread.called
+        _thread.interpreting, _thread.called = True, 0.0
         started = time.thread_time()
         try:
             if not outermost:
@@ -102,8 +105,8 @@ class Interpretable:
                 return self.function(*arguments)
         finally:
             taken = time.thread_time() - started
-            self.spent += taken - _thread.elsewhere
-            _thread.interpreting, _thread.elsewhere = not outermost, around + taken
+            self.spent += taken - _thread.called
+            _thread.interpreting, _thread.called = not outermost, around + taken
 
     def call_twin(self, twin: Callable[..., Result], *arguments: Any) -> Result:
         """Call another function that does the same, and count its time."""
@@ -113,44 +116,52 @@ class Interpretable:
         finally:
             self.spent += time.thread_time() - started
 
-    def _load(self, *arguments: Any) -> Any:
+    def _compile(self, *arguments: Any) -> Any:
         started = time.thread_time()
         try:
-            return self.compile(*arguments)
+            return self.compile_for(*arguments)
         finally:
-            _thread.elsewhere += time.thread_time() - started
+            _thread.called += time.thread_time() - started
 
     def is_ready(self) -> bool:
         """Tell whether to call the function rather than its twin: it has machine code, or is to be compiled now."""
         if _patience is None or self.compiled.overloads:
             return True
-        return self.spent >= _patience * sum(one.cost for one in self._with_callees if not one.compiled.overloads)
+        seconds = sum(one.seconds for one in self._with_callees if not one.compiled.overloads)
+        return self._has_been_patient(seconds) and not self.is_being_compiled()
+
+    def _has_been_patient(self, seconds: float) -> bool:
+        """Tell whether calls without machine code have taken long enough, if compiling it takes some seconds."""
+        return _patience is not None and not math.isinf(_patience) and self.spent >= _patience * seconds
 
     @cached_property
     def _with_callees(self) -> set[Interpretable]:
-        """The function and all that have to be compiled with it."""
+        """The function and those that it calls, directly or not."""
         found, new = {self}, [self]
         while new:
-            named = inspect.getclosurevars(new.pop().function)
-            for value in (*named.globals.values(), *named.nonlocals.values()):
+            function = new.pop().function
+            named = inspect.getclosurevars(function)
+            values = [*named.globals.values(), *named.nonlocals.values()]
+            modules = filter(inspect.ismodule, values)
+            values += [getattr(module, name, None) for module in modules for name in named.unbound]
+            for value in values:
                 called: Interpretable | None = getattr(value, "interpretable", None)
                 if called is not None and called not in found:
                     found.add(called)
                     new.append(called)
         return found
 
-    def _has_been_stored(self, arguments: tuple[Any, ...]) -> bool:
-        """Tell whether machine code for these arguments has been stored since the last question."""
+    def _is_stored(self, arguments: tuple[Any, ...]) -> bool:
+        """Tell whether machine code for these arguments is in the cache."""
         cache = self.compiled._cache
         try:
             stored = Path(cache._cache_file._index_path).stat().st_mtime_ns
         except (AttributeError, OSError):  # a function that is not kept; nothing stored yet
             return False
-        if stored == self.stored:
-            return False
-        self.stored = stored
+        if stored != self.index[0]:
+            self.index = stored, set(cache._cache_file._load_index())
         types = tuple(map(self.compiled.typeof_pyval, arguments))
-        return cache._index_key(types, self.compiled.targetctx.codegen()) in cache._cache_file._load_index()
+        return cache._index_key(types, self.compiled.targetctx.codegen()) in self.index[1]
 
 
 def without_machine_code(function: Any) -> Interpretable | None:

@@ -298,7 +298,7 @@ def _score_pose(turn, shift, points, order, image, least):
     x, y, z = shift
     focal, raster, origin, per_pixel = image
     height, width = raster.shape
-    total = 0.0
+    total = np.float64(0)
     for i in range(len(order)):
         p = points[order[i]]
         depth = turn[2, 0] * p[0] + turn[2, 1] * p[1] + turn[2, 2] * p[2] + z
@@ -327,7 +327,8 @@ def _rasterize(uv, count, cell, origin):
     for c in range(cameras):
         if count[c] == 0:
             continue
-        low_u, low_v, high_u, high_v = uv[c, 0, 0], uv[c, 0, 1], uv[c, 0, 0], uv[c, 0, 1]
+        low_u, low_v = float(uv[c, 0, 0]), float(uv[c, 0, 1])
+        high_u, high_v = low_u, low_v
         for m in range(1, count[c]):
             low_u, high_u = min(low_u, uv[c, m, 0]), max(high_u, uv[c, m, 0])
             low_v, high_v = min(low_v, uv[c, m, 1]), max(high_v, uv[c, m, 1])

@@ -20,7 +20,7 @@ REDUNDANCY = 0.4
 """Weight of pairs of cameras: ten cameras give 45 distances from 20 coordinates, less three of the point."""
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def epipolar_equations(xy, start, rotation, position, focal, scale, width, chance, information, gradient):
     """Fill in the normal equations of whitened parameters, and return the cost and the sum of weights.
 
@@ -110,7 +110,7 @@ def epipolar_equations(xy, start, rotation, position, focal, scale, width, chanc
     return cost, total
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def _essential_matrix(rotation1, rotation2, position1, position2, essential):
     """Fill in E: x1 E x2 = 0 for images x1, x2 (homogeneous, on the planes z = 1) of one point."""
     px, py, pz = position2[0] - position1[0], position2[1] - position1[1], position2[2] - position1[2]
@@ -121,7 +121,7 @@ def _essential_matrix(rotation1, rotation2, position1, position2, essential):
             essential[m, k] = rotation1[m, 0] * nx + rotation1[m, 1] * ny + rotation1[m, 2] * nz
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def _ray(rotation, blob):
     """Direction of a blob in the rig's frame."""
     return (
@@ -131,7 +131,7 @@ def _ray(rotation, blob):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def _are_in_front(one, two, rotation1, rotation2, position1, position2):
     """Tell whether two rays are nearest to each other in front of both cameras."""
     ax, ay, az = _ray(rotation1, one)
@@ -142,7 +142,7 @@ def _are_in_front(one, two, rotation1, rotation2, position1, position2):
     return pa * bb - pb * ab > 0 and pa * ab - pb * aa > 0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def _distance_jacobian(one, two, rotation1, rotation2, position1, position2, focal1, focal2, jacobian):
     """Fill in the derivatives of the distance (px) of two blobs from showing one point (Sampson's)."""
     x1, y1, x2, y2 = one[0], one[1], two[0], two[1]
@@ -174,7 +174,7 @@ def _distance_jacobian(one, two, rotation1, rotation2, position1, position2, foc
         jacobian[k] /= spread
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def image_equations(
     uv, start, point, point_start, rotation, position, focal, scale, width, chance, information, gradient
 ):
@@ -243,7 +243,7 @@ def image_equations(
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def _camera_point(rotation, position, point):
     """A point on the plane z = 1 of a camera, and its depth, at least 1 mm."""
     x, y, z = point[0] - position[0], point[1] - position[1], point[2] - position[2]

@@ -32,7 +32,7 @@ NEIGHBOUR = 3
 """Index of the neighbour whose distance defines the local density of blobs."""
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def find_lights(xy, start, rotation, position, gate, half, least, witnesses, chosen, point, odds, margin):
     """Fill in the markers of one moment, most probable first, and return their number.
 
@@ -136,7 +136,7 @@ def find_lights(xy, start, rotation, position, gate, half, least, witnesses, cho
     return rows
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def find_all_lights(xy, start, rotation, position, gate, half, least, witnesses, chosen, point, odds, margin, moment):
     """Do the work of `find_lights` for successive moments: `start` (S, C + 1); return the number of rows.
 
@@ -158,7 +158,7 @@ def find_all_lights(xy, start, rotation, position, gate, half, least, witnesses,
     return rows
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def _prepare(xy, start, rotation, position, half, ray, density):
     """Fill in unit rays in the rig's frame and the local densities of blobs; return the volume of positions, mm^3."""
     cameras = len(position)
@@ -190,12 +190,12 @@ def _prepare(xy, start, rotation, position, half, ray, density):
     return max(apart, 1.0) ** 3
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def _length(x, y, z):
     return math.sqrt(x * x + y * y + z * z)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def _meet(d1, d2, p1, p2, gate1, gate2, place):
     """Tell whether two rays nearly meet in front of both cameras, and fill in the midpoint."""
     bx, by, bz = p2[0] - p1[0], p2[1] - p1[1], p2[2] - p1[2]
@@ -216,7 +216,7 @@ def _meet(d1, d2, p1, p2, gate1, gate2, place):
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def _explore(xy, start, ray, density, rotation, position, gate, half, used, volume, witnesses, place, hit):
     """Alternate between choosing blobs near a position and triangulating it from them; return log odds and cameras."""
     seen, value, information = 0, -np.inf, np.empty((3, 3))
@@ -254,7 +254,7 @@ def _explore(xy, start, ray, density, rotation, position, gate, half, used, volu
     return value + 1.5 * math.log(2 * math.pi) - 0.5 * math.log(determinant) - math.log(volume), seen
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def _image(rotation, position, place):
     """A position on the plane z = 1 of a camera, and its depth."""
     x, y, z = place[0] - position[0], place[1] - position[1], place[2] - position[2]
@@ -264,7 +264,7 @@ def _image(rotation, position, place):
     return across / depth, down / depth, depth
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def _solve(ray, position, gate, hit, place, information):
     """Move a position to where its rays pass nearest, and fill in its information (3, 3), 1 / mm^2."""
     target = np.zeros(3)
@@ -293,7 +293,7 @@ def _solve(ray, position, gate, hit, place, information):
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def _determinant(m):
     return (
         m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
@@ -302,7 +302,7 @@ def _determinant(m):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def _note_rival(hits, value, owner, odds, margin, rows):
     """Lower the margin of markers whose blobs another one would combine with at least two others."""
     total = 0
@@ -316,7 +316,7 @@ def _note_rival(hits, value, owner, odds, margin, rows):
             margin[row] = min(margin[row], odds[row] - value)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", heavy=True)
 def _drop_doubtful(xy, start, rotation, position, gate, chosen, point, owner, rows):
     """Remove blobs if a blob nearby may equally be the marker, alone or in exchange."""
     doubtful = np.zeros((rows, len(gate)), dtype=np.bool_)

@@ -2,34 +2,47 @@
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import io
 import os
-import sys
 import tempfile
 import threading
-from pathlib import Path
+import time
 
-from imgcal.cli.compiling import COMPLETE, GO_ON, HELPER
-from renderers.compiling import cache_folder, hold
+from imgcal.cli.compiling import GO_ON, HELPER, completion_mark
+from renderers.compiling import hold
 
 SAMPLE = "sample:O10"
+GIVE_UP = 10.0
+"""Seconds for tidying up after an interruption."""
 
 
 def main() -> None:
-    """Compile, what the calibration meets first before the rest; nothing if another process does so already."""
+    """Compile first what the calibration needs first, then the rest; nothing if another process does so already."""
     threading.Thread(target=_end_if_interrupted, daemon=True).start()
     with hold(HELPER) as free:
-        if free:
-            from imgcal.detection.warmup import warm_up_detection
+        if not free:
+            return
+        try:
+            from imgcal.detection import warm_up_detection
 
             warm_up_detection()
             _calibrate()
-            Path(cache_folder(), COMPLETE).touch()
+        except Exception as error:  # trying it again with each command would not help
+            completion_mark().write_text(f"{type(error).__name__}: {error}\n", "utf-8")
+        else:
+            completion_mark().touch()
 
 
 def _end_if_interrupted() -> None:
-    if sys.stdin.buffer.read() != GO_ON:
+    """Read how the command has ended, without Python's buffer: a thread that waits in that would abort the process."""
+    said = b""
+    while part := os.read(0, len(GO_ON)):
+        said += part
+    if said != GO_ON:
+        _thread.interrupt_main()
+        time.sleep(GIVE_UP)
         os._exit(1)
 
 

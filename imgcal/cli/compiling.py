@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import statistics
 import subprocess
@@ -16,10 +17,8 @@ from imgcal.machine import usable_cores
 
 HELPER = "helper"
 """Lock of the process that compiles in the background."""
-COMPLETE = "first-calibration"
-"""File in the folder of compiled code: all that a calibration needs is there."""
 GO_ON = b"go on"
-"""Told to the helper when the command has ended."""
+"""Sent to the helper when the command has ended."""
 LOOKS = 9
 """Counts of running processes, of which the median counts."""
 THREADS = "OMP_NUM_THREADS"
@@ -100,31 +99,34 @@ def help_to_compile() -> Iterator[None]:
 def _run_helper() -> Iterator[None]:
     helper = start_helper()
     _helpers.append(helper)
+    said = GO_ON
     try:
         yield
     except KeyboardInterrupt:
-        helper.terminate()
-        helper.wait()
+        said = b""  # it ends, too
         raise
     finally:
+        _helpers.remove(helper)
         if helper.stdin is not None:
             with contextlib.suppress(BrokenPipeError), helper.stdin:
-                helper.stdin.write(GO_ON)
+                helper.stdin.write(said)
 
 
 @contextlib.contextmanager
 def _interpret() -> Iterator[None]:
     from renderers.interpreting import interpret_first
 
-    # PyTorch's threads would wait for one another in busy loops, because the helper has one of the cores.
+    # PyTorch's threads wait for one another in busy loops, and the helper has one of the cores.
     given = os.environ.get(THREADS)
-    os.environ[THREADS] = given or "1"
+    os.environ[THREADS] = given or str(max(1, usable_cores() - 1))
     try:
         with interpret_first():
             yield
     finally:
         if given is None:
-            del os.environ[THREADS]
+            os.environ.pop(THREADS, None)
+        else:
+            os.environ[THREADS] = given
 
 
 def is_useful() -> bool:
@@ -134,9 +136,28 @@ def is_useful() -> bool:
 
 def is_lacking() -> bool:
     """Tell whether the machine code of a calibration is incomplete in the folder that processes share."""
-    from renderers.compiling import cache_folder, is_shared
+    import numba
 
-    return is_shared() and not Path(cache_folder(), COMPLETE).exists()
+    from renderers.compiling import is_shared
+
+    return not numba.config.DISABLE_JIT and is_shared() and not completion_mark().exists()  # type: ignore[attr-defined]
+
+
+def completion_mark() -> Path:
+    """The file that says, in the folder of compiled code, that all that a calibration needs is there.
+
+    Its name depends on what the code depends on: Python, numba, the processor and the sources.
+    """
+    import numba
+    from llvmlite.binding import get_host_cpu_name  # type: ignore[import-untyped]
+
+    from renderers.compiling import cache_folder
+
+    package = Path(imgcal.__file__).parents[1]
+    files = sorted(path for name in ("imgcal", "renderers") for path in (package / name).rglob("*.py"))
+    said = [sys.implementation.cache_tag, numba.__version__, get_host_cpu_name()]
+    said += [f"{path.relative_to(package)} {path.stat().st_size} {path.stat().st_mtime_ns}" for path in files]
+    return Path(cache_folder(), f"complete-{hashlib.sha256(chr(10).join(said).encode()).hexdigest()[:16]}")
 
 
 def is_helped() -> bool:
@@ -151,10 +172,8 @@ def _load() -> float:
 
     The average of the last minute would count the installation that comes right before the first command.
     """
-    try:
+    with contextlib.suppress(OSError, ValueError, IndexError):  # not Linux
         return statistics.median(_count_running() for _ in range(LOOKS))
-    except OSError:  # not Linux
-        pass
     try:
         return os.getloadavg()[0]
     except (AttributeError, OSError):  # not known on this system

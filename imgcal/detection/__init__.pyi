@@ -4,6 +4,7 @@ from .checks import Frame
 from .detector import detect, detect_frame, detect_snapshot
 from .options import DetectionOptions
 from .populations import drop_dim
+from .warmup import warm_up_detection
 
 __all__ = [
     "Blobs",
@@ -15,4 +16,5 @@ __all__ = [
     "drop_dim",
     "require_board",
     "to_detections",
+    "warm_up_detection",
 ]

@@ -134,7 +134,7 @@ def block_means(frame: Frame, options: DetectionOptions, scale: int) -> Frame:
     return scale - means if options.polarity == "dark" else means
 
 
-@njit(cache=True, nogil=True, per_pixel=True)
+@njit(cache=True, nogil=True, heavy=True)
 def _average(frame, sums, means):
     """Compute block means in one pass over the frame, which exceeds the cache; `sums` (4 Q,) is scratch."""
     height, width = frame.shape
@@ -162,7 +162,7 @@ def _levels(contrast: NDArray[np.generic], options: DetectionOptions, scale: int
     return float(sample[sample.size // 2]), level
 
 
-@njit(cache=True, nogil=True, per_pixel=True)
+@njit(cache=True, nogil=True, heavy=True)
 def _select(contrast, local_peak, background, floor, level):
     """Select bright blocks and their non-empty neighbours: indices (K,), base and excess."""
     columns, count = contrast.shape[1], 0
@@ -182,7 +182,7 @@ def _select(contrast, local_peak, background, floor, level):
     return blocks[:count], base, excess
 
 
-@njit(cache=True, nogil=True, per_pixel=True)
+@njit(cache=True, nogil=True, heavy=True)
 def _smooth_tiles(frame, blocks, tile, invert):
     """Number the tiles, and average the 3 x 3 pixels around each of their pixels: (K, 4, 4), -1 outside the frame.
 
@@ -258,7 +258,7 @@ def _split(blocks, base, tile, smooth, labels, count, saturation, level):
     return parted
 
 
-@njit(cache=True, nogil=True, per_pixel=True)
+@njit(cache=True, nogil=True, heavy=True)
 def _highest(labels, k, values):
     """Largest value of the components with pixels in a tile, at least 0."""
     highest = 0.0
@@ -300,13 +300,13 @@ def _parents(merged, labels, count):
     return parents
 
 
-@njit(cache=True, nogil=True, per_pixel=True)
+@njit(cache=True, nogil=True, heavy=True)
 def _place(tile, v, u):
     """Flat index of a pixel in the tiles; coordinates start at the empty blocks around the frame."""
     return np.uint32(tile[np.uint32(v) >> 2, np.uint32(u) >> 2] * BLOCK * BLOCK + (v & 3) * BLOCK + (u & 3))
 
 
-@njit(cache=True, nogil=True, per_pixel=True)
+@njit(cache=True, nogil=True, heavy=True)
 def _connect(blocks, tile, smooth, level, labels, largest):
     """Label connected components (8-neighbourhood) of pixels above their tile's level (K,) from 1; 0 elsewhere.
 
@@ -344,7 +344,7 @@ def _corner(block, tile):
     return BLOCK * (block // columns + 1), BLOCK * (block % columns + 1)
 
 
-@njit(cache=True, nogil=True, per_pixel=True)
+@njit(cache=True, nogil=True, heavy=True)
 def _fill(flat, tile, v, u, number, stack, box):
     """Label the component of a marked pixel, and compute its box; coordinates as in `_place`."""
     box[0], box[1], box[2], box[3] = u, v, u, v

@@ -104,7 +104,7 @@ def _is_blob(p):
     return p[0] > 0 and p[1] > 0 and p[2] > 0 and p[2] * p[4] - p[3] * p[3] > 1e-3 and abs(p[5] + p[6]) < 1e3
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", per_pixel=True)
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", heavy=True)
 def _draw(rows, pixels, parameters):
     """Evaluate derivatives and residuals of all pixels (columns); return the sum of the squared residuals."""
     height, edge, xx, xy, yy, x0, y0 = parameters.astype(np.float32)
@@ -138,7 +138,7 @@ def _draw(rows, pixels, parameters):
     return float(cost)
 
 
-@njit(cache=True, nogil=True, fastmath=True, per_pixel=True)
+@njit(cache=True, nogil=True, fastmath=True, heavy=True)
 def _products(rows, pixels):
     """Sum the products of derivatives and residuals: lower triangle (8, 8)."""
     products = np.empty((PARAMETERS + 1, PARAMETERS + 1))

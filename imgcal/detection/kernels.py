@@ -151,7 +151,7 @@ def _area(frame, box, u, v, half):
     return (top - MARGIN, left - MARGIN), bottom - top + 1 + 2 * MARGIN, right - left + 1 + 2 * MARGIN
 
 
-@njit(cache=True, nogil=True, per_pixel=True)
+@njit(cache=True, nogil=True, heavy=True)
 def _grey(frame, v, u, invert):
     """Grey value of a pixel; for dark blobs it is subtracted from `invert` (-1 = bright).
 
@@ -161,7 +161,7 @@ def _grey(frame, v, u, invert):
     return np.float32(invert) - value if invert >= 0 else value
 
 
-@njit(cache=True, nogil=True, fastmath=True, per_pixel=True)
+@njit(cache=True, nogil=True, fastmath=True, heavy=True)
 def _background(frame, u, v, half, invert, ring):
     """Fit a plane to the ring around a blob, robust to clutter there.
 
@@ -209,7 +209,7 @@ def _solve(a, b, c, d, e, f, x, y, z):
     return (aa * x + ab * y + ac * z) / det, (ab * x + bb * y + bc * z) / det, (ac * x + bc * y + cc * z) / det
 
 
-@njit(cache=True, nogil=True, fastmath=True, per_pixel=True)
+@njit(cache=True, nogil=True, fastmath=True, heavy=True)
 def _copy(frame, first, u, v, invert, plane, grey, offsets):
     """Copy the area and its margin from a frame, subtract the background, and fill offsets from (u, v).
 
@@ -233,7 +233,7 @@ def _copy(frame, first, u, v, invert, plane, grey, offsets):
     return brightest
 
 
-@njit(cache=True, nogil=True, fastmath=True, per_pixel=True)
+@njit(cache=True, nogil=True, fastmath=True, heavy=True)
 def _blur(values, means):
     """Average the 3 x 3 pixels around each pixel of the area and of the adjacent pixels."""
     rows, columns = values.shape
@@ -244,7 +244,7 @@ def _blur(values, means):
             mean[j] = (outer + middle[j - 1] + middle[j] + middle[j + 1]) * np.float32(1 / 9)
 
 
-@njit(cache=True, nogil=True, fastmath=True, per_pixel=True)
+@njit(cache=True, nogil=True, fastmath=True, heavy=True)
 def _gather(grey, x, y, own, other, marks, plane, saturation, start, fit):
     """Collect the unsaturated pixels around the edge of a blob that belong to it, for `fit_centre`.
 
@@ -275,7 +275,7 @@ def _gather(grey, x, y, own, other, marks, plane, saturation, start, fit):
     return count
 
 
-@njit(cache=True, nogil=True, fastmath=True, per_pixel=True)
+@njit(cache=True, nogil=True, fastmath=True, heavy=True)
 def _weigh(smooth, noise, weight):
     """Convert the territory in `weight` to weights of the blob's pixels, from 0 to 1 with increasing brightness.
 
@@ -297,7 +297,7 @@ def _weigh(smooth, noise, weight):
     return scale
 
 
-@njit(cache=True, nogil=True, fastmath=True, per_pixel=True)
+@njit(cache=True, nogil=True, fastmath=True, heavy=True)
 def _find_peaks(grey, smooth, weight):
     """Brightest pixel and brightest 3 x 3 mean of the blob, and the sum of the blob."""
     peak, top, total = np.float32(1e-6), np.float32(0), np.float32(0)

@@ -28,7 +28,7 @@ def find_ramp(grey, weight, scale, ramp):
             slope[j] = value[j] * scale if zero < part[j] < one else zero
 
 
-@njit(cache=True, nogil=True, fastmath=True, per_pixel=True)
+@njit(cache=True, nogil=True, fastmath=True, heavy=True)
 def find_centroid(grey, weight, ramp, x, y):
     """Compute the centroid of a blob from all pixels at (x, y) from the centre of the window, as one row.
 
@@ -55,7 +55,7 @@ def find_centroid(grey, weight, ramp, x, y):
     return x0, y0, gg - 2 * (x0 * gx + y0 * gy) + away * g, tt - 2 * (x0 * tx + y0 * ty) + away * t
 
 
-@njit(cache=True, nogil=True, fastmath=True, per_pixel=True)
+@njit(cache=True, nogil=True, fastmath=True, heavy=True)
 def find_waist(grey, weight, x, y, most, axis, middle, spread):
     """Smallest ratio along an axis of the mass to the lesser of the peaks on its two sides; 1 = there is no waist.
 
@@ -84,7 +84,7 @@ def find_waist(grey, weight, x, y, most, axis, middle, spread):
     return least
 
 
-@njit(cache=True, nogil=True, fastmath=True, per_pixel=True)
+@njit(cache=True, nogil=True, fastmath=True, heavy=True)
 def find_shape(grey, weight, x, y, most, patch):
     """Find the elongation of a blob with masses clipped at `most`, whether it has two parts along its major axis, its
     centroid, and its moments xx, xy, yy. A flat `patch` may be a square.

@@ -17,7 +17,7 @@ MARGIN = SPREAD + 1  # px around the area: distances are also needed in the adja
 _FAR = 200  # px^2; fits into 8 bit even with two distances added
 
 
-@njit(cache=True, nogil=True, per_pixel=True)
+@njit(cache=True, nogil=True, heavy=True)
 def spread_labels(tile, labels, first, name, scratch, own, other):
     """Compute squared distances (px^2) to the component `name` and to others; return whether there are others."""
     rows, columns = own.shape
@@ -44,7 +44,7 @@ def spread_labels(tile, labels, first, name, scratch, own, other):
     return crowded
 
 
-@njit(cache=True, nogil=True, per_pixel=True)
+@njit(cache=True, nogil=True, heavy=True)
 def _spread(squared, scratch):
     """Convert 0 and `_FAR` to squared distances from the zeros, up to `SPREAD` px along each axis.
 
@@ -55,7 +55,7 @@ def _spread(squared, scratch):
     _lower(along, flat, squared.shape[1])
 
 
-@njit(cache=True, nogil=True, per_pixel=True)
+@njit(cache=True, nogil=True, heavy=True)
 def _lower(values, result, stride):
     """Compute the minimum over d of d ** 2 plus the values at distance `d * stride`."""
     for p in range(len(values)):
@@ -67,7 +67,7 @@ def _lower(values, result, stride):
             middle[p] = min(middle[p], np.uint8(min(left[p], right[p]) + d * d))
 
 
-@njit(cache=True, nogil=True, per_pixel=True)
+@njit(cache=True, nogil=True, heavy=True)
 def claim(own, other, crowded, smooth, territory):
     """Set pixels of the area to 1 if they are within a blob's skirt and not nearer to others; all others to 0.
 

@@ -291,7 +291,7 @@ def _arrays(tensors: tuple[Tensor, ...]) -> tuple[np.ndarray, ...]:
     return tuple(tensor.detach().contiguous().numpy() for tensor in tensors)
 
 
-@njit(parallel=True, cache=True, fastmath=kernels.FAST)
+@njit(parallel=True, cache=True, fastmath=kernels.FAST, heavy=True)
 def _minimize_all(given, state, blocks, cost, converged, iterations, limits, tolerances):
     """Run Levenberg-Marquardt on all rigs of a batch; the outputs receive the best states and their equations."""
     for row in prange(len(cost)):
@@ -322,7 +322,7 @@ def _minimize_all(given, state, blocks, cost, converged, iterations, limits, tol
         _copy(residual, tried[7][best])
 
 
-@njit(cache=True, fastmath=kernels.FAST)
+@njit(cache=True, fastmath=kernels.FAST, heavy=True)
 def _minimize_rig(given, states, blocks, cost, converged, iterations, limits, tolerance):
     """Run Levenberg-Marquardt on one rig.
 

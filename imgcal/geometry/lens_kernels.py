@@ -254,7 +254,7 @@ _usual_image, _usual_coefficients, _usual_inverse = _IMAGES[USUAL], _COEFFICIENT
 def image_of(models, camera, px, py, depth, radius_squared, k):
     """Image of a point (mm, camera frame) or of a sphere around it, and its derivatives, like `linearization._lens`.
 
-    For compiled code only; `models` comes from `lens_codes`.
+    `models` comes from `lens_codes`.
 
     Returns:
         x / px; the derivative of log x with respect to depth; x, y, x^2 + y^2, the distorted x and y, and the symmetric

@@ -16,7 +16,7 @@ USUAL_MISFIT = 0.1  # RMS relative to the amplitude: smallest shape difference t
 LEAST_HALF = 4  # px, of a window
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True, heavy=True)
 def cut(grey, uv, scale, half, patches):
     """Fill windows (K, P, P) centred at places (K, 2), resampled to the markers' scales."""
     height, width = grey.shape
@@ -37,7 +37,7 @@ def cut(grey, uv, scale, half, patches):
                 patches[k, i, j] = upper + down * (lower - upper)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, heavy=True)
 def fit_camera(grey, start, inside, sure, scale, half, iterations, uv, found, misfit):
     """Fit the markers (N) of one camera.
 

@@ -81,7 +81,7 @@ def correlate(
     return Scores(np.log(BLIND + (1 - BLIND) * np.exp(score)), shift * maps.factor)
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy", heavy=True)
 def _correlate(cells, front, gain, size, steps, window, score, shift):
     highest = np.empty(len(window), np.float32)
     for k in range(len(cells)):

@@ -28,7 +28,7 @@ FEW = OCTANTS / (OCTANTS - 4)
 """Correction for their reduced scatter: the fit of four values has made four sums of residuals zero."""
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", heavy=True)
 def _median(values, count):
     """Median of the first `count` non-negative values, accurate relative to the largest."""
     low, high = np.float32(0), np.float32(0)
@@ -45,7 +45,7 @@ def _median(values, count):
     return np.float32(0.5) * (low + high)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", heavy=True)
 def _linear(values, shapes, residual, doubt, count):
     """Background and amplitude of a shape, with weights of pixels reduced by `doubt` times their squared residuals."""
     one, zero = np.float32(1), np.float32(0)
@@ -63,7 +63,7 @@ def _linear(values, shapes, residual, doubt, count):
     return (s11 * sv - s1 * s1v) / determinant, (ss * s1v - s1 * sv) / determinant
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", heavy=True)
 def _gather(grey, n, half, uv, pixels):
     """List the pixels around marker n: their values, and their positions relative to its centre.
 
@@ -86,7 +86,7 @@ def _gather(grey, n, half, uv, pixels):
     return left, right, top, bottom
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", heavy=True)
 def _subtract_marker(box, m, half, size, amplitude, whitening, profile, uv, values):
     """Subtract marker m from the values in a box, within its reach."""
     left, right, top, bottom = box
@@ -102,7 +102,7 @@ def _subtract_marker(box, m, half, size, amplitude, whitening, profile, uv, valu
                 values[k] -= amplitude * (profile[low] + (place - low) * (profile[low + 1] - profile[low]))
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", heavy=True)
 def _shape(size, whitening, profile, pixels, count):
     """Compute ring index and brightness of pixels, and the increase of brightness to the next ring."""
     along_u, along_v, place, brightness, step = pixels[1], pixels[2], pixels[3], pixels[4], pixels[5]
@@ -120,7 +120,7 @@ def _shape(size, whitening, profile, pixels, count):
         step[k] = grown
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", heavy=True)
 def _sum(pixels, count, size, whitening, ground, amplitude, doubt, normal, right):
     """Compute the normal equations of (ground, amplitude, u, v).
 
@@ -173,7 +173,7 @@ def _sum(pixels, count, size, whitening, ground, amplitude, doubt, normal, right
     return w0, squares, core, middle
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", heavy=True)
 def _pull(pixels, count, size, whitening, ground, amplitude, doubt, pulls):
     """Compute the contribution of each octant to the right side of the normal equations."""
     values, along_u, along_v, place = pixels[0], pixels[1], pixels[2], pixels[3]
@@ -194,7 +194,7 @@ def _pull(pixels, count, size, whitening, ground, amplitude, doubt, pulls):
             pulls[octant, 3] += slope * (q * x + s * y)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, heavy=True)
 def _variance(normal, pulls, variance, axis, row):
     """Variance of the position along one axis, after `cholesky(normal)`: the larger one from pixels or octants."""
     row[:] = 0.0
@@ -209,7 +209,7 @@ def _variance(normal, pulls, variance, axis, row):
     return max(variance * row[axis], FEW * scatter)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, heavy=True)
 def _improve(size, shape, misfit, last, count, pixels, place, result, work):
     """Move a marker (2,) by one robust step; fill its results (5,), see `fit_markers`."""
     whitening, profile = shape
@@ -243,7 +243,7 @@ def _improve(size, shape, misfit, last, count, pixels, place, result, work):
         result[1] = variance * row[1]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, heavy=True)
 def fit_markers(grey, inside, half, scale, close, shape, iterations, with_variance, uv, found):
     """Fit markers (N) in the windows around them, one after the other.
 

@@ -17,7 +17,7 @@ MOMENTS = 6  # iterations in which the window follows the moments
 TAPS = 4  # px, half width of a blur with a standard deviation of one
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, heavy=True)
 def median(values, count):
     """Median of the first `count` values; reorders them."""
     upper = kernels.select_rank(values, count, count // 2)
@@ -29,7 +29,7 @@ def median(values, count):
     return (lower + upper) / 2
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", heavy=True)
 def _blur(line, blurred):
     """Blur a row of values with a standard deviation of one; the outer values are repeated beyond the ends."""
     weights = np.empty(2 * TAPS + 1)
@@ -49,7 +49,7 @@ def _blur(line, blurred):
             blurred[i] += weight * wide[i + k]
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", heavy=True)
 def _medians(stack, count):
     """Replace the first row of (K, P) by the medians of the first `count` values of each column; reorders them."""
     middle = count // 2
@@ -63,7 +63,7 @@ def _medians(stack, count):
         stack[0, j] = np.float32(0.5) * (stack[before, j] + stack[middle, j])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", heavy=True)
 def _levels(patch, scratch):
     """Medians of the rim, two pixels wide, and of the centre of a window (P, P)."""
     side = len(patch)
@@ -87,7 +87,7 @@ def _levels(patch, scratch):
     return level, median(scratch, inner)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", heavy=True)
 def usual_window(patches, mean):
     """Fill `mean` (P, P) with the median of windows (K, P, P), each normalized by rim and centre, made symmetric.
 
@@ -119,7 +119,7 @@ def usual_window(patches, mean):
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", heavy=True)
 def _moments(mean, covariance):
     """Fill (a, b, c) with the covariance [[a, b], [b, c]] of the central spot; False = no spot."""
     side = len(mean)
@@ -161,7 +161,7 @@ def _moments(mean, covariance):
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", heavy=True)
 def common_shape(patches, whitening, profile):
     """Compute the common shape of markers from windows (K, P, P) centred on them.
 

@@ -17,7 +17,7 @@ MOST = 9.0
 EVERY = 3  # step of rows and columns for the noise estimate
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", heavy=True)
 def raise_ranks(values, size, tries, ranks):
     """Raise ranks, where they are lower, to minus the logarithm of the share of values that are at least as large.
 
@@ -32,8 +32,6 @@ def raise_ranks(values, size, tries, ranks):
     for i in range(height):
         for j in range(width):
             low, high = min(low, values[i, j]), max(high, values[i, j])
-    if not high > low:
-        return
     # The interesting values are few and large: bins are narrow at zero and wide far out. They follow a logarithm of
     # |x| + 1 that is linear between powers of two, like the bits of a float.
     one, ends = np.ones(1, np.float32), np.empty(2, np.float32)
@@ -41,6 +39,8 @@ def raise_ranks(values, size, tries, ranks):
     zero, bits = one.view(np.int32)[0], ends.view(np.int32)
     first = bits[0] - zero if low > 0 else zero - bits[0]
     last = bits[1] - zero if high > 0 else zero - bits[1]
+    if not last > first:
+        return  # all values are the same, but for less than the rounding of |x| + 1
     scale = np.float32((BINS - 1) / (last - first))
     place, count = np.empty((height, width), np.int32), np.zeros(BINS, np.int64)
     row = np.empty(width, np.float32)
@@ -64,7 +64,7 @@ def raise_ranks(values, size, tries, ranks):
             ranks[i, j] = max(ranks[i, j], table[place[i, j]])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", heavy=True)
 def rank_spots(response, covered, size, ranks):
     """Normalize responses by their noise, and raise ranks to those of the largest response.
 
@@ -94,7 +94,7 @@ def rank_spots(response, covered, size, ranks):
         raise_ranks(values, size, len(response), ranks)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", heavy=True)
 def average(frame, corner, factor, cells):
     """Fill cells (H, W) with the means of blocks of a frame; the first block starts at a column and row (2,)."""
     height, width = cells.shape

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from renderers.compiling import njit
-from renderers.interpreting import LARGEST, interpret_first, without_machine_code
+from renderers.interpreting import MOST_ELEMENTS, interpret_first, without_machine_code
 
 
-def make(per_pixel: bool = False):
+def make(heavy: bool = False):
     """A function of its own for each test, so that no test finds the machine code of another."""
 
-    @njit(cache=False, per_pixel=per_pixel)
+    @njit(cache=False, heavy=heavy)
     def total(values):
         found = 0.0
         for value in values:
@@ -38,14 +38,14 @@ def test_a_function_is_compiled_once_interpreting_it_has_taken_as_long():
         assert total(values) == pytest.approx(1000)
         assert not total.overloads
         spent = total.interpretable.spent
-        assert 0 < spent < total.interpretable.cost
+        assert 0 < spent < total.interpretable.seconds
         while not total.overloads:
             before = total.interpretable.spent
             assert total(values) == pytest.approx(1000)
-        assert total.interpretable.cost <= before == total.interpretable.spent
+        assert total.interpretable.seconds <= before == total.interpretable.spent
 
 
-@pytest.mark.parametrize("values", [np.ones(LARGEST + 1), np.ones(LARGEST + 1, np.uint8)])
+@pytest.mark.parametrize("values", [np.ones(MOST_ELEMENTS + 1), np.ones(MOST_ELEMENTS + 1, np.uint8)])
 def test_large_arrays_are_not_interpreted_but_images_may_be(values):
     total = make()
     with interpret_first():
@@ -54,18 +54,18 @@ def test_large_arrays_are_not_interpreted_but_images_may_be(values):
 
 
 def test_what_runs_for_each_pixel_is_interpreted_only_while_another_process_compiles_it():
-    total = make(per_pixel=True)
-    total.interpretable.is_compiled_elsewhere = lambda: True
+    total = make(heavy=True)
+    total.interpretable.is_being_compiled = lambda: True
     with interpret_first():
         assert total(np.ones(3)) == 1
         assert not total.overloads
-        total.interpretable.is_compiled_elsewhere = lambda: False
+        total.interpretable.is_being_compiled = lambda: False
         assert total(np.ones(3)) == 1
         assert total.overloads
 
 
 def test_without_patience_all_is_compiled_and_with_endless_patience_nothing():
-    compiled, interpreted = make(), make(per_pixel=True)
+    compiled, interpreted = make(), make(heavy=True)
     with interpret_first(0):
         compiled(np.ones(3))
         with interpret_first(math.inf):
@@ -93,7 +93,7 @@ def test_only_the_own_time_counts():
         return inner(values) + 1
 
     with interpret_first(math.inf):
-        assert outer(np.ones(30_000)) == pytest.approx(10_001)
+        assert outer(np.ones(15_000)) == pytest.approx(5001)
     assert 0 < outer.interpretable.spent < 0.1 * inner.interpretable.spent
 
 
@@ -119,18 +119,18 @@ def test_a_twin_stands_in_for_a_function_and_all_that_it_calls_as_long_as_compil
         return values.sum() / 3 + 1
 
     assert without_machine_code(outer) is None
-    costs = inner.interpretable.cost + outer.interpretable.cost
+    costs = inner.interpretable.seconds + outer.interpretable.seconds
     with interpret_first():
         missing = without_machine_code(outer)
         assert missing is outer.interpretable
         assert missing.call_twin(twin, np.ones(6)) == 3
-        assert 0 < missing.spent < outer.interpretable.cost
+        assert 0 < missing.spent < outer.interpretable.seconds
         missing.spent = costs - 1e-9
         assert without_machine_code(outer) is missing
         missing.spent = costs
         assert without_machine_code(outer) is None
         missing.spent = 0.0
-        outer.interpretable._load(np.ones(6))
+        outer.interpretable._compile(np.ones(6))
         assert without_machine_code(outer) is None
 
 

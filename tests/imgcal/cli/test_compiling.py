@@ -2,6 +2,7 @@ import contextlib
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numba
@@ -10,9 +11,10 @@ from numba import config
 from numba.core import event
 
 import renderers.compiling
+from imgcal import detection
 from imgcal.cli import compiler, compiling
 from imgcal.cli.compiling import HINT, WAIT, announce_compilation, help_to_compile
-from imgcal.errors import InputError
+from imgcal.errors import InputError, RefusedError
 from renderers import interpreting
 
 
@@ -86,10 +88,11 @@ def test_a_second_process_helps_and_goes_on_after_the_command(cache, helpers, mo
 
 
 @pytest.mark.skipif(renderers.compiling.fcntl is None, reason="no help on Windows")
-def test_the_second_process_ends_if_the_command_is_interrupted(cache, helpers):
+def test_the_second_process_learns_that_the_command_is_interrupted(cache, helpers):
     with pytest.raises(KeyboardInterrupt), help_to_compile():
         raise KeyboardInterrupt
-    assert helpers[0].returncode not in (None, 0)
+    assert helpers[0].wait(60) == 0
+    assert (cache / "told").read_bytes() == b""
 
 
 @pytest.mark.skipif(renderers.compiling.fcntl is None, reason="no help on Windows")
@@ -107,14 +110,69 @@ def test_a_command_does_not_start_a_second_helper_beside_that_of_another(cache, 
 
 
 @pytest.mark.skipif(renderers.compiling.fcntl is None, reason="no help on Windows")
-def test_the_helper_leaves_a_mark_when_all_is_compiled(cache, monkeypatch):
-    monkeypatch.setattr(compiler, "_calibrate", lambda: None)
-    monkeypatch.setattr(compiler, "cache_folder", lambda: str(cache))
-    monkeypatch.setattr("imgcal.detection.warmup.warm_up_detection", lambda: None)
+@pytest.mark.parametrize("error", [None, RefusedError("no camera")])
+def test_the_helper_leaves_a_mark_when_all_is_compiled_or_cannot_be(cache, monkeypatch, error):
+    def calibrate() -> None:
+        if error is not None:
+            raise error
+
+    monkeypatch.setattr(compiler, "_calibrate", calibrate)
+    monkeypatch.setattr(detection, "warm_up_detection", lambda: None)
     monkeypatch.setattr(compiler, "_end_if_interrupted", lambda: None)
     assert compiling.is_useful()
     compiler.main()
-    assert not compiling.is_useful() and not compiling.is_lacking()
+    assert not compiling.is_lacking() and not compiling.is_useful()
+    assert compiling.completion_mark().read_text() == ("" if error is None else "RefusedError: no camera\n")
+
+
+CODE = """
+import pathlib, time
+from imgcal.cli import compiler
+from imgcal import detection
+
+def work():
+    try:
+        print("here", flush=True)
+        for _ in range({steps}):
+            time.sleep(0.05)
+    finally:
+        pathlib.Path({mark!r}).touch()
+
+detection.warm_up_detection = lambda: None
+compiler._calibrate = work
+compiler.main()
+"""
+
+
+def start(steps: int, cache: Path) -> subprocess.Popen[bytes]:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    code = CODE.format(steps=steps, mark=str(cache / "tidy"))
+    helper = subprocess.Popen([sys.executable, "-c", code], env=environment, **pipes)
+    assert helper.stdout.readline() == b"here\n"
+    return helper
+
+
+@pytest.mark.skipif(renderers.compiling.fcntl is None, reason="no help on Windows")
+def test_a_helper_that_is_done_before_the_command_ends_well(tmp_path):
+    with start(0, tmp_path) as helper:
+        assert (helper.wait(60), helper.stderr.read()) == (0, b"")
+
+
+@pytest.mark.skipif(renderers.compiling.fcntl is None, reason="no help on Windows")
+def test_a_helper_whose_command_is_interrupted_tidies_up_and_ends(tmp_path):
+    with start(2400, tmp_path) as helper:
+        began = time.monotonic()
+        helper.communicate(b"")
+    assert helper.returncode != 0 and (tmp_path / "tidy").exists() and time.monotonic() - began < 60
+    assert not list(tmp_path.glob("complete-*"))
+
+
+def test_the_mark_depends_on_sources_and_versions(cache, monkeypatch):
+    before = compiling.completion_mark()
+    assert before == compiling.completion_mark()
+    monkeypatch.setattr(numba, "__version__", "0.1")
+    assert compiling.completion_mark() != before
 
 
 @pytest.mark.skipif(renderers.compiling.fcntl is None, reason="no help on Windows")
@@ -136,7 +194,7 @@ def test_no_help_where_it_is_of_no_use(cache, monkeypatch):
     with monkeypatch.context() as elsewhere:  # a folder of this process alone
         elsewhere.setattr(renderers.compiling, "cache_folder", lambda: "/tmp/imgcal-compiled-x")
         assert not compiling.is_useful()
-    (cache / compiling.COMPLETE).touch()
+    compiling.completion_mark().touch()
     assert not compiling.is_useful()
 
 

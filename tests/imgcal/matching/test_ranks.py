@@ -63,3 +63,10 @@ def test_cells_are_means_of_blocks(kind):
     average(frame, np.array([8, 4]), 4, cells)
     part = frame[4:84, 8:108].astype(np.float64)
     assert np.allclose(cells, cv2.resize(part, (25, 20), interpolation=cv2.INTER_AREA), rtol=1e-6)
+
+
+@pytest.mark.parametrize("other", [1e-9, -1e-9, 0.0])
+def test_values_that_differ_by_less_than_rounding_have_no_rank(other):
+    flat = np.zeros((4, 5), np.float32)
+    flat[1, 2] = other
+    assert not ranked(flat).any()
