@@ -180,7 +180,10 @@ def test_the_helper_calibrates_the_sample_and_says_nothing():
     with compiling.start_helper() as helper:
         helper.communicate(compiling.GO_ON)
     assert helper.returncode == 0
-    assert not compiling.is_lacking()
+    deadline = time.monotonic() + 300
+    while compiling.is_helped() and time.monotonic() < deadline:  # by the helper of another test
+        time.sleep(0.1)
+    assert compiling.completion_mark().read_text() == ""
 
 
 def test_no_help_where_it_is_of_no_use(cache, monkeypatch):
