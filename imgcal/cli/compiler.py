@@ -6,6 +6,7 @@ import _thread
 import contextlib
 import io
 import os
+import signal
 import tempfile
 import threading
 import time
@@ -20,6 +21,7 @@ GIVE_UP = 10.0
 
 def main() -> None:
     """Compile first what the calibration needs first, then the rest; nothing if another process does so already."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background inherits that it is ignored
     threading.Thread(target=_end_if_interrupted, daemon=True).start()
     with hold(HELPER) as free:
         if not free:

@@ -1,5 +1,6 @@
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -119,6 +120,7 @@ def test_the_helper_leaves_a_mark_when_all_is_compiled_or_cannot_be(cache, monke
     monkeypatch.setattr(compiler, "_calibrate", calibrate)
     monkeypatch.setattr(detection, "warm_up_detection", lambda: None)
     monkeypatch.setattr(compiler, "_end_if_interrupted", lambda: None)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
     assert compiling.is_useful()
     compiler.main()
     assert not compiling.is_lacking() and not compiling.is_useful()
@@ -148,7 +150,8 @@ def start(steps: int, cache: Path) -> subprocess.Popen[bytes]:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)}
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     code = CODE.format(steps=steps, mark=str(cache / "tidy"))
-    helper = subprocess.Popen([sys.executable, "-c", code], env=environment, **pipes)
+    as_a_job_in_the_background = ["sh", "-c", 'trap "" INT; exec "$0" -c "$1"', sys.executable, code]
+    helper = subprocess.Popen(as_a_job_in_the_background, env=environment, **pipes)
     assert helper.stdout.readline() == b"here\n"
     return helper
 
