@@ -155,9 +155,11 @@ def completion_mark() -> Path:
 
     package = Path(imgcal.__file__).parents[1]
     files = sorted(path for name in ("imgcal", "renderers") for path in (package / name).rglob("*.py"))
-    said = [sys.implementation.cache_tag, numba.__version__, get_host_cpu_name()]
-    said += [f"{path.relative_to(package)} {path.stat().st_size} {path.stat().st_mtime_ns}" for path in files]
-    return Path(cache_folder(), f"complete-{hashlib.sha256(chr(10).join(said).encode()).hexdigest()[:16]}")
+    state = [sys.implementation.cache_tag, numba.__version__, get_host_cpu_name()]
+    for path in files:
+        status = path.stat()
+        state.append(f"{path.relative_to(package)} {status.st_size} {status.st_mtime_ns}")
+    return Path(cache_folder(), f"complete-{hashlib.sha256(repr(state).encode()).hexdigest()[:16]}")
 
 
 def is_helped() -> bool:
@@ -187,11 +189,11 @@ def _count_running() -> int:
 
 
 def start_helper() -> subprocess.Popen[bytes]:
-    """Start `imgcal.cli.compiler` in a second process, which has this package and says nothing."""
+    """Start `imgcal.cli.background_compiler` in a second process, which has this package and says nothing."""
     # Not from the current folder, which anybody may have filled.
     path = os.pathsep.join(filter(None, (str(Path(imgcal.__file__).parents[1]), os.environ.get("PYTHONPATH"))))
     environment = os.environ | {"PYTHONPATH": path, THREADS: "1"}
-    command, nothing = [sys.executable, "-P", "-m", "imgcal.cli.compiler"], subprocess.DEVNULL
+    command, nothing = [sys.executable, "-P", "-m", "imgcal.cli.background_compiler"], subprocess.DEVNULL
     return subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=nothing, stderr=nothing, env=environment, start_new_session=True
     )

@@ -9,7 +9,7 @@ from .light_tracks import LightTracks
 from .object_pose import ObjectPose
 from .rig_state import CameraHealth, RigState
 from .sequential_test import SequentialTest
-from .warmup import warm_up, warm_up_fits
+from .warmup import warm_up
 
 __all__ = [
     "EVENT_KINDS",
@@ -28,5 +28,4 @@ __all__ = [
     "RigState",
     "SequentialTest",
     "warm_up",
-    "warm_up_fits",
 ]

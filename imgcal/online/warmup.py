@@ -9,10 +9,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from imgcal.association import align_camera, associate_lights, relocalize
+from imgcal.association import align_camera, associate_lights
 from imgcal.detection import detect
 from imgcal.errors import RefusedError
-from imgcal.estimation import EstimationOptions, estimate, find_moves, flat_std
 from imgcal.geometry import lens_width
 from imgcal.io import load_object, read_rig
 from imgcal.monitoring import RecentSnapshots, RigFilter
@@ -79,21 +78,6 @@ def _warm_up(rig: CameraRig) -> None:
     for uv in (truth.uv, truth.uv.float()):  # for `imgcal render` and for the networks
         render_views(uv, seen, rig.image_size, obj, ImageOptions(32, 1.5))
         rig.to(uv.dtype).expand(1).project_values(obj.points.to(uv.dtype)[None])
-
-
-def warm_up_fits() -> None:
-    """Compile the last steps of a calibration: its fits, then the search for a pose; and the networks' inputs."""
-    rig, obj = read_rig(RIG).resized(torch.tensor(SIZE)), load_object(OBJECT)
-    truth = simulate_truth(rig, obj, SNAPSHOTS, _make_generator(), DRIFT, POSES)
-    seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
-    observations = Observations(truth.uv, torch.full(seen.shape, 0.1, dtype=torch.float64), seen)
-    found = estimate(observations, rig, obj, truth.rig_from_object)
-    flat_std(found)
-    snapshots = tuple(map(str, range(SNAPSHOTS)))
-    find_moves(found.problem, found.solution.state, rig.camera_names, snapshots, EstimationOptions())
-    relocalize(true_detections(truth).of_snapshots(0, 1), rig, obj, RigPrior().std(rig))
-    render_views(truth.uv.float(), seen, rig.image_size, obj, ImageOptions(32, 1.5))
-    rig.to(torch.float32).expand(1).project_values(obj.points.float()[None])
 
 
 def _make_generator() -> torch.Generator:

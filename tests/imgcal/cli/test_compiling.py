@@ -13,7 +13,7 @@ from numba.core import event
 
 import renderers.compiling
 from imgcal import detection
-from imgcal.cli import compiler, compiling
+from imgcal.cli import background_compiler, compiling
 from imgcal.cli.compiling import HINT, WAIT, announce_compilation, help_to_compile
 from imgcal.errors import InputError, RefusedError
 from renderers import interpreting
@@ -117,19 +117,19 @@ def test_the_helper_leaves_a_mark_when_all_is_compiled_or_cannot_be(cache, monke
         if error is not None:
             raise error
 
-    monkeypatch.setattr(compiler, "_calibrate", calibrate)
+    monkeypatch.setattr(background_compiler, "_calibrate", calibrate)
     monkeypatch.setattr(detection, "warm_up_detection", lambda: None)
-    monkeypatch.setattr(compiler, "_end_if_interrupted", lambda: None)
+    monkeypatch.setattr(background_compiler, "_end_if_interrupted", lambda: None)
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     assert compiling.is_useful()
-    compiler.main()
+    background_compiler.main()
     assert not compiling.is_lacking() and not compiling.is_useful()
     assert compiling.completion_mark().read_text() == ("" if error is None else "RefusedError: no camera\n")
 
 
 CODE = """
 import pathlib, time
-from imgcal.cli import compiler
+from imgcal.cli import background_compiler
 from imgcal import detection
 
 def work():
@@ -141,8 +141,8 @@ def work():
         pathlib.Path({mark!r}).touch()
 
 detection.warm_up_detection = lambda: None
-compiler._calibrate = work
-compiler.main()
+background_compiler._calibrate = work
+background_compiler.main()
 """
 
 

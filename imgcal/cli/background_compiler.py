@@ -1,4 +1,4 @@
-"""Compile what a first calibration needs, beside it and after it: `python -m imgcal.cli.compiler`."""
+"""Compile what a first calibration needs, beside it and after it: `python -m imgcal.cli.background_compiler`."""
 
 from __future__ import annotations
 
