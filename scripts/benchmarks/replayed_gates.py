@@ -2,7 +2,8 @@
 
 Run as `python -m scripts.benchmarks.replayed_gates`. Each item simulates a place with the noise of the recorded wand
 (`replayed_stream`), calibrates it, and keeps it calibrated from there on. Finished items of the same code are not run
-again (`out/work/replayed_gates`); the result contains the items that were run within `--minutes`.
+again (`out/work/replayed_gates`); the result contains the items that were run within `--minutes`, with `--add` also
+those that it contained before. Each states its commit.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from scripts.benchmarks.replayed_noise import recorded_residuals, recorded_serie
 from scripts.benchmarks.replayed_stream import PLACES, TEACHING, calibrated_stream
 from scripts.benchmarks.rig_streams import Bump
 from scripts.benchmarks.wand_recording import calibrated
-from scripts.output import ROOT, WORK, command, markdown, surroundings, write_json
+from scripts.output import ROOT, WORK, command, commit, markdown, read_json, surroundings, write_json
 
 RESULT = ROOT / "docs" / "benchmarks" / "replayed_noise.json"
 LONG = 6000
@@ -68,7 +69,7 @@ def run(item: Item) -> dict[str, Any]:
         bumps = (Bump(TEACHING + BEFORE, camera, item.kind, BUMPS[item.kind]),)
         count = BEFORE + 4 * AFTER
     began = time.process_time()
-    said = {"place": item.place, "seed": item.seed, "bump": item.kind}
+    said = {"place": item.place, "seed": item.seed, "bump": item.kind, "commit": commit()}
     try:
         stream, calibration = calibrated_stream(item.place, item.seed, count, bumps)
     except RefusedError as reason:
@@ -119,9 +120,9 @@ def run(item: Item) -> dict[str, Any]:
     return {**found, "false": len(false), "events": false}
 
 
-def items(snapshots: int = LONG, bumped: int | None = None) -> Iterator[Item]:
-    """Yield endless items: quiet ones of `snapshots`, the first `bumped` (None = all) followed by two with bumps."""
-    kinds, number = tuple(BUMPS), 0
+def items(snapshots: int = LONG, bumped: int | None = None, first: int = 0) -> Iterator[Item]:
+    """Yield endless items from number `first`: quiet ones, each below `bumped` (None = all) followed by two bumps."""
+    kinds, number = tuple(BUMPS), first
     while True:
         place = PLACES[number % len(PLACES)]
         yield Item(place, number, snapshots=snapshots)
@@ -237,6 +238,7 @@ class Options:
     snapshots: int = LONG  #: per item without a bump
     bumped: int | None = None  #: number of items without a bump that are followed by two with one; default: all
     cores: int = 1
+    add: bool = False  #: keep the items in `--out`, and go on after the last of them
     fresh: bool = False  #: calibrate the recording again, instead of using cached residuals
     out: Path = RESULT
 
@@ -248,15 +250,16 @@ def main() -> None:
         calibrated(anew=True)
         replayed_noise.CACHE.unlink(missing_ok=True)
     noise = compared()
+    rows: list[dict[str, Any]] = read_json(options.out)["items"] if options.add else []
+    first = max((row["seed"] + 1 for row in rows if row["bump"] is None), default=0)
     modules = (__file__, real_stream.__file__, replayed_noise.__file__, replayed_stream.__file__)
     kept = StoredResults(WORK / "replayed_gates", "\n".join(Path(str(name)).read_text("utf-8") for name in modules))
     until = time.monotonic() + 60 * options.minutes
     some = takewhile(
         lambda pair: pair[0] < options.count and time.monotonic() < until,
-        enumerate(items(options.snapshots, options.bumped)),
+        enumerate(items(options.snapshots, options.bumped, first)),
     )
     with workers(None, options.cores, kept) as mapped:
-        rows = []
         for row in mapped(run, (item for _, item in some)):
             rows.append(row)
             shown = ("place", "seed", "bump", "refused", "false", "nees", "nees_median", "in_time", "seen_s", "cpu_s")
