@@ -39,7 +39,7 @@ def drop_merged(labelled: Associations, poses: RigidTransform, rig: CameraRig, o
     """
     detections, used = labelled.detections, np.array(labelled.used)
     points = poses.apply(obj.points.to(rig.focal_length))
-    image = rig.expand(len(points)).project(points, obj.radius)
+    image = rig.expand(len(points)).project_values(points, obj.radius)
     rows = np.flatnonzero((detections.fiducial >= 0) & np.isin(detections.snapshot, used))
     snapshot, camera = np.searchsorted(used, detections.snapshot[rows]), detections.camera[rows]
     hidden = image.visible.numpy() & labelled.columns(obj)

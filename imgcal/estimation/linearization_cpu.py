@@ -24,6 +24,11 @@ from renderers.compiling import njit
 
 SHIFTS = 50
 """Most iterations of reweighting for a shift."""
+TILE = 16
+"""Products are summed in rows of a multiple of this many columns, of which the compiler makes vector instructions. It
+must not know the number, or it writes every product out instead ..."""
+TOGETHER = 4
+"""... of this many points at a time."""
 
 
 @njit(cache=True, fastmath=kernels.FAST)
@@ -69,9 +74,8 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
     offset, rotation, centre, own_offset = state
     camera, coupling, pose, border, camera_gradient, pose_gradient, own_gradient, residual = blocks
     snapshots, cameras, fiducials = root_weight.shape
-    kind, free = uv.dtype, 10 + lens_kernels.width_of(lenses, distortion0)
-    wide = free + 6
-    turns = np.empty((3, 3), dtype=kind)
+    free = 10 + lens_kernels.width_of(lenses, distortion0)
+    turns = np.empty((3, 3))
     several = points.shape[1] > 3
     lacking = 0 if several else kernels.fill_free_turns(points, turns)
     for s in range(snapshots):
@@ -83,21 +87,17 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
             lacking = _fill_turns_of_row(points, root_weight[s], turns)
         if lacking:
             _fix_turns(rotation[s], turns, pose[s])
-    rows = np.zeros((2, wide), dtype=kind)
-    products = np.empty((wide, wide), dtype=kind)
-    gradient = np.empty(wide, dtype=kind)
-    turned, left, rotation_cam = (
-        np.empty((3, 3), dtype=kind),
-        np.empty((3, 3), dtype=kind),
-        np.empty((3, 3), dtype=kind),
-    )
-    parameters = np.empty(free, dtype=kind)
-    coefficients = np.empty(free - 10, dtype=kind)
-    rotated, point = np.empty(3, dtype=kind), np.empty(3, dtype=kind)
-    derivative, back = np.empty((2, 3), dtype=kind), np.empty(3, dtype=kind)
+    width = TILE * ((10 + distortion0.shape[1]) // TILE + 1)
+    wide = TILE + 0 * distortion0.shape[1]
+    several_rows, products, own = np.zeros((TOGETHER, 2, width)), np.empty((width, width)), np.empty((free, free))
+    motions, mixed, posed = np.zeros((6, wide)), np.empty((width, wide)), np.empty((12, wide))
+    turned, left, rotation_cam, together = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    parameters, coefficients = np.empty(free), np.empty(free - 10)
+    at, there, around, point = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    derivative = np.empty((2, 3))
     bent, scale = len(own_std) > 0, 1.0
-    rows_own = np.empty((2, 4), dtype=kind)
-    shift, shared, shared_own = np.zeros(2, dtype=kind), np.empty((2, wide), dtype=kind), np.empty((2, len(own_std)))
+    full, rows_own = np.empty((2, free + 6)), np.empty((2, 4))
+    shift, shared, shared_own = np.zeros(2), np.empty((2, width)), np.empty((2, len(own_std)))
     cost = 0.0
     if bent:
         cost = _start_object(own_offset, coupling, border, own_gradient)
@@ -106,9 +106,9 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
         for i in range(free):
             parameters[i] = offset[c, i] * prior_std[c, i]
             cost += 0.5 * offset[c, i] ** 2
-            camera_gradient[c, i] = offset[c, i]
-            for j in range(free):
-                camera[c, i, j] = 1.0 if i == j else 0.0
+            camera_gradient[c, i] = 0
+            for j in range(i + 1):
+                own[i, j] = 0
         kernels.exponential(parameters, turned, left)
         kernels.multiply(turned, rotation0[c], rotation_cam)
         fx, fy = focal0[c, 0] + parameters[6], focal0[c, 1] + parameters[7]
@@ -116,31 +116,31 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
         for i in range(free - 10):
             coefficients[i] = distortion0[c, i] + parameters[10 + i]
         for s in range(snapshots):
-            for i in range(wide):
-                gradient[i] = 0
-                for j in range(i + 1):
+            for i in range(free + 1):
+                for j in range(width):
                     products[i, j] = 0
+            kernels.multiply(rotation_cam, rotation[s], together)
+            for i in range(3):
+                at[i] = centre[s, i] - position0[c, i] - parameters[3 + i]
+            for i in range(3):
+                there[i] = rotation_cam[i, 0] * at[0] + rotation_cam[i, 1] * at[1] + rotation_cam[i, 2] * at[2]
             unit = max(1.0, np.sqrt(centre[s, 0] ** 2 + centre[s, 1] ** 2 + centre[s, 2] ** 2))
-            shaken, total = len(shake) > 0 and shake[s, c] > 0, 0.0
+            _write_motions(rotation_cam, left, there, unit, motions)
+            shaken, total, count = len(shake) > 0 and shake[s, c] > 0, 0.0, 0
             if shaken:
-                camera_at = (rotation_cam, position0[c], parameters, coefficients, (fx, fy, cx, cy))
-                _project(given, state, c, s, scale, camera_at, residual[s, c])
+                camera_at = (together, there, coefficients, (fx, fy, cx, cy))
+                _project(given, own_offset, c, s, scale, camera_at, residual[s, c])
                 cost += take_shift(residual[s, c], root_weight[s, c], shake[s, c], loss, threshold, shift)
                 shared[:] = 0
                 shared_own[:] = 0
             for n in range(fiducials):
-                at_x, at_y, at_z = points[n, 0], points[n, 1], points[n, 2]
-                if bent:
-                    at_x = scale * at_x + own_offset[3 * n] * own_std[3 * n]
-                    at_y = scale * at_y + own_offset[3 * n + 1] * own_std[3 * n + 1]
-                    at_z = scale * at_z + own_offset[3 * n + 2] * own_std[3 * n + 2]
                 for i in range(3):
-                    rotated[i] = rotation[s, i, 0] * at_x + rotation[s, i, 1] * at_y + rotation[s, i, 2] * at_z
-                rx = rotated[0] + centre[s, 0] - position0[c, 0] - parameters[3]
-                ry = rotated[1] + centre[s, 1] - position0[c, 1] - parameters[4]
-                rz = rotated[2] + centre[s, 2] - position0[c, 2] - parameters[5]
+                    at[i] = points[n, i]
+                    if bent:
+                        at[i] = scale * at[i] + own_offset[3 * n + i] * own_std[3 * n + i]
                 for i in range(3):
-                    point[i] = rotation_cam[i, 0] * rx + rotation_cam[i, 1] * ry + rotation_cam[i, 2] * rz
+                    around[i] = together[i, 0] * at[0] + together[i, 1] * at[1] + together[i, 2] * at[2]
+                    point[i] = around[i] + there[i]
                 weight = root_weight[s, c, n]
                 if weight > 0 and point[2] <= NEAREST_DEPTH:
                     cost = np.inf
@@ -153,66 +153,175 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
                 residual[s, c, 0, n], residual[s, c, 1, n] = ru, rv
                 if weight == 0:
                     continue
+                rows = several_rows[count % TOGETHER]
+                count += 1
                 if shaken:
                     ru, rv = ru - shift[0], rv - shift[1]
                 value, slope = loss_and_slope((ru * ru + rv * rv) * weight * weight, loss, threshold)
                 cost += 0.5 * value
-                weight *= np.sqrt(slope)
+                if slope != 1.0:
+                    weight *= np.sqrt(slope)
                 fx_w, fy_w = fx * weight, fy * weight
                 write_derivative((per_depth, log_slope, x, y, jxx, jxy, jyy), fx_w, fy_w, derivative)
-
                 for r in range(2):
                     d0, d1, d2 = derivative[r, 0], derivative[r, 1], derivative[r, 2]
-                    t0 = point[1] * d2 - point[2] * d1
-                    t1 = point[2] * d0 - point[0] * d2
-                    t2 = point[0] * d1 - point[1] * d0
-                    for i in range(3):
-                        rows[r, i] = left[0, i] * t0 + left[1, i] * t1 + left[2, i] * t2
-                        back[i] = rotation_cam[0, i] * d0 + rotation_cam[1, i] * d1 + rotation_cam[2, i] * d2
-                        rows[r, 3 + i] = -back[i]
-                        rows[r, free + 3 + i] = back[i] * unit
-                    rows[r, free] = rotated[1] * back[2] - rotated[2] * back[1]
-                    rows[r, free + 1] = rotated[2] * back[0] - rotated[0] * back[2]
-                    rows[r, free + 2] = rotated[0] * back[1] - rotated[1] * back[0]
-                    if bent:
-                        for i in range(3):
-                            rows_own[r, i] = (
-                                rotation[s, 0, i] * back[0] + rotation[s, 1, i] * back[1] + rotation[s, 2, i] * back[2]
-                            )
-                        rows_own[r, 3] = own_std[-1] * (
-                            rows_own[r, 0] * points[n, 0]
-                            + rows_own[r, 1] * points[n, 1]
-                            + rows_own[r, 2] * points[n, 2]
-                        )
-                        for i in range(3):
-                            rows_own[r, i] *= own_std[3 * n + i]
+                    rows[r, 0] = around[1] * d2 - around[2] * d1
+                    rows[r, 1] = around[2] * d0 - around[0] * d2
+                    rows[r, 2] = around[0] * d1 - around[1] * d0
+                    rows[r, 3], rows[r, 4], rows[r, 5] = d0, d1, d2
                 rows[0, 6], rows[1, 7] = xd * weight, yd * weight
                 rows[0, 8], rows[1, 9] = weight, weight
                 lens_kernels.by_coefficients(lenses, c, x, y, rr, coefficients, fx_w, fy_w, 10, rows)
-                for i in range(free):
-                    rows[0, i] *= prior_std[c, i]
-                    rows[1, i] *= prior_std[c, i]
-                ru, rv = ru * weight, rv * weight
+                rows[0, free], rows[1, free] = ru * weight, rv * weight
                 if bent:
-                    _add_object(rows, rows_own, ru, rv, c, s, n, coupling, border, own_gradient, cameras_first)
+                    _write_own(points[n], together, derivative, own_std, n, rows_own)
+                    _expand(rows, motions, prior_std[c], full)
+                    residuals = (rows[0, free], rows[1, free])
+                    _add_object(full, rows_own, residuals, c, s, n, coupling, border, own_gradient, cameras_first)
                 if shaken:
                     total += weight * weight
                     _add_shared(rows, rows_own, weight, n, shared, shared_own)
-                for i in range(wide):
-                    gradient[i] += rows[0, i] * ru + rows[1, i] * rv
-                    for j in range(i + 1):
-                        products[i, j] += rows[0, i] * rows[0, j] + rows[1, i] * rows[1, j]
+                if count % TOGETHER == 0:
+                    _add_products(several_rows, free + 1, products)
+            if count == 0:
+                _clear_coupling(c, s, free, coupling, cameras_first)
+                continue
+            if count % TOGETHER:
+                several_rows[count % TOGETHER :] = 0.0
+                _add_products(several_rows, free + 1, products)
             if shaken:
                 share = 1 / (1 / shake[s, c] ** 2 + total)
-                for i in range(wide):
-                    for j in range(i + 1):
-                        products[i, j] -= share * (shared[0, i] * shared[0, j] + shared[1, i] * shared[1, j])
+                shared[0, free], shared[1, free] = 0.0, 0.0
+                _subtract_products(shared, free, share, products)
                 if bent:
-                    _subtract_object(share, shared, shared_own, c, s, coupling, border)
-            _distribute(
-                products, gradient, c, s, free, camera, coupling, pose, camera_gradient, pose_gradient, cameras_first
-            )
+                    _expand(shared, motions, prior_std[c], full)
+                    _subtract_object(share, full, shared_own, c, s, coupling, border)
+            _carry_over(products, motions, free + 1, mixed, posed)
+            for i in range(6):
+                camera_gradient[c, i] += mixed[free, i]
+                pose_gradient[s, i] += mixed[free, 6 + i]
+                for j in range(i + 1):
+                    own[i, j] += posed[i, j]
+                    pose[s, i, j] += posed[6 + i, 6 + j]
+            for i in range(6, free):
+                camera_gradient[c, i] += products[free, i]
+                for j in range(6):
+                    own[i, j] += mixed[i, j]
+                for j in range(6, i + 1):
+                    own[i, j] += products[i, j]
+            for i in range(6):
+                for j in range(free):
+                    value = (posed[6 + i, j] if j < 6 else mixed[j, 6 + i]) * prior_std[c, j]
+                    if cameras_first:
+                        coupling[c, j, 6 * s + i] = value
+                    else:
+                        coupling[s, i, free * c + j] = value
+        for i in range(free):
+            camera_gradient[c, i] = offset[c, i] + camera_gradient[c, i] * prior_std[c, i]
+            for j in range(i + 1):
+                camera[c, i, j] = camera[c, j, i] = own[i, j] * prior_std[c, i] * prior_std[c, j]
+            camera[c, i, i] += 1.0
+    for s in range(snapshots):
+        for i in range(6):
+            for j in range(i):
+                pose[s, j, i] = pose[s, i, j]
     return cost
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _write_motions(rotation_cam, left, there, unit, motions):
+    """Write how an object moves in a camera's frame by steps of the camera's and of its own pose: (6, 12).
+
+    Rows: a rotation about the object's centre, `there` (3,), and a shift. Columns: rotation and position of the camera,
+    rotation and position of the object. What is zero is left as it is.
+    """
+    for i in range(3):
+        for k in range(3):
+            motions[k, i] = left[k, i]
+            motions[3 + k, 3 + i] = -rotation_cam[k, i]
+            motions[k, 6 + i] = rotation_cam[k, i]
+            motions[3 + k, 9 + i] = unit * rotation_cam[k, i]
+        motions[3, i] = left[1, i] * there[2] - left[2, i] * there[1]
+        motions[4, i] = left[2, i] * there[0] - left[0, i] * there[2]
+        motions[5, i] = left[0, i] * there[1] - left[1, i] * there[0]
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _add_products(rows, count, products):
+    """Add the products of the first columns of the rows of four points (4, 2, W) with all columns to a matrix."""
+    a, b, c, d = rows[0], rows[1], rows[2], rows[3]
+    for i in range(count):
+        a0, a1, b0, b1, c0, c1, d0, d1 = a[0, i], a[1, i], b[0, i], b[1, i], c[0, i], c[1, i], d[0, i], d[1, i]
+        for j in range(rows.shape[2]):
+            products[i, j] += (a0 * a[0, j] + a1 * a[1, j] + b0 * b[0, j] + b1 * b[1, j]) + (
+                c0 * c[0, j] + c1 * c[1, j] + d0 * d[0, j] + d1 * d[1, j]
+            )
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _subtract_products(rows, count, factor, products):
+    """Subtract the scaled products of the first columns of rows (2, W) with all columns from a matrix."""
+    for i in range(count):
+        first, second = factor * rows[0, i], factor * rows[1, i]
+        for j in range(rows.shape[1]):
+            products[i, j] -= first * rows[0, j] + second * rows[1, j]
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _carry_over(products, motions, count, mixed, posed):
+    """Express products by motions (6, 12): `mixed` (W, 12) where one factor is a motion, `posed` (12, 12) where both are.
+
+    The first tile of the products contains both triangles.
+    """
+    for i in range(count):
+        p, m = products[i], motions
+        for j in range(m.shape[1]):
+            mixed[i, j] = (p[0] * m[0, j] + p[1] * m[1, j] + p[2] * m[2, j]) + (
+                p[3] * m[3, j] + p[4] * m[4, j] + p[5] * m[5, j])
+    for i in range(12):
+        m, x = motions, mixed
+        for j in range(m.shape[1]):
+            posed[i, j] = (m[0, i] * x[0, j] + m[1, i] * x[1, j] + m[2, i] * x[2, j]) + (
+                m[3, i] * x[3, j] + m[4, i] * x[4, j] + m[5, i] * x[5, j])
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _expand(rows, motions, prior_std, full):
+    """Write derivatives with respect to the camera and the pose (2, K + 6) from those in the camera's frame (2, W)."""
+    free = len(prior_std)
+    for r in range(2):
+        for i in range(6):
+            by_camera, by_pose = 0.0, 0.0
+            for k in range(6):
+                by_camera += motions[k, i] * rows[r, k]
+                by_pose += motions[k, 6 + i] * rows[r, k]
+            full[r, i], full[r, free + i] = by_camera * prior_std[i], by_pose
+        for i in range(6, free):
+            full[r, i] = rows[r, i] * prior_std[i]
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _write_own(at, together, derivative, own_std, n, rows_own):
+    """Write derivatives (2, 4) with respect to the coordinates of fiducial n and to the object's scale."""
+    for r in range(2):
+        rows_own[r, 3] = 0.0
+        for i in range(3):
+            value = 0.0
+            for k in range(3):
+                value += together[k, i] * derivative[r, k]
+            rows_own[r, i] = value * own_std[3 * n + i]
+            rows_own[r, 3] += value * at[i] * own_std[-1]
+
+
+@njit(cache=True, fastmath=kernels.FAST)
+def _clear_coupling(c, s, free, coupling, cameras_first):
+    """Clear the coupling of a camera with a snapshot in which it sees nothing."""
+    for i in range(6):
+        for j in range(free):
+            if cameras_first:
+                coupling[c, j, 6 * s + i] = 0.0
+            else:
+                coupling[s, i, free * c + j] = 0.0
 
 
 @njit(cache=True, fastmath=kernels.FAST)
@@ -260,9 +369,10 @@ def _start_object(own_offset, coupling, border, own_gradient):
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _add_object(rows, rows_own, ru, rv, c, s, n, coupling, border, own_gradient, cameras_first):
+def _add_object(rows, rows_own, residuals, c, s, n, coupling, border, own_gradient, cameras_first):
     """Add the information of one observation about its fiducial's coordinates and the object's scale."""
     size, wide = border.shape
+    ru, rv = residuals
     first, last, free = wide - size, size - 1, rows.shape[1] - 6
     for k in range(4):
         own = 3 * n + k if k < 3 else last
@@ -286,11 +396,10 @@ def _add_object(rows, rows_own, ru, rv, c, s, n, coupling, border, own_gradient,
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _project(given, state, c, s, scale, camera_at, residual):
+def _project(given, own_offset, c, s, scale, camera_at, residual):
     """Write the residuals of a camera in a snapshot, predicted minus observed: (2, N) pixels."""
-    points, radius_squared, lenses, uv, _, _, _, _, _, _, _, own_std = given
-    _, rotation, centre, own_offset = state
-    rotation_cam, position, parameters, coefficients, (fx, fy, cx, cy) = camera_at
+    points, radius_squared, lenses, uv, own_std = given[0], given[1], given[2], given[3], given[11]
+    together, there, coefficients, (fx, fy, cx, cy) = camera_at
     at, point = np.empty(3), np.empty(3)
     for n in range(residual.shape[1]):
         for i in range(3):
@@ -298,11 +407,7 @@ def _project(given, state, c, s, scale, camera_at, residual):
             if len(own_std):
                 at[i] = scale * at[i] + own_offset[3 * n + i] * own_std[3 * n + i]
         for i in range(3):
-            point[i] = rotation[s, i, 0] * at[0] + rotation[s, i, 1] * at[1] + rotation[s, i, 2] * at[2]
-            point[i] += centre[s, i] - position[i] - parameters[3 + i]
-        x, y, z = point[0], point[1], point[2]
-        for i in range(3):
-            point[i] = rotation_cam[i, 0] * x + rotation_cam[i, 1] * y + rotation_cam[i, 2] * z
+            point[i] = together[i, 0] * at[0] + together[i, 1] * at[1] + together[i, 2] * at[2] + there[i]
         image = lens_kernels.image_of(
             lenses, c, point[0], point[1], max(point[2], NEAREST_DEPTH), radius_squared[n], coefficients
         )
@@ -358,26 +463,6 @@ def _subtract_object(share, shared, shared_own, c, s, coupling, border):
             coupling[s, i, first + own] -= shared[0, free + i] * mine_u + shared[1, free + i] * mine_v
         for other in range(own + 1):
             border[own, first + other] -= shared_own[0, other] * mine_u + shared_own[1, other] * mine_v
-
-
-@njit(cache=True, fastmath=kernels.FAST)
-def _distribute(products, gradient, c, s, free, camera, coupling, pose, camera_gradient, pose_gradient, cameras_first):
-    """Add the lower triangle of one camera's products with one snapshot to the blocks."""
-    for i in range(free):
-        camera_gradient[c, i] += gradient[i]
-        for j in range(i + 1):
-            camera[c, i, j] += products[i, j]
-            camera[c, j, i] = camera[c, i, j]
-    for i in range(6):
-        pose_gradient[s, i] += gradient[free + i]
-        for j in range(i + 1):
-            pose[s, i, j] += products[free + i, free + j]
-            pose[s, j, i] = pose[s, i, j]
-        for j in range(free):
-            if cameras_first:
-                coupling[c, j, 6 * s + i] = products[free + i, j]
-            else:
-                coupling[s, i, free * c + j] = products[free + i, j]
 
 
 @njit(cache=True, fastmath=kernels.FAST)

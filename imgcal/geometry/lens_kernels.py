@@ -214,8 +214,8 @@ def _image(lens: CompiledLens, size: int) -> Formula:
     @compile_as(lens.name, fastmath=FAST)
     def image(px, py, depth, radius_squared, k):
         squared = depth * depth
-        per_depth = depth / (squared - radius_squared)
-        log_slope = -(squared + radius_squared) / (depth * (squared - radius_squared))
+        inverse = 1 / (depth * (squared - radius_squared))
+        per_depth, log_slope = squared * inverse, -(squared + radius_squared) * inverse
         x, y = px * per_depth, py * per_depth
         xd, yd, jxx, jxy, jyy, rr, _ = distort(1.0, x, y, as_tuple(k, size))
         return per_depth, log_slope, x, y, rr, xd, yd, jxx, jxy, jyy

@@ -124,14 +124,24 @@ def drop_repeats(detections: Detections) -> tuple[Detections, Repeats]:
 def _sort_images(detections: Detections) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
     """Sort blobs by image: which are listed once (M,), the order of those, and where in it each image begins (I,)."""
     u, v = detections.uv.T
-    order = np.lexsort((detections.fiducial, v, u, detections.camera, detections.snapshot))
-    columns = np.stack([detections.snapshot, detections.camera, u, v, detections.fiducial])[:, order]
+    image = detections.snapshot * len(detections.camera_names) + detections.camera
+    order = np.lexsort((u, image))
+    again = _equal_to_previous(order, image, u)
+    if again.any():
+        order = np.lexsort((detections.fiducial, v, u, image))
+        again = _equal_to_previous(order, image, u, v, detections.fiducial)
     kept = np.ones(len(detections), dtype=np.bool_)
-    kept[order[1:]] = (np.diff(columns, axis=1) != 0).any(0)
+    kept[order] = ~again
     order = order[kept[order]]
-    image = np.stack([detections.snapshot[order], detections.camera[order]])
-    begins = np.flatnonzero(np.r_[True, (np.diff(image, axis=1) != 0).any(0)]) if len(order) else np.empty(0, int)
+    begins = np.flatnonzero(~_equal_to_previous(order, image))
     return kept, order, begins
+
+
+def _equal_to_previous(order: NDArray[np.int64], *columns: NDArray[Any]) -> NDArray[np.bool_]:
+    """Tell which rows of sorted columns (M,) are equal to the row before."""
+    equal = np.zeros(len(order), dtype=np.bool_)
+    equal[1:] = np.logical_and.reduce([column[order[1:]] == column[order[:-1]] for column in columns])
+    return equal
 
 
 def _find_equal(uv: NDArray[np.float64], group: NDArray[np.int64], begins: NDArray[np.int64]) -> NDArray[np.int64]:
