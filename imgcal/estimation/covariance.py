@@ -26,6 +26,7 @@ from imgcal.estimation.robust_losses import NamedLoss
 from imgcal.geometry import RigidTransform, cross_matrix, kernels, left_jacobian
 from imgcal.types import CameraRig
 from renderers.compiling import njit
+from renderers.interpreting import without_machine_code
 
 UNDETERMINED = "covariance: the observations do not determine the object's pose in every snapshot"
 LEAST_STD = 1e-9
@@ -196,16 +197,23 @@ def remaining_variance(solution: Solution) -> NDArray[np.float64]:
         RefusedError: the information is singular.
     """
     equations = solution.equations
-    snapshots, cameras = equations.coupling.shape[1:3]
+    snapshots = equations.coupling.shape[1]
+    few = snapshots <= FEW_POSES and equations.object is None
     if equations.cost.device.type != "cpu":
-        diagonal = whitened_covariance(solution).diagonal(dim1=-2, dim2=-1)
-        variance = diagonal.unflatten(-1, (cameras, -1)).cpu().numpy()
-    elif snapshots <= FEW_POSES and equations.object is None:
-        variance = _by_poses(equations)
+        variance = _in_tensors(solution)
+    elif missing := without_machine_code(_diagonal if few else _diagonal_without_poses):
+        variance = missing.call_twin(_in_tensors, solution)
     else:
-        variance = _by_cameras(equations)
+        variance = _by_poses(equations) if few else _by_cameras(equations)
     if not np.isfinite(variance).all():
         raise RefusedError(UNDETERMINED)
+    return variance
+
+
+def _in_tensors(solution: Solution) -> NDArray[np.float64]:
+    """Diagonals (B, C, K) on any device."""
+    diagonal = whitened_covariance(solution).diagonal(dim1=-2, dim2=-1)
+    variance: NDArray[np.float64] = diagonal.unflatten(-1, (solution.state.offset.shape[1], -1)).cpu().numpy()
     return variance
 
 

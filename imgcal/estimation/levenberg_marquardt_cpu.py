@@ -271,7 +271,9 @@ def shared_arrays(problem: Problem) -> tuple[np.ndarray | None, ...]:
 
 
 def rig_at(problem: Problem, offset: Tensor) -> CameraRig:
-    """Do the work of `linearize.rig_at` for tensors on the CPU, without gradients."""
+    """Do the work of `linearization.rig_at` for tensors on the CPU, without gradients."""
+    if missing := without_machine_code(turn_all):
+        return missing.call_twin(torch.no_grad()(linearization.rig_at), problem, offset)
     factory = problem.factory
     given = (factory.cam_from_rig.rotation, factory.cam_from_rig.translation)
     rotation, translation = (torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in given)
