@@ -269,20 +269,22 @@ def _subtract_products(rows, count, factor, products):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _carry_over(products, motions, count, mixed, posed):
-    """Express products by motions (6, 12): `mixed` (W, 12) where one factor is a motion, `posed` (12, 12) where both are.
+    """Express products (W, W) by the steps of `motions` (6, 16) instead of the motions.
 
-    The first tile of the products contains both triangles.
+    Fills `mixed` (W, 16), products of all columns with the steps, and `posed` (12, 16), those of the steps.
     """
     for i in range(count):
         p, m = products[i], motions
         for j in range(m.shape[1]):
             mixed[i, j] = (p[0] * m[0, j] + p[1] * m[1, j] + p[2] * m[2, j]) + (
-                p[3] * m[3, j] + p[4] * m[4, j] + p[5] * m[5, j])
+                p[3] * m[3, j] + p[4] * m[4, j] + p[5] * m[5, j]
+            )
     for i in range(12):
         m, x = motions, mixed
         for j in range(m.shape[1]):
             posed[i, j] = (m[0, i] * x[0, j] + m[1, i] * x[1, j] + m[2, i] * x[2, j]) + (
-                m[3, i] * x[3, j] + m[4, i] * x[4, j] + m[5, i] * x[5, j])
+                m[3, i] * x[3, j] + m[4, i] * x[4, j] + m[5, i] * x[5, j]
+            )
 
 
 @njit(cache=True, fastmath=kernels.FAST)

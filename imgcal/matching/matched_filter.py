@@ -261,7 +261,7 @@ def _known_poses(snapshot: Snapshot) -> list[RigidTransform]:
 def _is_in_view(pose: RigidTransform, snapshot: Snapshot) -> bool:
     """Check whether any camera would see the object there."""
     points = pose.apply(snapshot.obj.points.to(snapshot.rig.focal_length))
-    return bool(snapshot.rig.expand(1).project_values(points[None]).visible.any())
+    return bool(snapshot.rig.project_values(points).visible.any())
 
 
 def _distance(snapshot: Snapshot) -> float:

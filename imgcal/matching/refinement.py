@@ -105,7 +105,7 @@ def fit_and_measure(
 def predictions(rig: CameraRig, scene: Scene, pose: RigidTransform) -> NDArray[np.float64]:
     """Pixels of all fiducials: (C, N, 2)."""
     points = pose.apply(scene.obj.points.to(rig.focal_length))
-    return rig.expand(1).project_values(points[None], scene.obj.radius).uv[0].numpy()
+    return rig.project_values(points, scene.obj.radius).uv.numpy()
 
 
 def spacing(uv: NDArray[np.float64]) -> float:
@@ -210,7 +210,7 @@ def _measure(
 ) -> list[Measured]:
     """Measure the markers of all cameras near their expected places (C, N, 2)."""
     points = fit.rig_from_object.apply(scene.obj.points.to(scene.rig.focal_length))  # (1, N, 3)
-    depth = fit.rig.expand(1).project_values(points).depth[0].numpy()
+    depth = fit.rig.project_values(points[0]).depth.numpy()
     focal = scene.rig.focal_length.mean(-1).numpy()[:, None]
     per_mm = focal / np.maximum(depth, 1.0)
     given = scene.obj.radius

@@ -72,8 +72,11 @@ class CameraVisibility:
             rig: the current one.
             predicted: (C, N, 2) px, nan if the object's pose is unknown; it may then be in view.
         """
+        missing = self.missing_cameras
+        if not missing:
+            return missing
         unknown = set(np.flatnonzero(np.isnan(predicted).all((1, 2))).tolist())
-        return self.missing_cameras & (self._should_see(rig, predicted) | unknown)
+        return missing & (self._should_see(rig, predicted) | unknown)
 
     def doubtful_cameras(self, time: float) -> frozenset[int]:
         """Cameras that have lately seen a possible object in the wrong place, and nothing better since."""

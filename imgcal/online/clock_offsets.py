@@ -64,6 +64,7 @@ class ClockOffsets:
         self._told = np.zeros(cameras)  # s, as last reported
         self.late = np.zeros(cameras)  # s of known delay: blobs are corrected for it
         self._period = math.nan
+        self._solved: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None  # offsets of the present data
 
     def __call__(
         self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: MeasurementUpdate | None
@@ -110,11 +111,16 @@ class ClockOffsets:
 
     def _begin(self, cameras: int | NDArray[np.bool_]) -> None:
         """Discard the data of some cameras."""
-        self._normal[cameras], self._right[cameras] = 0.0, 0.0
+        self._normal[cameras], self._right[cameras], self._solved = 0.0, 0.0, None
         self._other[cameras], self._seconds[cameras] = 0, 0.0
 
     def offsets(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Delay of each camera relative to the median one, and its standard deviation: (C,) s; nan = unknown."""
+        if self._solved is None:
+            self._solved = self._solve()
+        return self._solved
+
+    def _solve(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         power = np.diagonal(self._normal, axis1=1, axis2=2)
         scale = np.sqrt(np.maximum(power, 1e-30))
         scaled = self._normal / (scale[:, :, None] * scale[:, None])
@@ -138,13 +144,12 @@ class ClockOffsets:
     def _predict(state: RigState, rig_from_object: RigidTransform) -> NDArray[np.float64]:
         """Project the fiducials of an object in another pose: (C, N, 2) pixels, nan out of view."""
         belief = state.belief
-        points = rig_from_object.reshape(1).apply(belief.points_object)
-        image = belief.rig.expand(1).project_values(points, belief.obj.radius)
-        return np.where(image.visible[0].numpy()[..., None], image.uv[0].numpy(), np.nan)
+        image = belief.rig.project_values(rig_from_object.reshape().apply(belief.points_object), belief.obj.radius)
+        return np.where(image.visible.numpy()[..., None], image.uv.numpy(), np.nan)
 
     def _add(self, state: RigState, velocity: NDArray[np.float64]) -> None:
         """Add the residuals of a snapshot; `velocity` (C, N, 2) pixels a second."""
-        keep = math.exp(-self._period / MEMORY_SECONDS)
+        keep, self._solved = math.exp(-self._period / MEMORY_SECONDS), None
         self._normal *= keep
         self._right *= keep
         self._seconds *= keep
@@ -221,7 +226,7 @@ class ClockOffsets:
         told, late = (np.array(values[name], dtype=np.float64) for name in ("told", "late"))
         if not all(each.shape == self._told.shape and np.isfinite(each).all() for each in (told, late)):
             raise ValueError(f"{self.name}: expected seconds of {len(self._told)} cameras")
-        self._told, self.late = told, late
+        self._told, self.late, self._solved = told, late, None
 
 
 def unsynchronized_event(camera: str, since: float, time: float, snapshot: int) -> Event:

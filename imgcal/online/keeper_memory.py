@@ -181,8 +181,8 @@ class KeeperMemory:
         """Project the fiducials of an object in a pose (1,): (C, N, 2) pixels; nan without a pose."""
         if pose is None:
             return np.full((self.prior.num_cameras, self.obj.num_fiducials, 2), np.nan)
-        points = self.belief.points_at(pose)
-        uv: NDArray[np.float64] = self.belief.rig.expand(1).project_values(points, self.obj.radius).uv[0].numpy()
+        points = self.belief.points_at(pose)[0]
+        uv: NDArray[np.float64] = self.belief.rig.project_values(points, self.obj.radius).uv.numpy()
         return uv
 
     def observed(self, blobs: Detections) -> Observations:

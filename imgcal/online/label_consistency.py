@@ -89,8 +89,8 @@ def check_labels(
     distance = np.linalg.norm(fit.residual, axis=-1)
     limit = options.identity_error + MOST_APART * median(distance[there]) if there.any() else 0.0
     stray |= there & ~measured[:, None] & (distance > limit)
-    image = rig.expand(1).project_values(fit.rig_from_object.apply(obj.points), obj.radius)
-    stray |= find_merged(named, there & ~stray, image.uv[0].numpy(), image.visible[0].numpy())
+    image = rig.project_values(fit.rig_from_object[0].apply(obj.points), obj.radius)
+    stray |= find_merged(named, there & ~stray, image.uv.numpy(), image.visible.numpy())
     rows = named.fiducial >= 0
     lost = stray[named.camera[rows], named.fiducial[rows]]
     fiducial = named.fiducial.copy()

@@ -143,7 +143,7 @@ class _Scene:
         focal = rig.focal_length.mean(-1).numpy()[:, None, None]
         depth = np.where(in_camera[..., 2:] > 1.0, in_camera[..., 2:], np.nan)
         self.expected = focal * in_camera[..., :2] / depth  # (C, L, 2) px without distortion
-        uv = rig.expand(1).project_values(points[None]).uv[0].numpy()
+        uv = rig.project_values(points).uv.numpy()
         self.inside = well_inside(np.where(np.isfinite(self.expected), uv, np.nan), rig)
 
     def bare(self, camera: int) -> int:

@@ -80,7 +80,7 @@ def light_points(
     for _ in range(NEWTON_STEPS):
         by_point, _ = _jacobians(belief, point, camera, light)
         information = _information(by_point, weight, light, count)
-        image = rig.expand(1).project_values(point[None]).uv[0][camera, light]
+        image = rig.project_values(point).uv[camera, light]
         pull = torch.einsum("mri,m,mr->mi", by_point, weight, uv - image)
         step = torch.linalg.pinv(information) @ point.new_zeros(count, 3).index_add_(0, light, pull)[..., None]
         point = point + step[..., 0]

@@ -1,5 +1,9 @@
 """Label a snapshot from the previous one: near the predictions, or again after a camera has moved."""
 
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs, no-check-untyped-defs
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -13,6 +17,7 @@ from imgcal.association import PipelineOptions, distances_to_nearest, merging_re
 from imgcal.geometry import RigidTransform
 from imgcal.medians import median, median_of_known
 from imgcal.types import CalibrationObject, CameraRig, Detections
+from renderers.compiling import njit
 
 TOO_NEAR = 0.6
 """Distance (px) below which two predictions are too close to tell their blobs apart."""
@@ -44,12 +49,24 @@ def near_prediction(blobs: Detections, predicted: NDArray[np.float64]) -> NDArra
     reach = 0.25 * median(gaps)
     order = np.lexsort((blobs.uv[:, 0], blobs.camera))
     ends = np.searchsorted(blobs.camera[order], np.arange(len(predicted) + 1))
-    for places, crowded, begin, end in zip(predicted, gaps < TOO_NEAR, ends[:-1], ends[1:], strict=True):
-        rows, found = order[begin:end], np.empty(len(places), dtype=np.int64)
-        mutual_nearest(places, blobs.uv[rows], reach, found)
-        named = np.flatnonzero((found >= 0) & ~crowded)
-        labels[rows[found[named]]] = named
+    found = np.empty(len(blobs), dtype=np.int64)
+    _label_nearest(predicted, gaps < TOO_NEAR, blobs.uv[order], ends, reach, found)
+    labels[order] = found
     return labels
+
+
+@njit(cache=True)
+def _label_nearest(predicted, crowded, uv, ends, reach, labels):
+    """Write the fiducial of each blob (M,); those of camera c are the rows from ends[c] to ends[c + 1] of uv (M, 2)."""
+    found = np.empty(predicted.shape[1], np.int64)
+    for m in range(len(labels)):
+        labels[m] = -1
+    for c in range(len(predicted)):
+        first = ends[c]
+        mutual_nearest(predicted[c], uv[first : ends[c + 1]], reach, found)
+        for n in range(len(found)):
+            if found[n] >= 0 and not crowded[c, n]:
+                labels[first + found[n]] = n
 
 
 def spare_blobs(blobs: Detections, cameras: int) -> NDArray[np.int64]:

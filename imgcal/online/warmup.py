@@ -77,7 +77,7 @@ def _warm_up(rig: CameraRig) -> None:
     seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
     for uv in (truth.uv, truth.uv.float()):  # for `imgcal render` and for the networks
         render_views(uv, seen, rig.image_size, obj, ImageOptions(32, 1.5))
-        rig.to(uv.dtype).expand(1).project_values(obj.points.to(uv.dtype)[None])
+        rig.to(uv.dtype).project_values(obj.points.to(uv.dtype))
 
 
 def _make_generator() -> torch.Generator:
