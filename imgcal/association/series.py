@@ -15,7 +15,7 @@ from imgcal.association.identity import PipelineOptions
 from imgcal.association.proposals import Sight
 from imgcal.association.tracker import SnapshotIdentity, Tracker, to_observations
 from imgcal.errors import InputError, RefusedError
-from imgcal.estimation import ON_A_LINE
+from imgcal.estimation import UNPOSED
 from imgcal.geometry import RigidTransform
 from imgcal.messages import list_names, plural
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
@@ -308,14 +308,14 @@ def _most_frequent_reason(snapshots: Sequence[SnapshotIdentity]) -> str:
 
 
 def drop_snapshots(labelled: Associations, rows: Sequence[int]) -> Associations:
-    """Refuse snapshots (numbers among the used ones) whose labels are collinear.
+    """Refuse snapshots (numbers among the used ones) whose labels do not determine a pose.
 
     Raises:
         RefusedError: no snapshot is left.
     """
-    left = refuse_snapshots(labelled, rows, ON_A_LINE)
+    left = refuse_snapshots(labelled, rows, UNPOSED)
     if not left.used:
-        raise RefusedError(f"estimation: in every snapshot: {ON_A_LINE}; capture more, with the whole object in view")
+        raise RefusedError(f"estimation: in every snapshot: {UNPOSED}; capture more, with the whole object in view")
     return left
 
 

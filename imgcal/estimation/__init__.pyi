@@ -48,7 +48,7 @@ from .map_operator import encode_options, map_state, prepend_lenses, split_lense
 from .moves import find_moves, longest_episode
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ScaleEvidence, ShapeEvidence, offsets
 from .pose_initialization import initial_pose
-from .pose_support import ON_A_LINE, UndeterminedPosesError, has_poses, require_poses
+from .pose_support import UNPOSED, UndeterminedPosesError, has_poses, require_poses
 from .reference_cameras import Gauge
 from .rig_error import displace, error_between, step_by_error
 from .rig_from_points import PointStart, cold_start_from_points, move_to_pair_frame, prior_of_pair
@@ -65,9 +65,9 @@ __all__ = [
     "LEAST_SNAPSHOTS",
     "MAP_DEPTHS",
     "MAP_SIZE",
-    "ON_A_LINE",
     "POSE_PARAMETERS",
     "SNAPSHOTS_TO_BEND",
+    "UNPOSED",
     "BlockScatter",
     "ColdStart",
     "Estimate",

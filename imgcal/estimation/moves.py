@@ -31,6 +31,7 @@ from imgcal.estimation.change_points import (
 from imgcal.estimation.correlation import correlation_time
 from imgcal.estimation.linearization import Problem, State, points_at, pose_at, rig_at
 from imgcal.estimation.map_estimate import equations_at, minimize
+from imgcal.estimation.pose_support import has_poses
 from imgcal.estimation.robust_losses import NamedLoss, huber
 from imgcal.medians import median
 from imgcal.types import PARAMETER_KINDS, Kind, MovedCamera
@@ -63,6 +64,8 @@ errors are correlated: a camera that has moved stays there, but the error of a s
 MOST_EPISODES, OUTERMOST = 4.0, 4
 """Longest time, in episodes, between a step and the nearer end of a capture for which the step may be an error that has
 passed. Whether it has passed is judged by the outermost of these snapshots, one in so many."""
+TRACE = 1e-3
+"""Share of its weight that a label keeps if the object's pose needs it but it must not count."""
 LEAST_LABELS = 2
 """Smallest number of labels from which the shift of a camera's image in a snapshot is computed."""
 
@@ -147,10 +150,16 @@ class Places:
         return float(sum(part.clamp_max(CLIP**2).sum() for part in own) - 2 * sum(labels))
 
     def drop_labels(self, place: int, rows: NDArray[np.int64]) -> Places:
-        """Drop the labels of one place in some snapshots; the estimate stays."""
-        root_weight = self.problem.root_weight.clone()
+        """Drop the labels of one place in some snapshots; the estimate stays.
+
+        Where the others do not determine the object's pose, they keep a trace of their weight, and with it the pose.
+        """
+        problem, root_weight = self.problem, self.problem.root_weight.clone()
         root_weight[:, rows, place] = 0
-        return replace(self, problem=replace(self.problem, root_weight=root_weight))
+        part_of = None if problem.part_of is None else problem.part_of.numpy()
+        needed = rows[~has_poses((root_weight[0, rows] > 0).numpy(), problem.points, part_of)]
+        root_weight[:, needed, place] = TRACE * problem.root_weight[:, needed, place]
+        return replace(self, problem=replace(problem, root_weight=root_weight))
 
     def episode(self, camera: int) -> int:
         """Longest transient error of a camera, in successive snapshots; 0 = errors are not correlated.

@@ -12,17 +12,19 @@ from imgcal.errors import RefusedError
 from imgcal.geometry import pose_rank
 from imgcal.messages import plural
 
+LEAST_LABELS = 4
+"""Labels of a solid object, in all cameras together."""
 LEAST_BREADTH = 0.05
 """Breadth of the visible part, relative to the whole object's: below, a rotation about a line is undetermined."""
 
-ON_A_LINE = "the remaining labels lie on one line, which leaves the rotation about it undetermined"
+UNPOSED = "fewer than four labels remain, or all lie on one line: they do not determine the object's pose"
 TOO_FEW = "two cameras share labels of fewer than {}"
 
 
 class UndeterminedPosesError(RefusedError):
     """Raise when labels do not determine the object's pose in some snapshots; the caller can drop those."""
 
-    def __init__(self, rows: Sequence[int], reason: str = ON_A_LINE) -> None:
+    def __init__(self, rows: Sequence[int], reason: str = UNPOSED) -> None:
         """Keep the indices of the snapshots among those of the fit."""
         super().__init__(f"estimation: in {plural(len(rows), 'snapshot')} {reason}")
         self.rows = tuple(rows)
@@ -31,7 +33,8 @@ class UndeterminedPosesError(RefusedError):
 def require_poses(seen: NDArray[np.bool_], points: Tensor, part_of: NDArray[np.int64] | None = None) -> None:
     """Require that the labels `seen` (S, C, N) of an object's points (N, 3) determine its pose in every snapshot.
 
-    A solid object needs points off a line; a stick needs two points and a light its one, each in two cameras.
+    A solid object needs points off a line, and four labels: three fit some pose exactly, whatever the cameras, and that
+    pose may be anywhere. A stick needs two points and a light its one, each in two cameras.
 
     Args:
         seen: whether each point has a label.
@@ -68,13 +71,13 @@ def has_poses(seen: NDArray[np.bool_], points: Tensor, part_of: NDArray[np.int64
         enough: NDArray[np.bool_] = (seen.sum(1) >= 2).sum(1) >= least
         return enough
     shown, where = seen.any(1), points.detach().cpu().double().numpy()
-    whole = breadth(where)
+    whole, enough = breadth(where), seen.sum((1, 2)) >= LEAST_LABELS
     if whole > 0 and shown.all():
-        return np.ones(len(seen), dtype=bool)
+        return enough
     # Patterns repeat: thousands of snapshots show only a few different parts of an object.
     parts, which = np.unique(shown, axis=0, return_inverse=True)
     broad = np.array([breadth(where[part]) > LEAST_BREADTH * whole for part in parts], dtype=bool)
-    return broad[which.reshape(-1)]
+    return enough & broad[which.reshape(-1)]
 
 
 def breadth(points: NDArray[np.float64]) -> float:

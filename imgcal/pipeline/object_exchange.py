@@ -52,12 +52,10 @@ def measure_sizes(fit: Estimate) -> tuple[Floats, Floats]:
     Returns:
         (S,) sizes relative to the estimate's object, and (S,) their standard deviations by noise.
     """
-    seen = fit.problem.root_weight[0] > 0
-    weight = torch.where(seen, fit.problem.root_weight[0].square(), 0.0)
-    slope = _differences(fit)
-    slope = torch.where(seen[..., None, None], slope, 0.0)  # (S, C, N, 2, 7)
-    information = torch.einsum("scnai,scn,scnaj->sij", slope, weight, slope)
-    pull = -torch.einsum("scnai,scn,scna->si", slope, weight, fit.residual)
+    root_weight = fit.problem.root_weight[0, ..., None]  # (S, C, N, 1)
+    slope = torch.where(root_weight[..., None] > 0, root_weight[..., None] * _differences(fit), 0.0).flatten(1, 3)
+    information = slope.mT @ slope  # (S, 7, 7)
+    pull = -(slope.mT @ (root_weight * fit.residual).flatten(1)[..., None])[..., 0]
     scale = information.diagonal(dim1=1, dim2=2).clamp_min(1e-30).rsqrt()
     whitened = information * scale[:, :, None] * scale[:, None]
     inverse = torch.linalg.pinv(whitened, hermitian=True, rtol=1e-12)

@@ -47,6 +47,20 @@ def test_the_moment_is_found_from_a_wrong_start(bumped):
     assert abs(move.size - 0.1) < 4 * move.sigma
 
 
+def test_labels_that_are_dropped_leave_the_pose_of_their_snapshot(bumped):
+    places, _ = bumped
+    alone = replace(places.problem, root_weight=places.problem.root_weight.clone())
+    alone.root_weight[:, 7, :CAMERA] = alone.root_weight[:, 7, CAMERA + 1 :] = 0  # nobody else sees the object then
+    places = replace(places, problem=alone)
+    left = places.drop_labels(CAMERA, np.array([7, 8]))
+    assert np.isfinite(left.blocks.statistics([CAMERA], np.array([FIRST]))).all()
+    assert np.abs(left.blocks.camera[7]).max() < 1e-5 * np.abs(places.blocks.camera[7]).max()  # they do not count
+    assert (
+        not left.seen[8, CAMERA]
+        and np.isfinite(left.divide(Step(CAMERA, FIRST, 0.0, np.zeros(10)), OPTIONS).costs(10)).all()
+    )
+
+
 def lasting(uv: torch.Tensor, size: float, seed: int = 3) -> torch.Tensor:
     """Observations (S, C, N, 2) px whose images are shifted by errors that last some two snapshots."""
     draw, memory = np.random.default_rng(seed), 0.5

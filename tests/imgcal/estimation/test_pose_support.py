@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from imgcal.errors import RefusedError
-from imgcal.estimation import UndeterminedPosesError, require_poses
+from imgcal.estimation import UndeterminedPosesError, has_poses, require_poses
 from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate
 from imgcal.synthesis import PhysicalDrift, simulate_volume, true_detections
@@ -59,3 +59,23 @@ def test_breadth_is_relative_to_the_object():
     with pytest.raises(UndeterminedPosesError) as found:
         require_poses(seen, points)
     assert found.value.rows == (1,)
+
+
+def test_three_labels_fit_any_pose_and_determine_none():
+    points = torch.tensor([[0.0, 0, 0], [100, 0, 0], [0, 80, 0], [60, 60, 40]])
+    seen = np.zeros((3, 2, 4), dtype=bool)
+    seen[0, 0, :3] = True  # three labels of one camera ...
+    seen[1, 0, :2], seen[1, 1, 2] = True, True  # ... of two ...
+    seen[2, 0, :2], seen[2, 1, 1:3] = True, True  # ... and four
+    assert has_poses(seen, points).tolist() == [False, False, True]
+
+
+def test_a_snapshot_that_is_left_with_three_labels_is_named_and_left_out():
+    """An object that leaves the view: its pose slid along a valley, and no minimum was found."""
+    rig, wand, table = wand_capture()
+    last = np.flatnonzero((table.snapshot == 7) & (table.camera < 2))
+    assert len(last) > 5
+    table.uv[last[3:]] += np.random.default_rng(2).choice([-40.0, 40.0], size=(len(last) - 3, 2))
+    result = calibrate(table.select((table.snapshot != 7) | (table.camera < 2)), rig, wand)
+    (refused,) = (s for s in result.labelled.snapshots if s.status == "refused")
+    assert refused.name == "00007" and "fewer than four labels" in refused.reason
