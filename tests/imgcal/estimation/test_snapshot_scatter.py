@@ -91,6 +91,20 @@ def test_the_camera_whose_lens_is_bad_gets_the_larger_factor(simulate) -> None:
     assert factor[0] > 1.2 * factor[1:].max()
 
 
+def test_errors_that_last_in_one_camera_of_many_widen_that_camera_alone(simulate) -> None:
+    case = simulate(snapshots=128, cameras=8, noise=0.1, seed=1)
+    generator, shift, memory = torch.Generator().manual_seed(2), torch.zeros(2, dtype=torch.float64), 0.9
+    uv = case.observations.uv.clone()
+    for row in range(128):  # on average over all cameras, there is no more scatter than noise would make
+        noise = torch.randn(2, generator=generator, dtype=torch.float64)
+        shift = memory * shift + (1 - memory**2) ** 0.5 * 0.3 * noise
+        uv[row, 5] += shift
+    seen = replace(case.observations, uv=uv, sigma=torch.full_like(case.observations.sigma, 0.1))
+    factor = scatter(estimate(seen, case.factory, case.obj, prior_std=case.prior_std)).factor
+    assert factor is not None and factor[5] > 1.2
+    assert (factor[torch.arange(8) != 5] == 1).all()
+
+
 @pytest.mark.parametrize("tolerance", [0.0, 0.05])
 def test_the_total_information_is_that_of_all_blocks(simulate, tolerance: float) -> None:
     case = simulate(snapshots=9, cameras=4)
