@@ -59,8 +59,8 @@ LEAST_LEAD = 0.8
 EPISODE, LEAST_EPISODE = 2.0, 3
 """Longest transient error in correlation times, and its smallest length in snapshots where errors are correlated."""
 PERSISTENT = 1e-3
-"""Error probability of the evidence that must remain on either side of a step without its most supportive half, where
-errors are correlated: a camera that has moved stays there, but the error of a second or two ends."""
+"""Error probability of the evidence that must remain on either side of a step without the half of its episodes that
+support it most, where errors are correlated: a camera that has moved stays there, but errors of a second or two end."""
 MOST_EPISODES, OUTERMOST = 4.0, 4
 """Longest time, in episodes, between a step and the nearer end of a capture for which the step may be an error that has
 passed. Whether it has passed is judged by the outermost of these snapshots, one in so many."""
@@ -333,7 +333,7 @@ def _locate(places: Places, step: Step, options: EstimationOptions) -> Places | 
 
 
 def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: float, noise: float) -> bool:
-    """Check that a step stays significant without its most supportive episode, and evident without half of either side.
+    """Check that a step stays significant without its best episode, and evident without the better half of either side.
 
     A transient error is no motion: a target at the edge of an image, or behind an arm, may seem to be off by pixels for
     some snapshots.
@@ -356,9 +356,14 @@ def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: fl
         if len(moments) <= length:
             return False
         gained = np.bincount(number, gain[rows])
-        for dropped, enough in ((length, least), (len(moments) // 2, least_significant(1, PERSISTENT))):
-            first = int(np.convolve(gained, np.ones(dropped), "valid").argmax())
-            rest = places.drop_labels(camera, rows[(number >= first) & (number < first + dropped)])
+        first = int(np.convolve(gained, np.ones(length), "valid").argmax())
+        episode = number // length  # several of them may be wrong alike
+        best = np.argsort(-np.bincount(episode, gain[rows]))[: (int(episode.max()) + 1) // 2]
+        for dropped, enough in (
+            ((number >= first) & (number < first + length), least),
+            (np.isin(episode, best), least_significant(1, PERSISTENT)),
+        ):
+            rest = places.drop_labels(camera, rows[dropped])
             if rest.blocks.statistics([camera], np.array([row]))[0, 0] < enough * noise:
                 return False
     return True

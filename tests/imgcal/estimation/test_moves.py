@@ -104,18 +104,22 @@ def test_what_is_no_longer_than_an_episode_is_no_step():
     assert not _outlasts_an_episode(places, divided, CAMERA, 0.0, 1.0)
 
 
-def test_an_error_that_ends_is_no_step_however_much_of_it_remains_without_an_episode():
-    rig, wand, truth = faults.wand_in_a_room(60, 1)
+@pytest.mark.parametrize(
+    ("count", "firsts", "off"),  # the latter in px, as recorded in a room
+    [(60, (48,), [0.11, 0.55, 0.32, 0.17, 0.33, 0.42, 0.18]), (90, (45, 75), [0.6] * 6)],
+)
+def test_errors_that_end_are_no_step_however_much_of_it_remains_without_an_episode(count, firsts, off):
+    rig, wand, truth = faults.wand_in_a_room(count, 1)
     observations, _ = accepted_observations(associate(faults.blobs(truth, 1, labelled=True), rig, wand), rig, wand)
-    uv, first = lasting(observations.uv, 0.06), 48
-    off = torch.tensor([0.11, 0.55, 0.32, 0.17, 0.33, 0.42, 0.18], dtype=uv.dtype)  # px, recorded in a room
-    uv[first : first + len(off), CAMERA] += off[:, None, None]
+    uv = lasting(observations.uv, 0.06)
+    for first in firsts:
+        uv[first : first + len(off), CAMERA, :, 0] -= torch.tensor(off, dtype=uv.dtype)[:, None]
     fit = estimate(replace(observations, uv=uv, sigma=torch.full_like(observations.sigma, 0.06)), rig, wand)
     places = Places(fit.problem, fit.solution.state, tuple(range(10)), (0,) * 10, np.arange(len(fit.problem.uv[0])))
-    statistic = float(places.blocks.statistics([CAMERA], np.array([first]))[0, 0])
-    divided = places.divide(Step(CAMERA, first, statistic, np.zeros(10)), OPTIONS)
+    statistic = float(places.blocks.statistics([CAMERA], np.array([firsts[0]]))[0, 0])
+    divided = places.divide(Step(CAMERA, firsts[0], statistic, np.zeros(10)), OPTIONS)
     noise = dispersion(divided.blocks, divided.seen)
-    assert divided.episode(CAMERA) < len(off)
+    assert divided.episode(CAMERA) < len(off) + 3
     assert not _outlasts_an_episode(places, divided, CAMERA, 0.2 * statistic / noise, noise)
 
 
