@@ -355,18 +355,24 @@ def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: fl
         moments, number = np.unique(places.moment[rows], return_inverse=True)
         if len(moments) <= length:
             return False
-        gained = np.bincount(number, gain[rows])
-        first = int(np.convolve(gained, np.ones(length), "valid").argmax())
-        episode = number // length  # several of them may be wrong alike
+        gained, persistent = np.bincount(number, gain[rows]), least_significant(1, PERSISTENT)
+        episode = number // length
         best = np.argsort(-np.bincount(episode, gain[rows]))[: (int(episode.max()) + 1) // 2]
         for dropped, enough in (
-            ((number >= first) & (number < first + length), least),
-            (np.isin(episode, best), least_significant(1, PERSISTENT)),
+            (_best_window(number, gained, length), least),
+            (_best_window(number, gained, len(moments) // 2), persistent),
+            (np.isin(episode, best), persistent),  # an error may come again
         ):
             rest = places.drop_labels(camera, rows[dropped])
             if rest.blocks.statistics([camera], np.array([row]))[0, 0] < enough * noise:
                 return False
     return True
+
+
+def _best_window(number: NDArray[np.int64], gained: Array, length: int) -> NDArray[np.bool_]:
+    """Tell which rows (R,), numbered by snapshot, are within the successive snapshots that gain most: (R,)."""
+    first = int(np.convolve(gained, np.ones(length), "valid").argmax())
+    return (number >= first) & (number < first + length)
 
 
 def _has_passed(places: Places, divided: Places, camera: int, options: EstimationOptions, noise: float) -> bool:
