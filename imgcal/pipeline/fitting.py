@@ -217,6 +217,8 @@ def _adopt_tolerances(obj: CalibrationObject, latest: Calibration | None) -> Cal
 def _require_any_view(arranged: LabelledCapture, rig: CameraRig, obj: CalibrationObject) -> None:
     """Refuse if a camera sees the object, but none of it could be labelled: worse than seeing nothing."""
     labels = arranged.observations.seen.numpy()
+    if labels.any((0, 2)).all():
+        return
     require_views(count_labels(arranged.labelled, labels, arranged.poses, rig, obj), rig, least_share=0.0)
 
 
