@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import os
 import pickle
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -202,9 +203,9 @@ def calibrated(anew: bool = False, arrangement: Arrangement = Arrangement()) -> 
         parts = (arrangement.calibrate, arrangement.follow, *arrangement.only)
         cache = CACHE.with_name(f"{CACHE.stem} {' '.join(parts)}.pkl")
     if not anew and cache.is_file():
-        with cache.open("rb") as file:
+        with cache.open("rb") as file, suppress(AttributeError, ImportError):  # a class has moved since
             found: Calibrated = pickle.load(file)  # written below, by this program
-        return found
+            return found
     given = recording(arrangement)
     numbers = arrangement.calibrated
     numbers = np.sort(FRAMES - 1 - numbers) if arrangement.backwards else numbers
