@@ -2,10 +2,13 @@
 
 There are three tuples of arrays. `given` holds the object's points and their squared radii, the lenses' models, the
 observations and the square roots of their weights, the factory rig, its prior, and that of the object. `state` holds
-the unknowns and `blocks` the normal equations, laid out as in `levenberg_marquardt_cpu._Blocks`. Products are summed
-for each camera and snapshot before they are written. The object's own parameters come last among the coupled ones, and
-have their own border. With several objects, the points have a fourth column, the number of the object; each row shows
-one object.
+the unknowns and `blocks` the normal equations, laid out as in `levenberg_marquardt_cpu._Blocks`. The object's own
+parameters come last among the coupled ones, and have their own border. With several objects, the points have a fourth
+column, the number of the object; each row shows one object.
+
+A step of a camera's pose, or of the object's, moves the object in the camera's frame, for all its points alike: it
+turns about its centre and shifts. So derivatives are taken with respect to these six motions and the lens, and their
+products are summed over the points; only the sums of a camera and a snapshot are expressed by the poses' steps.
 
 A shaking camera shifts all its observations of a snapshot by the same unknown amount. The most probable shift is
 subtracted from the residuals, and the shift is eliminated from the normal equations (Schur complement).
@@ -25,8 +28,8 @@ from renderers.compiling import njit
 SHIFTS = 50
 """Most iterations of reweighting for a shift."""
 TILE = 16
-"""Products are summed in rows of a multiple of this many columns, of which the compiler makes vector instructions. It
-must not know the number, or it writes every product out instead ..."""
+"""Products are summed in rows of a multiple of this many columns, of which the compiler makes vector instructions (it
+must not know the number, or it writes every product out instead) ..."""
 TOGETHER = 4
 """... of this many points at a time."""
 
@@ -88,7 +91,7 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
         if lacking:
             _fix_turns(rotation[s], turns, pose[s])
     width = TILE * ((10 + distortion0.shape[1]) // TILE + 1)
-    wide = TILE + 0 * distortion0.shape[1]
+    wide = TILE + 0 * distortion0.shape[1]  # 12 used; see `TILE`
     several_rows, products, own = np.zeros((TOGETHER, 2, width)), np.empty((width, width)), np.empty((free, free))
     motions, mixed, posed = np.zeros((6, wide)), np.empty((width, wide)), np.empty((12, wide))
     turned, left, rotation_cam, together = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
