@@ -355,7 +355,7 @@ def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: fl
         moments, number = np.unique(places.moment[rows], return_inverse=True)
         if len(moments) <= length:
             return False
-        gained, persistent = np.bincount(number, gain[rows]), least_significant(1, PERSISTENT)
+        gained, persistent = np.bincount(number, gain[rows]).astype(np.float64), least_significant(1, PERSISTENT)
         episode = number // length
         best = np.argsort(-np.bincount(episode, gain[rows]))[: (int(episode.max()) + 1) // 2]
         for dropped, enough in (
