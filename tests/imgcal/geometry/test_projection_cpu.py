@@ -45,6 +45,15 @@ def test_pixels_are_those_of_opencv(o10: CameraRig) -> None:
         np.testing.assert_allclose(found.uv[0, c], pixels[:, 0], atol=1e-8)
 
 
+def test_one_rig_needs_no_batch_axis(o10: CameraRig) -> None:
+    points = 100 * torch.randn(9, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    points[..., 2] += 800
+    alone, many = o10.project_values(points), o10.expand(1).project_values(points[None])
+    for name in ("uv", "depth", "visible"):
+        assert torch.equal(getattr(alone, name), getattr(many, name)[0])
+    assert alone.uv.shape == (10, 9, 2) and alone.visible.any()
+
+
 def test_points_behind_are_finite_and_invisible(o10: CameraRig) -> None:
     rig = o10.select([0])
     depth = torch.tensor([-500.0, -1e-9, 0.0, 0.5 * NEAREST_DEPTH, 900.0], dtype=torch.float64)
