@@ -132,7 +132,7 @@ def _is_worth_measuring(total: Tensor, pull: Tensor, lengths: list[int], shape: 
     groups = torch.cat((torch.ones_like(groups[:, :1]), groups[:, groups.any(0)]), 1)  # of all cameras, and of each
     groups /= groups.sum(0)
     squares = (noise[known][:, known] * scale[:, None] * scale).square()
-    spread = torch.einsum("ig,ij,jg->g", groups, squares, groups)
+    spread = (groups.mT @ squares * groups.mT).sum(1)
     sigmas = torch.full_like(spread, WORTH_OF_ONE)
     sigmas[0] = WORTH_MEASURING
     reached = torch.zeros(len(pull) + 1, count, dtype=pull.dtype, device=pull.device)
