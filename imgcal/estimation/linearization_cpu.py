@@ -30,7 +30,7 @@ SHIFTS = 50
 TILE = 16
 """Products are summed in rows of a multiple of this many columns, of which the compiler makes vector instructions (it
 must not know the number, or it writes every product out instead) ..."""
-TOGETHER = 4
+AT_ONCE = 4
 """... of this many points at a time."""
 
 
@@ -92,11 +92,12 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
             _fix_turns(rotation[s], turns, pose[s])
     width = TILE * ((10 + distortion0.shape[1]) // TILE + 1)
     wide = TILE + 0 * distortion0.shape[1]  # 12 used; see `TILE`
-    several_rows, products, own = np.zeros((TOGETHER, 2, width)), np.empty((width, width)), np.empty((free, free))
+    batch, products, own = np.zeros((AT_ONCE, 2, width)), np.empty((width, width)), np.empty((free, free))
     motions, mixed, posed = np.zeros((6, wide)), np.empty((width, wide)), np.empty((12, wide))
-    turned, left, rotation_cam, together = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    turned, left = np.empty((3, 3)), np.empty((3, 3))
+    rotation_cam, rotation_object = np.empty((3, 3)), np.empty((3, 3))  # of the rig and of the object, to the camera
     parameters, coefficients = np.empty(free), np.empty(free - 10)
-    at, there, around, point = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    at, centre_cam, arm, point = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     derivative = np.empty((2, 3))
     bent, scale = len(own_std) > 0, 1.0
     full, rows_own = np.empty((2, free + 6)), np.empty((2, 4))
@@ -122,16 +123,16 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
             for i in range(free + 1):
                 for j in range(width):
                     products[i, j] = 0
-            kernels.multiply(rotation_cam, rotation[s], together)
+            kernels.multiply(rotation_cam, rotation[s], rotation_object)
             for i in range(3):
                 at[i] = centre[s, i] - position0[c, i] - parameters[3 + i]
             for i in range(3):
-                there[i] = rotation_cam[i, 0] * at[0] + rotation_cam[i, 1] * at[1] + rotation_cam[i, 2] * at[2]
+                centre_cam[i] = rotation_cam[i, 0] * at[0] + rotation_cam[i, 1] * at[1] + rotation_cam[i, 2] * at[2]
             unit = max(1.0, np.sqrt(centre[s, 0] ** 2 + centre[s, 1] ** 2 + centre[s, 2] ** 2))
-            _write_motions(rotation_cam, left, there, unit, motions)
+            _write_motions(rotation_cam, left, centre_cam, unit, motions)
             shaken, total, count = len(shake) > 0 and shake[s, c] > 0, 0.0, 0
             if shaken:
-                camera_at = (together, there, coefficients, (fx, fy, cx, cy))
+                camera_at = (rotation_object, centre_cam, coefficients, (fx, fy, cx, cy))
                 _project(given, own_offset, c, s, scale, camera_at, residual[s, c])
                 cost += take_shift(residual[s, c], root_weight[s, c], shake[s, c], loss, threshold, shift)
                 shared[:] = 0
@@ -142,8 +143,9 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
                     if bent:
                         at[i] = scale * at[i] + own_offset[3 * n + i] * own_std[3 * n + i]
                 for i in range(3):
-                    around[i] = together[i, 0] * at[0] + together[i, 1] * at[1] + together[i, 2] * at[2]
-                    point[i] = around[i] + there[i]
+                    turn = rotation_object[i]
+                    arm[i] = turn[0] * at[0] + turn[1] * at[1] + turn[2] * at[2]
+                    point[i] = arm[i] + centre_cam[i]
                 weight = root_weight[s, c, n]
                 if weight > 0 and point[2] <= NEAREST_DEPTH:
                     cost = np.inf
@@ -156,7 +158,7 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
                 residual[s, c, 0, n], residual[s, c, 1, n] = ru, rv
                 if weight == 0:
                     continue
-                rows = several_rows[count % TOGETHER]
+                rows = batch[count % AT_ONCE]
                 count += 1
                 if shaken:
                     ru, rv = ru - shift[0], rv - shift[1]
@@ -168,38 +170,38 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
                 write_derivative((per_depth, log_slope, x, y, jxx, jxy, jyy), fx_w, fy_w, derivative)
                 for r in range(2):
                     d0, d1, d2 = derivative[r, 0], derivative[r, 1], derivative[r, 2]
-                    rows[r, 0] = around[1] * d2 - around[2] * d1
-                    rows[r, 1] = around[2] * d0 - around[0] * d2
-                    rows[r, 2] = around[0] * d1 - around[1] * d0
+                    rows[r, 0] = arm[1] * d2 - arm[2] * d1
+                    rows[r, 1] = arm[2] * d0 - arm[0] * d2
+                    rows[r, 2] = arm[0] * d1 - arm[1] * d0
                     rows[r, 3], rows[r, 4], rows[r, 5] = d0, d1, d2
                 rows[0, 6], rows[1, 7] = xd * weight, yd * weight
                 rows[0, 8], rows[1, 9] = weight, weight
                 lens_kernels.by_coefficients(lenses, c, x, y, rr, coefficients, fx_w, fy_w, 10, rows)
                 rows[0, free], rows[1, free] = ru * weight, rv * weight
                 if bent:
-                    _write_own(points[n], together, derivative, own_std, n, rows_own)
-                    _expand(rows, motions, prior_std[c], full)
+                    _write_own(points[n], rotation_object, derivative, own_std, n, rows_own)
+                    _express_rows(rows, motions, prior_std[c], full)
                     residuals = (rows[0, free], rows[1, free])
                     _add_object(full, rows_own, residuals, c, s, n, coupling, border, own_gradient, cameras_first)
                 if shaken:
                     total += weight * weight
                     _add_shared(rows, rows_own, weight, n, shared, shared_own)
-                if count % TOGETHER == 0:
-                    _add_products(several_rows, free + 1, products)
+                if count % AT_ONCE == 0:
+                    _add_products(batch, free + 1, products)
             if count == 0:
                 _clear_coupling(c, s, free, coupling, cameras_first)
                 continue
-            if count % TOGETHER:
-                several_rows[count % TOGETHER :] = 0.0
-                _add_products(several_rows, free + 1, products)
+            if count % AT_ONCE:
+                batch[count % AT_ONCE :] = 0.0
+                _add_products(batch, free + 1, products)
             if shaken:
                 share = 1 / (1 / shake[s, c] ** 2 + total)
                 shared[0, free], shared[1, free] = 0.0, 0.0
                 _subtract_products(shared, free, share, products)
                 if bent:
-                    _expand(shared, motions, prior_std[c], full)
+                    _express_rows(shared, motions, prior_std[c], full)
                     _subtract_object(share, full, shared_own, c, s, coupling, border)
-            _carry_over(products, motions, free + 1, mixed, posed)
+            _express_products(products, motions, free + 1, mixed, posed)
             for i in range(6):
                 camera_gradient[c, i] += mixed[free, i]
                 pose_gradient[s, i] += mixed[free, 6 + i]
@@ -232,11 +234,11 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _write_motions(rotation_cam, left, there, unit, motions):
+def _write_motions(rotation_cam, left, centre_cam, unit, motions):
     """Write how an object moves in a camera's frame by steps of the camera's and of its own pose: (6, 12).
 
-    Rows: a rotation about the object's centre, `there` (3,), and a shift. Columns: rotation and position of the camera,
-    rotation and position of the object. What is zero is left as it is.
+    Rows: a rotation about the object's centre, `centre_cam` (3,), and a shift. Columns: rotation and position of the
+    camera, rotation and position of the object. What is zero is left as it is.
     """
     for i in range(3):
         for k in range(3):
@@ -244,9 +246,9 @@ def _write_motions(rotation_cam, left, there, unit, motions):
             motions[3 + k, 3 + i] = -rotation_cam[k, i]
             motions[k, 6 + i] = rotation_cam[k, i]
             motions[3 + k, 9 + i] = unit * rotation_cam[k, i]
-        motions[3, i] = left[1, i] * there[2] - left[2, i] * there[1]
-        motions[4, i] = left[2, i] * there[0] - left[0, i] * there[2]
-        motions[5, i] = left[0, i] * there[1] - left[1, i] * there[0]
+        motions[3, i] = left[1, i] * centre_cam[2] - left[2, i] * centre_cam[1]
+        motions[4, i] = left[2, i] * centre_cam[0] - left[0, i] * centre_cam[2]
+        motions[5, i] = left[0, i] * centre_cam[1] - left[1, i] * centre_cam[0]
 
 
 @njit(cache=True, fastmath=kernels.FAST)
@@ -271,7 +273,7 @@ def _subtract_products(rows, count, factor, products):
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _carry_over(products, motions, count, mixed, posed):
+def _express_products(products, motions, count, mixed, posed):
     """Express products (W, W) by the steps of `motions` (6, 16) instead of the motions.
 
     Fills `mixed` (W, 16), products of all columns with the steps, and `posed` (12, 16), those of the steps.
@@ -291,7 +293,7 @@ def _carry_over(products, motions, count, mixed, posed):
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _expand(rows, motions, prior_std, full):
+def _express_rows(rows, motions, prior_std, full):
     """Write derivatives with respect to the camera and the pose (2, K + 6) from those in the camera's frame (2, W)."""
     free = len(prior_std)
     for r in range(2):
@@ -306,14 +308,14 @@ def _expand(rows, motions, prior_std, full):
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _write_own(at, together, derivative, own_std, n, rows_own):
+def _write_own(at, rotation_object, derivative, own_std, n, rows_own):
     """Write derivatives (2, 4) with respect to the coordinates of fiducial n and to the object's scale."""
     for r in range(2):
         rows_own[r, 3] = 0.0
         for i in range(3):
             value = 0.0
             for k in range(3):
-                value += together[k, i] * derivative[r, k]
+                value += rotation_object[k, i] * derivative[r, k]
             rows_own[r, i] = value * own_std[3 * n + i]
             rows_own[r, 3] += value * at[i] * own_std[-1]
 
@@ -404,7 +406,7 @@ def _add_object(rows, rows_own, residuals, c, s, n, coupling, border, own_gradie
 def _project(given, own_offset, c, s, scale, camera_at, residual):
     """Write the residuals of a camera in a snapshot, predicted minus observed: (2, N) pixels."""
     points, radius_squared, lenses, uv, own_std = given[0], given[1], given[2], given[3], given[11]
-    together, there, coefficients, (fx, fy, cx, cy) = camera_at
+    rotation_object, centre_cam, coefficients, (fx, fy, cx, cy) = camera_at
     at, point = np.empty(3), np.empty(3)
     for n in range(residual.shape[1]):
         for i in range(3):
@@ -412,7 +414,8 @@ def _project(given, own_offset, c, s, scale, camera_at, residual):
             if len(own_std):
                 at[i] = scale * at[i] + own_offset[3 * n + i] * own_std[3 * n + i]
         for i in range(3):
-            point[i] = together[i, 0] * at[0] + together[i, 1] * at[1] + together[i, 2] * at[2] + there[i]
+            turn = rotation_object[i]
+            point[i] = turn[0] * at[0] + turn[1] * at[1] + turn[2] * at[2] + centre_cam[i]
         image = lens_kernels.image_of(
             lenses, c, point[0], point[1], max(point[2], NEAREST_DEPTH), radius_squared[n], coefficients
         )

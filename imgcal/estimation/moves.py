@@ -59,8 +59,8 @@ LEAST_LEAD = 0.8
 EPISODE, LEAST_EPISODE = 2.0, 3
 """Longest transient error in correlation times, and its smallest length in snapshots where errors are correlated."""
 PERSISTENT = 1e-3
-"""Error probability of the evidence that must remain on either side of a step without the half of its episodes that
-support it most, where errors are correlated: a camera that has moved stays there, but errors of a second or two end."""
+"""Error probability of the evidence that must remain on either side of a step without the half that supports it most,
+in one piece or by episodes, where errors are correlated: a camera that has moved stays there, but errors end."""
 MOST_EPISODES, OUTERMOST = 4.0, 4
 """Longest time, in episodes, between a step and the nearer end of a capture for which the step may be an error that has
 passed. Whether it has passed is judged by the outermost of these snapshots, one in so many."""
@@ -156,8 +156,7 @@ class Places:
         """
         problem, root_weight = self.problem, self.problem.root_weight.clone()
         root_weight[:, rows, place] = 0
-        part_of = None if problem.part_of is None else problem.part_of.numpy()
-        needed = rows[~has_poses((root_weight[0, rows] > 0).numpy(), problem.points, part_of)]
+        needed = rows[~has_poses((root_weight[0, rows] > 0).numpy(), problem.points, problem.part_of)]
         root_weight[:, needed, place] = TRACE * problem.root_weight[:, needed, place]
         return replace(self, problem=replace(problem, root_weight=root_weight))
 

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import RefusedError
+from imgcal.estimation.linearization import POSE_PARAMETERS
 from imgcal.geometry import pose_rank
 from imgcal.messages import plural
 
-LEAST_LABELS = 4
-"""Labels of a solid object, in all cameras together."""
+Parts: TypeAlias = NDArray[np.int64] | Tensor | None
+
 LEAST_BREADTH = 0.05
 """Breadth of the visible part, relative to the whole object's: below, a rotation about a line is undetermined."""
 
@@ -30,7 +32,7 @@ class UndeterminedPosesError(RefusedError):
         self.rows = tuple(rows)
 
 
-def require_poses(seen: NDArray[np.bool_], points: Tensor, part_of: NDArray[np.int64] | None = None) -> None:
+def require_poses(seen: NDArray[np.bool_], points: Tensor, part_of: Parts = None) -> None:
     """Require that the labels `seen` (S, C, N) of an object's points (N, 3) determine its pose in every snapshot.
 
     A solid object needs points off a line, and four labels: three fit some pose exactly, whatever the cameras, and that
@@ -58,12 +60,13 @@ def _least_fiducials(rank: int) -> int | None:
     return None if rank == 6 else 2 if rank == 5 else 1
 
 
-def has_poses(seen: NDArray[np.bool_], points: Tensor, part_of: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
+def has_poses(seen: NDArray[np.bool_], points: Tensor, part_of: Parts = None) -> NDArray[np.bool_]:
     """Find the snapshots in which labels `seen` (S, C, N) of an object's points (N, 3) determine its pose: (S,).
 
     With several objects (`part_of`, as in `require_poses`), at least one of them must be determined.
     """
     if part_of is not None:
+        part_of = np.asarray(part_of)
         columns = [np.flatnonzero(part_of == part) for part in range(int(part_of.max()) + 1)]
         return np.any([has_poses(seen[..., own], points[own]) for own in columns], axis=0)
     least = _least_fiducials(pose_rank(points))
@@ -71,7 +74,7 @@ def has_poses(seen: NDArray[np.bool_], points: Tensor, part_of: NDArray[np.int64
         enough: NDArray[np.bool_] = (seen.sum(1) >= 2).sum(1) >= least
         return enough
     shown, where = seen.any(1), points.detach().cpu().double().numpy()
-    whole, enough = breadth(where), seen.sum((1, 2)) >= LEAST_LABELS
+    whole, enough = breadth(where), 2 * seen.sum((1, 2)) > POSE_PARAMETERS
     if whole > 0 and shown.all():
         return enough
     # Patterns repeat: thousands of snapshots show only a few different parts of an object.

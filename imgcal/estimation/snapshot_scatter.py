@@ -97,10 +97,8 @@ def block_scatter(problem: Problem, solution: Solution, loss: NamedLoss) -> Bloc
         sure |= scatter.own > 1 + SCATTER_SIGMAS * scatter.own_deviation
         sure |= scatter.average > 1 + SCATTER_SIGMAS * scatter.deviation
         factor = torch.where(sure, scatter.by_camera(before), 1.0)
-        if bool((factor > largest).any()):
-            length = size * joined if bool(factor.max() > largest.max()) else length
-            largest = torch.maximum(largest, factor)
-        before = scatter
+        length = size * joined if bool(factor.max() > largest.max()) else length
+        largest, before = torch.maximum(largest, factor), scatter
     return BlockScatter(largest.sqrt(), length) if length else BlockScatter()
 
 

@@ -174,7 +174,7 @@ def estimate_variance_components(
         # residual, so it stays out.
         kept = seen & (fit.squared <= options.outlier**2 * fit.noise)
         if (kept != seen).any():
-            require_poses(kept, problem.points, None if problem.part_of is None else problem.part_of.numpy())
+            require_poses(kept, problem.points, problem.part_of)
         if later and not (fit.converged and (kept == labels).all()):
             start, *later = later
             state, additive_noise, known, kept = start.state, start.additive_noise, start.solution, labels

@@ -9,6 +9,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -35,11 +37,11 @@ def project_cpu(
     """Project like `projection.project_components`, for tensors on the CPU: without gradients, several times faster.
 
     Args:
-        points_rig: (B, N, 3) mm; all others have the same floating-point type. For one rig, (N, 3), and so on.
-        cam_from_rig: (B, C).
-        focal_length: (B, C, 2) pixels.
-        principal_point: (B, C, 2) pixels.
-        distortion: (B, C, D) coefficients of the lenses.
+        points_rig: (*B, N, 3) mm; all others have the same floating-point type.
+        cam_from_rig: (*B, C).
+        focal_length: (*B, C, 2) pixels.
+        principal_point: (*B, C, 2) pixels.
+        distortion: (*B, C, D) coefficients of the lenses.
         image_size: (C, 2) pixels, width and height.
         radius: (N,) mm of spherical fiducials; None = points.
         models: lens model of all cameras, or of each.
@@ -47,17 +49,15 @@ def project_cpu(
     given = (cam_from_rig.rotation, cam_from_rig.translation, focal_length, principal_point, distortion)
     # NumPy's calls take half the time of PyTorch's, and its large arrays ask Linux for huge pages.
     points = np.ascontiguousarray(points_rig.detach().numpy().swapaxes(-1, -2))
-    alone = points.ndim == 2
-    points = points[None] if alone else points
-    count, _, fiducials = points.shape
-    kind = points.dtype
+    batch, fiducials, kind = points.shape[:-2], points.shape[-1], points.dtype
+    count = math.prod(batch)
     radius_squared = np.zeros(fiducials, kind) if radius is None else radius.detach().numpy().astype(kind) ** 2
     image = np.empty((count, focal_length.shape[-2], 4, fiducials), kind)  # u, v, depth, visible
     arrays = [np.ascontiguousarray(tensor.detach().numpy()) for tensor in given]
-    arrays = [array[None] for array in arrays] if alone else arrays
+    points, *arrays = (array.reshape(count, *array.shape[len(batch) :]) for array in (points, *arrays))
     sizes = np.ascontiguousarray(image_size.numpy())
     project_arrays(lens_codes(models, *distortion.shape[-2:]), (points, radius_squared, *arrays, sizes, image))
-    image = image[0] if alone else image
+    image = image.reshape(*batch, *image.shape[1:])
     uv, depth, visible = image[..., :2, :].swapaxes(-1, -2), image[..., 2, :], image[..., 3, :] > 0
     return Projection(torch.from_numpy(uv), torch.from_numpy(depth), torch.from_numpy(visible))
 

@@ -271,7 +271,7 @@ class CameraRig:
         """Project like `project` but without gradients: several times faster on the CPU.
 
         Args:
-            points_rig: (B, N, 3) mm, one set for each of the (B,) rigs, (N, 3) for one; same floating-point type.
+            points_rig: (*B, N, 3) mm, one set for each of the (*B) rigs; same floating-point type.
             radius: (N,) mm of spherical fiducials; None = points.
         """
         if points_rig.device.type != "cpu" or is_traced():
