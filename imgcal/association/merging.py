@@ -47,14 +47,18 @@ def drop_merged(labelled: Associations, poses: RigidTransform, rig: CameraRig, o
     doubtful = np.flatnonzero(hidden[snapshot, camera].any(-1))
     if not len(doubtful):
         return labelled
-    reach, uv = merging_distance(labelled, rows[doubtful]), image.uv.numpy()
+    reach, uv = merging_reach(detections.radius[rows[doubtful]]), image.uv.numpy()
     spacing, where = 2 * reach.max(), (snapshot[doubtful], camera[doubtful])
     frame = np.arange(hidden[..., 0].size).reshape(hidden.shape[:2])  # frames lie side by side in the tree
     tree = cKDTree(np.column_stack((uv[hidden], spacing * frame[hidden.nonzero()[:2]])))
     places = np.column_stack((uv[*where, detections.fiducial[rows[doubtful]]], spacing * frame[where]))
     apart, known = np.full(len(places), np.inf), np.isfinite(places).all(1)
     apart[known], _ = tree.query(places[known], distance_upper_bound=reach.max())
-    merged = rows[doubtful[apart < reach]]
+    near = np.flatnonzero(apart < reach)
+    if not len(near):
+        return labelled
+    merged = rows[doubtful[near]]
+    merged = merged[apart[near] < merging_distance(labelled, merged)]
     if not len(merged):
         return labelled
     fiducial, flags = detections.fiducial.copy(), detections.flags.copy()

@@ -195,7 +195,7 @@ class Tracker:
 
     def _refuse_too_few(self, name: str, labels: NDArray[np.int64]) -> SnapshotIdentity | None:
         """Refuse a snapshot with too few fiducials; None = it has enough."""
-        shown = len(np.unique(labels[labels >= 0]))
+        shown = np.count_nonzero(np.bincount(labels[labels >= 0]))
         least = self.options.least_fiducials
         least = least if self.obj.pose_rank == 6 else min(least, self.obj.num_fiducials)
         if shown >= least:

@@ -119,7 +119,8 @@ class Blocks:
 
 def _reverse_cumsum(parts: Array) -> Array:
     """Replace parts (R, ...) by their sums from each part to the end."""
-    np.cumsum(parts[::-1], axis=0, out=parts[::-1])
+    for row in range(len(parts) - 2, -1, -1):  # four times as fast as `cumsum` along the first axis
+        parts[row] += parts[row + 1]
     return parts
 
 

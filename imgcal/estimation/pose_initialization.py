@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
@@ -76,7 +77,7 @@ def initial_pose(observations: Observations, rig: CameraRig, obj: CalibrationObj
     rays, origins = _rays(observations, rig, undistort_cpu if plain else undistort)  # (P, C, N, 3), (P, C, 3)
     seen = observations.seen.reshape(-1, *observations.seen.shape[-2:]).to(rays.dtype)
     form = _quadratic_form(rays, origins, seen, centred)
-    starts = torch.as_tensor(Rotation.create_group("I").as_matrix(), dtype=rays.dtype, device=rays.device)
+    starts = _all_around().to(rays)
     promising = _cost(form, starts.expand(len(rays), -1, -1, -1)).topk(STARTS, largest=False).indices
     minimized = _minimize_cpu if plain else _minimize_on_rotations
     # A single light has no rotation.
@@ -92,6 +93,12 @@ def initial_pose(observations: Observations, rig: CameraRig, obj: CalibrationObj
     chosen = rotation[torch.arange(len(best)), best]
     shift = translation[torch.arange(len(best)), best] - (chosen @ centroid)
     return RigidTransform(chosen.reshape(*batch, 3, 3), shift.reshape(*batch, 3))
+
+
+@cache
+def _all_around() -> Tensor:
+    """The rotations of the icosahedron: (60, 3, 3)."""
+    return torch.from_numpy(Rotation.create_group("I").as_matrix())
 
 
 def _rays(

@@ -121,20 +121,17 @@ def _is_worth_measuring(total: Tensor, pull: Tensor, lengths: list[int], shape: 
     covariance = torch.cholesky_inverse(torch.linalg.cholesky(total))
     noise = (covariance - covariance @ covariance)[:wide, :wide]  # due to noise; the rest is due to the prior
     known = noise.diagonal() > LEAST_SAID
-    count = int(known.sum())
-    if not count:
-        return False
-    scale = noise.diagonal()[known].rsqrt()
-    camera = torch.arange(shape[0], device=pull.device).repeat_interleave(shape[1])[known]
-    groups = torch.nn.functional.one_hot(camera, shape[0]).to(pull)  # (D, C)
-    groups = torch.cat((torch.ones_like(groups[:, :1]), groups[:, groups.any(0)]), 1)  # of all cameras, and of each
-    groups /= groups.sum(0)
-    squares = (noise[known][:, known] * scale[:, None] * scale).square()
+    scale = torch.where(known, noise.diagonal().clamp_min(LEAST_SAID).rsqrt(), 0.0)
+    camera = torch.arange(shape[0], device=pull.device).repeat_interleave(shape[1])
+    of_cameras = torch.nn.functional.one_hot(camera, shape[0]).to(pull)
+    groups = torch.cat((torch.ones_like(scale)[:, None], of_cameras), 1) * known[:, None]  # of all, and of each: (K, G)
+    groups /= groups.sum(0).clamp_min(1.0)
+    squares = (noise * scale[:, None] * scale).square()
     spread = (groups.mT @ squares * groups.mT).sum(1)
     sigmas = torch.full_like(spread, WORTH_OF_ONE)
     sigmas[0] = WORTH_MEASURING
-    reached = torch.zeros(len(pull) + 1, count, dtype=pull.dtype, device=pull.device)
-    reached[1:] = ((pull @ covariance)[:, :wide][:, known] * scale).cumsum(0)
+    reached = torch.zeros(len(pull) + 1, wide, dtype=pull.dtype, device=pull.device)
+    reached[1:] = ((pull @ covariance)[:, :wide] * scale).cumsum(0)
     for joined in lengths:
         change, blocks = reached[joined:] - reached[:-joined], len(pull) / joined
         scatter = change.square().mean(0) @ groups * (blocks / (1 - 1 / blocks))

@@ -39,7 +39,7 @@ from imgcal.pipeline.recalibration import (
     late_cameras,
     require_same_moments,
 )
-from imgcal.pipeline.repeats import drop_repeats, name_repeats, require_own_images
+from imgcal.pipeline.repeats import drop_repeats, name_repeats
 from imgcal.pipeline.sources import Frames, find_blobs
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, ConvexVolume, Detections, RigPrior
@@ -111,7 +111,6 @@ def calibrate_from_scratch(
         obj.require_rigid("to calibrate without a factory calibration")
     started, cameras, options = time.perf_counter(), _set_prior(cameras), options.of_object(obj)
     blobs = find_blobs(source, cameras, obj, detection)
-    require_own_images(blobs)
     detections, repeats = drop_repeats(blobs)
     if obj.pose_rank == 3:
         detections, obj = _marker_alone(detections, obj)

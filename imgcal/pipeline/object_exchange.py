@@ -16,6 +16,7 @@ from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, correlation_time
+from imgcal.geometry import cross_matrix
 from imgcal.medians import median
 
 Floats = NDArray[np.float64]
@@ -52,10 +53,16 @@ def measure_sizes(fit: Estimate) -> tuple[Floats, Floats]:
     Returns:
         (S,) sizes relative to the estimate's object, and (S,) their standard deviations by noise.
     """
-    root_weight = fit.problem.root_weight[0, ..., None]  # (S, C, N, 1)
-    slope = torch.where(root_weight[..., None] > 0, root_weight[..., None] * _differences(fit), 0.0).flatten(1, 3)
-    information = slope.mT @ slope  # (S, 7, 7)
-    pull = -(slope.mT @ (root_weight * fit.residual).flatten(1)[..., None])[..., 0]
+    points = fit.points_object - fit.points_object.mean(0)
+    arms = points @ fit.rig_from_object.rotation.mT  # (S, N, 3), from the centroid, in the rig frame
+    motion = torch.cat((-cross_matrix(arms), torch.eye(3).to(arms).expand(*arms.shape, 3), arms[..., None]), -1)
+    root_weight = fit.problem.root_weight[0]  # (S, C, N)
+    residual = (root_weight[..., None] * fit.residual).permute(0, 2, 1, 3).flatten(2)
+    slope = torch.where(root_weight[..., None, None] > 0, root_weight[..., None, None] * _slopes(fit), 0.0)
+    slope = slope.permute(0, 2, 1, 3, 4).flatten(2, 3)  # (S, N, 2 C, 3)
+    square, toward = slope.mT @ slope, slope.mT @ residual[..., None]  # (S, N, 3, 3), (S, N, 3, 1)
+    across = motion.flatten(1, 2).mT  # (S, 7, 3 N): by rotation, translation and growth
+    information, pull = across @ (square @ motion).flatten(1, 2), -(across @ toward.flatten(1, 2))[..., 0]
     scale = information.diagonal(dim1=1, dim2=2).clamp_min(1e-30).rsqrt()
     whitened = information * scale[:, :, None] * scale[:, None]
     inverse = torch.linalg.pinv(whitened, hermitian=True, rtol=1e-12)
@@ -110,14 +117,10 @@ def require_one_size(fit: Estimate, names: tuple[str, ...]) -> None:
         )
 
 
-def _differences(fit: Estimate) -> Tensor:
-    """Derivatives (S, C, N, 2, 7) of the images by rotation (rad), translation (mm) and growth of the object."""
-    points = fit.points_object - fit.points_object.mean(0)
-    arms = points @ fit.rig_from_object.rotation.mT  # (S, N, 3), from the centroid, in the rig frame
+def _slopes(fit: Estimate) -> Tensor:
+    """Derivatives (S, C, N, 2, 3) of the images by the fiducials' places, px/mm."""
+    steps = WAY * torch.eye(3).to(fit.points_object)
     places = fit.rig_from_object.apply(fit.points_object)
-    rigs = fit.rig.expand(len(arms))
-    steps = WAY * torch.eye(3, dtype=points.dtype)
-    images = [(rigs.project_values(places + step).uv, rigs.project_values(places - step).uv) for step in steps]
-    by_place = torch.stack([(after - before) / (2 * WAY) for after, before in images], -1)  # (S, C, N, 2, 3)
-    by_turn = torch.cross(arms[:, None, :, None].expand_as(by_place), by_place, dim=-1)
-    return torch.cat((by_turn, by_place, (by_place * arms[:, None, :, None]).sum(-1, keepdim=True)), -1)
+    moved = places[:, None] + torch.cat((steps, -steps))[:, None]  # (S, 6, N, 3)
+    images = fit.rig.expand(len(places)).project_values(moved.flatten(1, 2)).uv.unflatten(2, (6, -1))
+    return ((images[:, :, :3] - images[:, :, 3:]) / (2 * WAY)).permute(0, 1, 3, 4, 2)

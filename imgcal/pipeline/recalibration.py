@@ -28,7 +28,7 @@ from imgcal.pipeline.labelled_capture import arrange_labels
 from imgcal.pipeline.learned_measurer import LearnedMeasurer
 from imgcal.pipeline.learned_proposer import LearnedProposer
 from imgcal.pipeline.lights import add_lights, find_lights
-from imgcal.pipeline.repeats import Repeats, drop_repeats, name_repeats, require_own_images
+from imgcal.pipeline.repeats import Repeats, drop_repeats, name_repeats
 from imgcal.pipeline.sources import Detector, Frames, check_frames, find_blobs, make_sight
 from imgcal.pipeline.synchronization import NOTICEABLE, find_unsynchronized
 from imgcal.pipeline.turned_images import require_upright_images
@@ -92,7 +92,6 @@ def calibrate(
     started, rig, options = time.perf_counter(), rig.to(torch.float64), options.of_object(obj)
     source = source if isinstance(source, Detections) else check_frames(source, rig)
     blobs = find_blobs(source, rig, obj, detection, measurer)
-    require_own_images(blobs)
     detections, repeats = drop_repeats(settle_turns(blobs, rig, obj))
     found = time.perf_counter()
     obj = as_unknown_marker(obj, detections)

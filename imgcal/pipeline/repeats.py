@@ -50,19 +50,55 @@ class Repeats:
         return f"{' and '.join(parts)}: these copies are left out" if parts else ""
 
 
-def require_own_images(detections: Detections) -> None:
-    """Refuse if two cameras show the same images: one camera's frames are stored under several names.
+def drop_repeats(detections: Detections) -> tuple[Detections, Repeats]:
+    """Remove blobs that are bit-identical copies of others.
+
+    Args:
+        detections: all blobs, snapshots in chronological order.
+
+    Returns:
+        The other blobs, with the names of all snapshots, and what was removed.
+
+    Raises:
+        RefusedError: two cameras show the same images: one camera's frames are stored under several names. The message
+            names the cameras.
+    """
+    kept, order, begins = _sort_images(detections)
+    _require_own_images(detections, order, begins)
+    rows = int((~kept).sum())
+    snapshots, cameras = detections.snapshot[order[begins]], detections.camera[order[begins]]
+    ends = np.append(begins[1:], len(order))
+    first: dict[tuple[int, bytes], int] = {}
+    originals = dict[int, set[int]]()
+    images = 0
+    for number in _find_equal(detections.uv[order], cameras, begins):
+        part = order[begins[number] : ends[number]]
+        if len(part) < LEAST_BLOBS:
+            continue
+        snapshot, camera = int(snapshots[number]), int(cameras[number])
+        earlier = first.setdefault((camera, detections.uv[part].tobytes()), snapshot)
+        if earlier != snapshot:
+            kept[part] = False
+            images += 1
+            originals.setdefault(snapshot, set()).add(earlier)
+    own = set(np.unique(detections.snapshot[kept]).tolist()) if originals else set()
+    names = detections.snapshot_names
+    whole = tuple((names[s], names[min(of)]) for s, of in sorted(originals.items()) if s not in own)
+    repeats = Repeats(rows, images, whole)
+    return (detections if kept.all() else detections.select(kept)), repeats
+
+
+def _require_own_images(detections: Detections, order: NDArray[np.int64], begins: NDArray[np.int64]) -> None:
+    """Refuse if two cameras show the same images.
 
     No two cameras see a snapshot alike to the last bit. As both would fit, the result would be a rig of two cameras in
     one place.
 
     Args:
         detections: all blobs.
-
-    Raises:
-        RefusedError: the message names the cameras.
+        order: of those that are listed once, by image.
+        begins: where in it each image begins.
     """
-    _, order, begins = _sort_images(detections)
     snapshot, camera = detections.snapshot[order[begins]], detections.camera[order[begins]]
     ends = np.append(begins[1:], len(order))
     cameras = len(detections.camera_names)
@@ -86,39 +122,6 @@ def require_own_images(detections: Detections) -> None:
             python="give each camera its own frames, or leave the wrong ones out (rig.select)",
             command="give each camera its own frames, or leave the wrong ones out (--without)",
         )
-
-
-def drop_repeats(detections: Detections) -> tuple[Detections, Repeats]:
-    """Remove blobs that are bit-identical copies of others.
-
-    Args:
-        detections: all blobs, snapshots in chronological order.
-
-    Returns:
-        The other blobs, with the names of all snapshots, and what was removed.
-    """
-    kept, order, begins = _sort_images(detections)
-    rows = int((~kept).sum())
-    snapshots, cameras = detections.snapshot[order[begins]], detections.camera[order[begins]]
-    ends = np.append(begins[1:], len(order))
-    first: dict[tuple[int, bytes], int] = {}
-    originals = dict[int, set[int]]()
-    images = 0
-    for number in _find_equal(detections.uv[order], cameras, begins):
-        part = order[begins[number] : ends[number]]
-        if len(part) < LEAST_BLOBS:
-            continue
-        snapshot, camera = int(snapshots[number]), int(cameras[number])
-        earlier = first.setdefault((camera, detections.uv[part].tobytes()), snapshot)
-        if earlier != snapshot:
-            kept[part] = False
-            images += 1
-            originals.setdefault(snapshot, set()).add(earlier)
-    own = set(np.unique(detections.snapshot[kept]).tolist()) if originals else set()
-    names = detections.snapshot_names
-    whole = tuple((names[s], names[min(of)]) for s, of in sorted(originals.items()) if s not in own)
-    repeats = Repeats(rows, images, whole)
-    return (detections if kept.all() else detections.select(kept)), repeats
 
 
 def _sort_images(detections: Detections) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
