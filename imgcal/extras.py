@@ -31,9 +31,9 @@ def advice(library: str | None) -> str | None:
 
     Examples:
         >>> advice("timm")
-        'needs timm: pip install "imgcal[train]"'
+        'needs timm: pip install ".[train]" in the clone'
     """
     for extra, libraries in EXTRAS.items():
         if library in libraries:
-            return f'needs {library}: pip install "imgcal[{extra}]"'
+            return f'needs {library}: pip install ".[{extra}]" in the clone'
     return None

@@ -31,6 +31,7 @@ LONG = {
     "imgcal evaluate": "cli/test_evaluate",
     "imgcal simulate": "cli/test_simulate: twenty snapshots at full size take half a minute",
     "imgcal calibrate CAPTURE": "cli/test_calibrate",
+    "imgcal detect": "cli/test_calibrate",
     "imgcal score": "cli/test_score",
     "imgcal fleet": "cli/test_fleet",
     "imgcal watch": "cli/test_watch",

@@ -39,7 +39,7 @@ class Place:
         parts = [
             f"{value:+.0f} mm in {axis}" for axis, value in zip("xyz", self.offset, strict=True) if abs(value) >= 1
         ]
-        new = f"{plural(self.fields, 'new field')} in {plural(self.cameras, 'camera')}"
+        new = f"{plural(self.fields, 'new image cell')} in {plural(self.cameras, 'camera')}"
         return f"{', '.join(parts) or 'where it was'} ({new})"
 
 
@@ -76,7 +76,7 @@ class Coverage:
         if not self.sentences or not self.places:
             return ""
         places = "; ".join(map(str, self.places))
-        return f"Move the object, along the axes of the rig and from where it was, by {places}; tilt it, too."
+        return f"From where it was, move the object along the rig's axes by {places}; tilt it, too."
 
 
 def measure_coverage(calibration: Calibration, std: Tensor) -> Coverage:

@@ -48,7 +48,7 @@ def test_extras_are_those_of_the_package() -> None:
 def test_the_core_calibrates_all_but_the_report(tmp_path: Path) -> None:
     done = without_extras(*CALIBRATE, str(tmp_path / "out"))
     assert done.returncode == 0, done.stderr
-    assert said(done) == ['note: no report.html, which needs jinja2: pip install "imgcal[report]"']
+    assert said(done) == ['note: no report.html, which needs jinja2: pip install ".[report]" in the clone']
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "rig.yaml",
         "rig.posterior.safetensors",
@@ -61,10 +61,10 @@ def test_the_core_calibrates_all_but_the_report(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "needs"),
     [
-        (["train", "table1-row01", "--out", "{out}"], 'train needs tensorboard: pip install "imgcal[train]"'),
+        (["train", "table1-row01", "--out", "{out}"], 'train needs tensorboard: pip install ".[train]" in the clone'),
         (
             ["evaluate", "--rig", "O10", "--object", "cube8", "--out", "{out}"],
-            '--out needs matplotlib: pip install "imgcal[report]"',
+            '--out needs matplotlib: pip install ".[report]" in the clone',
         ),
     ],
 )

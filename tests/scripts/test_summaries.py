@@ -1,4 +1,4 @@
-"""The two short pages agree with the committed results."""
+"""The short pages and the README agree with the committed results."""
 
 import pytest
 
@@ -13,4 +13,4 @@ def test_the_page_is_what_the_script_writes(name: str) -> None:
     page = ROOT / name
     text = page.read_text("utf-8")
     assert replaced(text, PAGES[name], page) == text, f"{name}: run `python -m scripts.summaries`"
-    assert len(text.splitlines()) < 80
+    assert len(text.splitlines()) < 110

@@ -39,4 +39,4 @@ def test_nothing_is_written_that_says_something_else(export, capsys, monkeypatch
 def test_a_library_that_is_missing_is_named(export, capsys, monkeypatch):
     monkeypatch.setattr(module, "missing", lambda *libraries: "onnx")
     assert export() == 2
-    assert 'needs onnx: pip install "imgcal[onnx]"' in capsys.readouterr().err
+    assert 'needs onnx: pip install ".[onnx]" in the clone' in capsys.readouterr().err

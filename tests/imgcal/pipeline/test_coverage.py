@@ -57,7 +57,7 @@ def test_words_name_values_cameras_and_directions(narrow):
     assert "k3" in known.undetermined and set(known.undetermined["k3"]) == set(result.rig.camera_names)
     text = " ".join(known.sentences)
     assert "k3 in all cameras" in text and "% of the images" in text
-    assert "mm in" in known.advice and "new fields in" in known.advice
+    assert "mm in" in known.advice and "new image cells in" in known.advice
 
 
 def test_all_is_known_where_the_object_was_everywhere():
