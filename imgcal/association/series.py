@@ -307,15 +307,15 @@ def _most_frequent_reason(snapshots: Sequence[SnapshotIdentity]) -> str:
     return f"{reason} ({times} of {tried})"
 
 
-def drop_snapshots(labelled: Associations, rows: Sequence[int]) -> Associations:
+def drop_snapshots(labelled: Associations, rows: Sequence[int], reason: str = UNPOSED) -> Associations:
     """Refuse snapshots (numbers among the used ones) whose labels do not determine a pose.
 
     Raises:
         RefusedError: no snapshot is left.
     """
-    left = refuse_snapshots(labelled, rows, UNPOSED)
+    left = refuse_snapshots(labelled, rows, reason)
     if not left.used:
-        raise RefusedError(f"estimation: in every snapshot: {UNPOSED}; capture more, with the whole object in view")
+        raise RefusedError(f"estimation: in every snapshot, {reason}; capture more, with the whole object in view")
     return left
 
 

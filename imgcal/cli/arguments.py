@@ -253,9 +253,9 @@ class Watch:
     learn: bool = False
     """with --detector learned: adapt detector and measurer to this rig's own frames while it runs, in a process of the
     lowest priority. Crops of snapshots go to OUT/learning/dataset, some of them held out; training begins after 30
-    frames of single cameras and 8 held-out snapshots. Adapted networks are used only if they are better on held-out snapshots; an event
-    reports either way. They stay in OUT/learning/adapted, for the next start and for --detector and
-    --measurer"""
+    frames of single cameras and 8 held-out snapshots. Adapted networks are used only if they are better on held-out
+    snapshots; an event reports either way. They stay in OUT/learning/adapted, for the next start and for --detector
+    and --measurer"""
     detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)
 
 

@@ -20,6 +20,7 @@ from torch import Tensor
 from imgcal.errors import RefusedError
 from imgcal.estimation.curvature import curvature_covariance, whitened_curvature
 from imgcal.estimation.levenberg_marquardt import Solution, factorize
+from imgcal.estimation.levenberg_marquardt_cpu import change_precision
 from imgcal.estimation.linearization import POSE_PARAMETERS, NormalEquations, points_at
 from imgcal.estimation.map_estimate import Estimate, equations_at
 from imgcal.estimation.robust_losses import NamedLoss
@@ -202,7 +203,7 @@ def remaining_variance(solution: Solution) -> NDArray[np.float64]:
     if equations.cost.device.type != "cpu":
         variance = _in_tensors(solution)
     elif missing := without_machine_code(_diagonal if few else _diagonal_without_poses):
-        variance = missing.call_twin(_in_tensors, solution)
+        variance = missing.call_twin(_in_tensors, change_precision(solution, torch.float64))  # as compiled
     else:
         variance = _by_poses(equations) if few else _by_cameras(equations)
     if not np.isfinite(variance).all():

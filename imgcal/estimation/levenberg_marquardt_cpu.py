@@ -62,8 +62,8 @@ def minimize(
         tolerance: see `levenberg_marquardt.minimize`.
     """
     if problem.uv.dtype != torch.float64:
-        exact = _convert(problem, torch.float64), _convert(start, torch.float64)
-        return _convert(minimize(*exact, loss, threshold, max_iterations, tolerance), problem.uv.dtype)
+        exact = change_precision(problem, torch.float64), change_precision(start, torch.float64)
+        return change_precision(minimize(*exact, loss, threshold, max_iterations, tolerance), problem.uv.dtype)
     if missing := without_machine_code(_minimize_rig):
         arguments = (problem, start, NamedLoss(loss, threshold), max_iterations, tolerance)
         return missing.call_twin(torch.no_grad()(levenberg_marquardt.minimize), *arguments)
@@ -140,8 +140,8 @@ def _threads_of_torch() -> Iterator[None]:
 def linearize(problem: Problem, state: State, loss: LossName, threshold: float) -> NormalEquations:
     """Do the work of `linearization.linearize` for tensors on the CPU, without gradients; the loss as in `minimize`."""
     if problem.uv.dtype != torch.float64:
-        exact = _convert(problem, torch.float64), _convert(state, torch.float64)
-        return _convert(linearize(*exact, loss, threshold), problem.uv.dtype)
+        exact = change_precision(problem, torch.float64), change_precision(state, torch.float64)
+        return change_precision(linearize(*exact, loss, threshold), problem.uv.dtype)
     if missing := without_machine_code(linearize_rig):
         arguments = (problem, state, NamedLoss(loss, threshold))
         return missing.call_twin(torch.no_grad()(linearization.linearize), *arguments)
@@ -156,7 +156,7 @@ def linearize(problem: Problem, state: State, loss: LossName, threshold: float) 
     return blocks.equations()
 
 
-def _convert(given: Part, dtype: torch.dtype) -> Part:
+def change_precision(given: Part, dtype: torch.dtype) -> Part:
     """Change the floating-point type of all tensors."""
 
     def changed(value: Any) -> Any:
@@ -164,7 +164,7 @@ def _convert(given: Part, dtype: torch.dtype) -> Part:
             return value.to(dtype) if value.is_floating_point() else value
         if isinstance(value, CameraRig):
             return value.to(dtype)
-        return _convert(value, dtype) if isinstance(value, State | NormalEquations | ObjectEquations) else value
+        return change_precision(value, dtype) if isinstance(value, State | NormalEquations | ObjectEquations) else value
 
     return replace(given, **{one.name: changed(getattr(given, one.name)) for one in fields(given)})
 

@@ -28,10 +28,9 @@ from renderers.compiling import njit
 SHIFTS = 50
 """Most iterations of reweighting for a shift."""
 TILE = 16
-"""Products are summed in rows of a multiple of this many columns, of which the compiler makes vector instructions (it
-must not know the number, or it writes every product out instead) ..."""
+"""Products are summed in rows of a multiple of this many columns, of which the compiler makes vector instructions."""
 AT_ONCE = 4
-"""... of this many points at a time."""
+"""Points whose products are summed at a time; `_add_products` is written for four."""
 
 
 @njit(cache=True, fastmath=kernels.FAST)
@@ -91,9 +90,8 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
         if lacking:
             _fix_turns(rotation[s], turns, pose[s])
     width = TILE * ((10 + distortion0.shape[1]) // TILE + 1)
-    wide = TILE + 0 * distortion0.shape[1]  # 12 used; see `TILE`
-    batch, products, own = np.zeros((AT_ONCE, 2, width)), np.empty((width, width)), np.empty((free, free))
-    motions, mixed, posed = np.zeros((6, wide)), np.empty((width, wide)), np.empty((12, wide))
+    batch, products, information = np.zeros((AT_ONCE, 2, width)), np.empty((width, width)), np.empty((free, free))
+    motions, mixed, posed = np.zeros((6, TILE)), np.empty((width, TILE)), np.empty((12, TILE))  # 12 columns are used
     turned, left = np.empty((3, 3)), np.empty((3, 3))
     rotation_cam, rotation_object = np.empty((3, 3)), np.empty((3, 3))  # of the rig and of the object, to the camera
     parameters, coefficients = np.empty(free), np.empty(free - 10)
@@ -112,7 +110,7 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
             cost += 0.5 * offset[c, i] ** 2
             camera_gradient[c, i] = 0
             for j in range(i + 1):
-                own[i, j] = 0
+                information[i, j] = 0
         kernels.exponential(parameters, turned, left)
         kernels.multiply(turned, rotation0[c], rotation_cam)
         fx, fy = focal0[c, 0] + parameters[6], focal0[c, 1] + parameters[7]
@@ -192,7 +190,9 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
                 _clear_coupling(c, s, free, coupling, cameras_first)
                 continue
             if count % AT_ONCE:
-                batch[count % AT_ONCE :] = 0.0
+                for k in range(count % AT_ONCE, AT_ONCE):
+                    for i in range(free + 1):
+                        batch[k, 0, i], batch[k, 1, i] = 0.0, 0.0
                 _add_products(batch, free + 1, products)
             if shaken:
                 share = 1 / (1 / shake[s, c] ** 2 + total)
@@ -206,14 +206,14 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
                 camera_gradient[c, i] += mixed[free, i]
                 pose_gradient[s, i] += mixed[free, 6 + i]
                 for j in range(i + 1):
-                    own[i, j] += posed[i, j]
+                    information[i, j] += posed[i, j]
                     pose[s, i, j] += posed[6 + i, 6 + j]
             for i in range(6, free):
                 camera_gradient[c, i] += products[free, i]
                 for j in range(6):
-                    own[i, j] += mixed[i, j]
+                    information[i, j] += mixed[i, j]
                 for j in range(6, i + 1):
-                    own[i, j] += products[i, j]
+                    information[i, j] += products[i, j]
             for i in range(6):
                 for j in range(free):
                     value = (posed[6 + i, j] if j < 6 else mixed[j, 6 + i]) * prior_std[c, j]
@@ -224,7 +224,7 @@ def linearize_rig(given, state, blocks, cameras_first, loss, threshold, shake):
         for i in range(free):
             camera_gradient[c, i] = offset[c, i] + camera_gradient[c, i] * prior_std[c, i]
             for j in range(i + 1):
-                camera[c, i, j] = camera[c, j, i] = own[i, j] * prior_std[c, i] * prior_std[c, j]
+                camera[c, i, j] = camera[c, j, i] = information[i, j] * prior_std[c, i] * prior_std[c, j]
             camera[c, i, i] += 1.0
     for s in range(snapshots):
         for i in range(6):
@@ -274,7 +274,7 @@ def _subtract_products(rows, count, factor, products):
 
 @njit(cache=True, fastmath=kernels.FAST)
 def _express_products(products, motions, count, mixed, posed):
-    """Express products (W, W) by the steps of `motions` (6, 16) instead of the motions.
+    """Express products (W, W) by the steps of `motions` (6, TILE) instead of the motions.
 
     Fills `mixed` (W, 16), products of all columns with the steps, and `posed` (12, 16), those of the steps.
     """

@@ -65,7 +65,8 @@ MOST_EPISODES, OUTERMOST = 4.0, 4
 """Longest time, in episodes, between a step and the nearer end of a capture for which the step may be an error that has
 passed. Whether it has passed is judged by the outermost of these snapshots, one in so many."""
 TRACE = 1e-3
-"""Share of its weight that a label keeps if the object's pose needs it but it must not count."""
+"""Share of its root weight that a label keeps if the object's pose needs it but it must not count: a millionth of its
+information, which decides nothing and still determines the pose."""
 LEAST_LABELS = 2
 """Smallest number of labels from which the shift of a camera's image in a snapshot is computed."""
 
@@ -159,6 +160,13 @@ class Places:
         needed = rows[~has_poses((root_weight[0, rows] > 0).numpy(), problem.points, problem.part_of)]
         root_weight[:, needed, place] = TRACE * problem.root_weight[:, needed, place]
         return replace(self, problem=replace(problem, root_weight=root_weight))
+
+    def comparable(self, place: int) -> NDArray[np.int64]:
+        """Snapshots with labels of a place in which the others determine the object's pose: only these can judge it."""
+        others = (self.problem.root_weight[0] > 0).numpy()
+        others[:, place] = False
+        rows = np.flatnonzero(self.seen[:, place])
+        return rows[has_poses(others[rows], self.problem.points, self.problem.part_of)]
 
     def episode(self, camera: int) -> int:
         """Longest transient error of a camera, in successive snapshots; 0 = errors are not correlated.
@@ -332,7 +340,7 @@ def _locate(places: Places, step: Step, options: EstimationOptions) -> Places | 
 
 
 def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: float, noise: float) -> bool:
-    """Check that a step stays significant without its best episode, and evident without the better half of either side.
+    """Check that a step does not rest on one episode, nor on the half of either side that supports it most.
 
     A transient error is no motion: a target at the edge of an image, or behind an arm, may seem to be off by pixels for
     some snapshots.
@@ -348,7 +356,7 @@ def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: fl
     length, row = divided.episode(divided.camera[new]), divided.first[new]
     if not length:
         return True
-    shown = np.flatnonzero(places.seen[:, camera])
+    shown = places.comparable(camera)
     saved = divided.costs(camera) - divided.costs(new)
     for rows, gain in ((shown[shown < row], -saved), (shown[shown >= row], saved)):
         moments, number = np.unique(places.moment[rows], return_inverse=True)
@@ -380,7 +388,7 @@ def _has_passed(places: Places, divided: Places, camera: int, options: Estimatio
     Arguments as for `_outlasts_an_episode`. Both places are estimated without the outermost snapshots in question.
     """
     new, row = len(divided.camera) - 1, divided.first[-1]
-    shown = np.flatnonzero(places.seen[:, camera])
+    shown = places.comparable(camera)
     before, after = shown[shown < row], shown[shown >= row]
     near, own, other = (before, camera, new) if len(before) < len(after) else (after, new, camera)
     moments = np.unique(places.moment[near])

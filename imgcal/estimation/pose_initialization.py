@@ -77,7 +77,7 @@ def initial_pose(observations: Observations, rig: CameraRig, obj: CalibrationObj
     rays, origins = _rays(observations, rig, undistort_cpu if plain else undistort)  # (P, C, N, 3), (P, C, 3)
     seen = observations.seen.reshape(-1, *observations.seen.shape[-2:]).to(rays.dtype)
     form = _quadratic_form(rays, origins, seen, centred)
-    starts = _all_around().to(rays)
+    starts = _icosahedral_rotations().to(rays)
     promising = _cost(form, starts.expand(len(rays), -1, -1, -1)).topk(STARTS, largest=False).indices
     minimized = _minimize_cpu if plain else _minimize_on_rotations
     # A single light has no rotation.
@@ -96,7 +96,7 @@ def initial_pose(observations: Observations, rig: CameraRig, obj: CalibrationObj
 
 
 @cache
-def _all_around() -> Tensor:
+def _icosahedral_rotations() -> Tensor:
     """The rotations of the icosahedron: (60, 3, 3)."""
     return torch.from_numpy(Rotation.create_group("I").as_matrix())
 

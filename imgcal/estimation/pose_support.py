@@ -10,16 +10,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.estimation.linearization import POSE_PARAMETERS
 from imgcal.geometry import pose_rank
 from imgcal.messages import plural
 
 Parts: TypeAlias = NDArray[np.int64] | Tensor | None
 
+LEAST_LABELS = 4
+"""Labels that determine the pose of a solid object, in all cameras together: three fit some pose exactly."""
 LEAST_BREADTH = 0.05
 """Breadth of the visible part, relative to the whole object's: below, a rotation about a line is undetermined."""
 
-UNPOSED = "fewer than four labels remain, or all lie on one line: they do not determine the object's pose"
+UNPOSED = "fewer than four labels remain, or all lie on one line"
 TOO_FEW = "two cameras share labels of fewer than {}"
 
 
@@ -27,16 +28,16 @@ class UndeterminedPosesError(RefusedError):
     """Raise when labels do not determine the object's pose in some snapshots; the caller can drop those."""
 
     def __init__(self, rows: Sequence[int], reason: str = UNPOSED) -> None:
-        """Keep the indices of the snapshots among those of the fit."""
+        """Keep the indices of the snapshots among those of the fit, and the reason."""
         super().__init__(f"estimation: in {plural(len(rows), 'snapshot')} {reason}")
-        self.rows = tuple(rows)
+        self.rows, self.reason = tuple(rows), reason
 
 
 def require_poses(seen: NDArray[np.bool_], points: Tensor, part_of: Parts = None) -> None:
     """Require that the labels `seen` (S, C, N) of an object's points (N, 3) determine its pose in every snapshot.
 
-    A solid object needs points off a line, and four labels: three fit some pose exactly, whatever the cameras, and that
-    pose may be anywhere. A stick needs two points and a light its one, each in two cameras.
+    A solid object needs points off a line, and four labels. A stick needs two points and a light its one, each in two
+    cameras.
 
     Args:
         seen: whether each point has a label.
@@ -74,7 +75,7 @@ def has_poses(seen: NDArray[np.bool_], points: Tensor, part_of: Parts = None) ->
         enough: NDArray[np.bool_] = (seen.sum(1) >= 2).sum(1) >= least
         return enough
     shown, where = seen.any(1), points.detach().cpu().double().numpy()
-    whole, enough = breadth(where), 2 * seen.sum((1, 2)) > POSE_PARAMETERS
+    whole, enough = breadth(where), seen.sum((1, 2)) >= LEAST_LABELS
     if whole > 0 and shown.all():
         return enough
     # Patterns repeat: thousands of snapshots show only a few different parts of an object.

@@ -10,10 +10,10 @@ estimate from all. For independent residuals, the difference would have the cova
 where H_b is a block's information about the (whitened) parameters with its poses marginalized, and 1 that of the prior.
 The squared differences over these variances, averaged over the parameters of a camera, are the factor by which the
 noise part of its covariance is too small. One factor for all its parameters preserves their correlations. Cameras
-differ widely, but few blocks determine a camera's own average only roughly. One above the average of all cameras is
-drawn towards it by half of its standard deviation; one below it most of the way, because errors that last as long as
-the capture do not show. Leaving a block out, rather than summing the scores of the residuals, accounts for the leverage
-of a block on the fit.
+differ widely, but few blocks determine a camera's own average only roughly. Where it is above the average of all
+cameras, it is drawn towards that by half of its standard deviation; where it is below, most of the way, because errors
+that last as long as the capture do not show. Leaving a block out, rather than summing the scores of the residuals,
+accounts for the leverage of a block on the fit.
 
 Source: the delete-block jackknife (Kunsch, Annals of Statistics 1989), studentized by its value for independent noise,
 as the bias-reduced cluster-robust covariances are (Bell and McCaffrey, Survey Methodology 2002). Errors that are
@@ -47,14 +47,15 @@ SCATTER_SIGMAS = 4.0
 """Standard deviations by which the scatter, of all cameras or of one, must exceed its value for independent noise."""
 OWN, DRAWN = 0.3, 0.5
 """Weight of a camera's own scatter where it is below the average of all cameras, and standard deviations of it by which
-it is drawn towards them where it is above. Replayed noise: 0.9 % of cameras beyond 3 sigma (half of both averages left
-1.6), squared errors over variances 0.98. Six blocks of a real recording: 1.4, 1.6 and 1.3 for focal lengths (1.7, 1.8
-and 1.4; the camera's own alone: 1.9, 1.9 and 1.5)."""
+it is drawn towards them where it is above. Chosen on calibrations with replayed noise (`replayed_gates` in
+`scripts/benchmarks`: share beyond 3 sigma) and on blocks of a real recording (`real_blocks`: chi-squared of focal
+lengths); half of both averages, and the camera's own alone, did worse."""
 OVERLAP = 2 / 3
 """Variance of the average over heavily overlapping blocks, relative to that over disjoint ones."""
 WORTH_MEASURING, WORTH_OF_ONE = 2.0, 2.5
 """The same thresholds, for all cameras and for one, of the first-order test, which needs no inverse per block and
-decides whether to measure."""
+decides whether to measure: far below the others, so that it misses nothing, and rare enough for white noise that most
+such captures need no more."""
 LEAST_SAID = 1e-6
 """Smallest variance that leaving out a block must add to a parameter, in units of its prior, for it to be included."""
 

@@ -118,9 +118,12 @@ class ClockOffsets:
         """Delay of each camera relative to the median one, and its standard deviation: (C,) s; nan = unknown."""
         if self._solved is None:
             self._solved = self._solve()
+            for part in self._solved:
+                part.setflags(write=False)  # states share them
         return self._solved
 
     def _solve(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Do the work of `offsets`."""
         power = np.diagonal(self._normal, axis1=1, axis2=2)
         scale = np.sqrt(np.maximum(power, 1e-30))
         scaled = self._normal / (scale[:, :, None] * scale[:, None])

@@ -132,7 +132,7 @@ def _fit(
         try:
             return _fit_once(arranged, rig, obj, options, known)
         except UndeterminedPosesError as error:
-            arranged, known = arranged.drop_snapshots(error.rows, rig, obj), replace(known, fits=())
+            arranged, known = arranged.drop_snapshots(error.rows, rig, obj, error.reason), replace(known, fits=())
             left, count = len(arranged.labelled.used), len(given.labelled.used)
             if left < LEAST_KEPT * count:
                 raise RefusedError(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from imgcal.association import Associations, accepted_observations, drop_merged, drop_snapshots
-from imgcal.estimation import UndeterminedPosesError, initial_pose, require_poses
+from imgcal.estimation import UNPOSED, UndeterminedPosesError, initial_pose, require_poses
 from imgcal.geometry import RigidTransform
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
@@ -19,13 +19,15 @@ class LabelledCapture:
     observations: Observations  # (S, C, N)
     poses: RigidTransform  # (S,) rig_from_object, the first guess
 
-    def drop_snapshots(self, rows: Sequence[int], rig: CameraRig, obj: CalibrationObject) -> LabelledCapture:
+    def drop_snapshots(
+        self, rows: Sequence[int], rig: CameraRig, obj: CalibrationObject, reason: str = UNPOSED
+    ) -> LabelledCapture:
         """Refuse some of the used snapshots, by their index among these."""
-        return arrange_labels(drop_snapshots(self.labelled, rows), rig, obj)
+        return arrange_labels(drop_snapshots(self.labelled, rows, reason), rig, obj)
 
 
 def arrange_labels(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> LabelledCapture:
-    """Remove merged blobs and snapshots whose labels are collinear; find missing poses.
+    """Remove merged blobs, and snapshots whose labels do not determine the pose; find missing poses.
 
     Raises:
         RefusedError: no snapshot is left.
@@ -34,7 +36,7 @@ def arrange_labels(labelled: Associations, rig: CameraRig, obj: CalibrationObjec
     try:
         require_poses(observations.seen.numpy(), obj.points, obj.part_of if obj.parts else None)
     except UndeterminedPosesError as error:
-        return arrange_labels(drop_snapshots(labelled, error.rows), rig, obj)
+        return arrange_labels(drop_snapshots(labelled, error.rows, error.reason), rig, obj)
     if poses is None:
         poses, snapshots = initial_pose(observations, rig, obj), list(labelled.snapshots)
         for row, snapshot in enumerate(labelled.used):

@@ -30,7 +30,9 @@ LEAST_SNAPSHOTS = 3
 LARGEST_SHARE = 0.5
 """Maximum share of the variance of the sizes that the step may leave: otherwise there are other causes."""
 UNKNOWN_SIZE = 0.1
-"""Relative standard deviation at which a snapshot says nothing about the size: a single camera."""
+"""Relative standard deviation at which a snapshot says nothing about the size."""
+DETERMINED = 1e-6
+"""Largest share of a change of size that the images may not show."""
 WAY = 1e-3
 """Step of the differences, mm."""
 
@@ -51,7 +53,8 @@ def measure_sizes(fit: Estimate) -> tuple[Floats, Floats]:
         fit: the estimate of one rig from S snapshots.
 
     Returns:
-        (S,) sizes relative to the estimate's object, and (S,) their standard deviations by noise.
+        (S,) sizes relative to the estimate's object, and (S,) their standard deviations by noise; infinite where a
+        snapshot does not determine the size: a single camera cannot tell a larger object from a nearer one.
     """
     points = fit.points_object - fit.points_object.mean(0)
     arms = points @ fit.rig_from_object.rotation.mT  # (S, N, 3), from the centroid, in the rig frame
@@ -68,6 +71,8 @@ def measure_sizes(fit: Estimate) -> tuple[Floats, Floats]:
     inverse = torch.linalg.pinv(whitened, hermitian=True, rtol=1e-12)
     size = scale[:, -1] * (inverse @ (scale * pull)[..., None])[:, -1, 0]
     sigma = scale[:, -1] * inverse[:, -1, -1].clamp_min(0).sqrt()
+    determined = (inverse @ whitened)[:, -1, -1]  # one, unless the inverse leaves out a direction that changes the size
+    sigma = torch.where(determined > 1 - DETERMINED, sigma, torch.inf)
     return size.numpy(), sigma.numpy()
 
 

@@ -11,6 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from imgcal.errors import InputError
 from imgcal.geometry import (
     LENS_MODELS,
     Join,
@@ -273,7 +274,13 @@ class CameraRig:
         Args:
             points_rig: (*B, N, 3) mm, one set for each of the (*B) rigs; same floating-point type.
             radius: (N,) mm of spherical fiducials; None = points.
+
+        Raises:
+            InputError: the points have other batch axes than the rigs.
         """
+        if points_rig.shape[:-2] != self.batch_shape:
+            expected = ", ".join(map(str, (*self.batch_shape, "N", 3)))
+            raise InputError(f"points: found shape {tuple(points_rig.shape)}, expected ({expected}) as for the rigs")
         if points_rig.device.type != "cpu" or is_traced():
             with torch.no_grad():
                 return self.project(points_rig, radius)

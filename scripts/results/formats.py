@@ -135,7 +135,11 @@ def table(result: dict[str, Any]) -> str:
     rows = []
     for name, row in result["formats"].items():
         read, write = row["read"], row["write"]
-        seen = f"{read['cameras']} in {read['files']}: {read['worst_px']:.1e}" if read["files"] else "no file in the public set"
+        seen = (
+            f"{read['cameras']} in {read['files']}: {read['worst_px']:.1e}"
+            if read["files"]
+            else "no file in the public set"
+        )
         if name == "caliscope-config":
             seen = "as `caliscope`"
         if write is None:

@@ -48,7 +48,10 @@ def test_frames_to_recalibrated_rig(workplace, tmp_path, capsys):
     moved = result["motion"]["cameras_moved"]
     assert result["motion"]["relative_to"] == "most cameras" and f"{len(moved)} of 4 cameras moved" in printed
     assert set(result["motion"]["per_camera"]) == set(result["knowledge"]["coverage"]) == set(result["per_camera"])
-    assert "Not determined by these data (factory values kept)" in printed and "move the object along the rig's axes" in printed
+    assert (
+        "Not determined by these data (factory values kept)" in printed
+        and "move the object along the rig's axes" in printed
+    )
     assert f"before {result['rms_px_before']:.3f} px" in printed and str(out / "report.html") in printed
 
     truth, factory = read_rig(workplace.capture / "truth" / "rig.yaml"), read_rig(workplace.rig)

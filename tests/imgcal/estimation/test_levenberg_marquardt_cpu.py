@@ -7,7 +7,15 @@ import numba
 import pytest
 import torch
 
-from imgcal.estimation import NormalEquations, Solution, levenberg_marquardt, levenberg_marquardt_cpu
+from imgcal.estimation import (
+    NormalEquations,
+    Solution,
+    covariance,
+    levenberg_marquardt,
+    levenberg_marquardt_cpu,
+    linearize,
+)
+from imgcal.estimation.covariance import remaining_variance
 from imgcal.estimation.robust_losses import LOSSES
 from imgcal.geometry import project_arrays
 
@@ -93,7 +101,14 @@ def test_tensors_stand_in_for_missing_machine_code(simulate, monkeypatch) -> Non
     case = simulate(1, snapshots=3, cameras=2, fiducials=6, radius=None, missing=0.05, noise=0.06)
     problem = case.problem()
     start, points = case.start(problem), problem.points.expand(1, -1, -1)
+    solutions = [
+        levenberg_marquardt_cpu.minimize(each, make.start(each), "huber", 4.0, 60, 1e-9)
+        for make in (case, simulate(1, snapshots=20, cameras=2, tolerance=0.4))  # poses, cameras are eliminated last
+        for each in (make.problem(), replace(make, observations=make.observations.to(torch.float32)).problem())
+    ]
     calls = (
+        *(lambda found=found: torch.from_numpy(remaining_variance(found)) for found in solutions),
+        lambda: levenberg_marquardt_cpu.rig_at(problem, start.offset + 0.3).cam_from_rig.rotation,
         lambda: levenberg_marquardt_cpu.minimize(problem, start, "huber", 4.0, 60, 1e-9).state.offset,
         lambda: (
             levenberg_marquardt_cpu.RigSolver(problem).minimize(problem, start, "huber", 4.0, 60, 1e-9).state.offset
@@ -103,13 +118,41 @@ def test_tensors_stand_in_for_missing_machine_code(simulate, monkeypatch) -> Non
     )
     compiled = [call() for call in calls]
     called = []
-    for function in (levenberg_marquardt_cpu._minimize_rig, levenberg_marquardt_cpu.linearize_rig, project_arrays):
+    functions = (
+        levenberg_marquardt_cpu._minimize_rig,
+        levenberg_marquardt_cpu.linearize_rig,
+        levenberg_marquardt_cpu.turn_all,
+        covariance._diagonal,
+        covariance._diagonal_without_poses,
+        project_arrays,
+    )
+    for function in functions:
         missing = function.interpretable
         monkeypatch.setattr(missing, "is_ready", lambda: False)
         monkeypatch.setattr(missing, "call_twin", lambda twin, *given: called.append(twin) or twin(*given))
     for call, expected in zip(calls, compiled, strict=True):
         torch.testing.assert_close(call(), expected, rtol=1e-6, atol=1e-6)
     assert len(called) == len(calls)
+
+
+@pytest.mark.parametrize("snapshots", [2, 12])  # cameras, poses are eliminated first
+@pytest.mark.parametrize("tolerances", [{}, {"tolerance": 0.4}])
+def test_a_camera_without_labels_in_a_snapshot_leaves_no_block_unwritten(
+    simulate, monkeypatch, snapshots: int, tolerances
+) -> None:
+    case = simulate(snapshots=snapshots, cameras=3, fiducials=5, **tolerances)
+    case.observations.seen[..., 1, 2, :] = False
+    problem = case.problem()
+    start, empty = case.start(problem), torch.Tensor.new_empty
+    expected = linearize(problem, start, partial(LOSSES["huber"], threshold=3.0))
+    monkeypatch.setattr(torch.Tensor, "new_empty", lambda self, *size: empty(self, *size).fill_(torch.nan))
+    found = levenberg_marquardt_cpu.linearize(problem, start, "huber", 3.0)
+    for name in ("camera", "coupling", "pose", "camera_gradient", "pose_gradient"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-6, msg=name)
+    if tolerances:
+        for name in ("camera", "pose", "own", "gradient"):
+            a, b = getattr(found.object, name), getattr(expected.object, name)
+            torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-6, msg=name)
 
 
 def test_single_precision_stays_close(simulate) -> None:

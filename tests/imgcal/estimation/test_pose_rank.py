@@ -89,6 +89,13 @@ def test_a_light_needs_two_cameras_and_a_stick_two_of_its_markers():
         require_poses(seen[:, :1, :1], pair[:1])
 
 
+def test_a_snapshot_without_a_pose_is_refused_for_the_reason_of_its_object():
+    rig, obj, _, table = capture(PAIR, 40)
+    alone = (table.snapshot != 3) | (table.camera == 0)
+    result = calibrate(table.select(alone), rig, obj)
+    assert "two cameras share labels of fewer than 2 fiducials" in result.labelled.snapshots[3].reason
+
+
 def test_a_light_calibrates_and_says_that_its_scale_is_that_of_the_cameras():
     rig, obj, _, table = capture(LIGHT, 80)
     result = calibrate(table, rig, obj)

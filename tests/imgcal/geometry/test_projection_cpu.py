@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from imgcal.errors import InputError
 from imgcal.geometry import NEAREST_DEPTH
 from imgcal.synthesis import PhysicalDrift
 from imgcal.types import CalibrationObject, CameraRig
@@ -52,6 +53,17 @@ def test_one_rig_needs_no_batch_axis(o10: CameraRig) -> None:
     for name in ("uv", "depth", "visible"):
         assert torch.equal(getattr(alone, name), getattr(many, name)[0])
     assert alone.uv.shape == (10, 9, 2) and alone.visible.any()
+    some = points + torch.arange(6.0).view(2, 3, 1, 1)
+    rigs = o10.expand(2, 3)
+    torch.testing.assert_close(rigs.project_values(some).uv, rigs.project(some).uv, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("rigs", "points"), [((), (3,)), ((2, 3), ()), ((2,), (3,))])
+def test_points_must_have_the_batch_axes_of_the_rigs(
+    o10: CameraRig, rigs: tuple[int, ...], points: tuple[int, ...]
+) -> None:
+    with pytest.raises(InputError, match=r"points: found shape \(.*9, 3\), expected \(.*N, 3\)"):
+        o10.expand(*rigs).project_values(torch.ones(*points, 9, 3, dtype=torch.float64))
 
 
 def test_points_behind_are_finite_and_invisible(o10: CameraRig) -> None:

@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 import imgcal
 from imgcal.errors import RefusedError
 from imgcal.pipeline.object_exchange import find_step, measure_sizes
-from imgcal.types import Detections
+from imgcal.synthesis import PhysicalDrift, simulate_truth
+from imgcal.types import Detections, Observations
 from scripts.benchmarks.replayed_stream import combined
 from scripts.benchmarks.rig_streams import Conditions, Stream
 
@@ -42,6 +44,15 @@ def test_each_snapshot_measures_the_size_as_well_as_it_says() -> None:
     assert sigma.max() < 5e-4
     larger = replace(fit, points_object=fit.points_object * 1.001)
     assert np.allclose(measure_sizes(larger)[1], sigma, rtol=0.01)
+
+
+def test_a_snapshot_of_one_camera_says_nothing_about_the_size() -> None:
+    rig, obj = imgcal.load_rig("T4").to(torch.float64), imgcal.load_object("asymmetric8")
+    truth = simulate_truth(rig, obj, 6, torch.Generator().manual_seed(1), PhysicalDrift())
+    seen = torch.ones(truth.uv.shape[:-1], dtype=torch.bool)
+    seen[4, 1:] = False
+    _, sigma = measure_sizes(imgcal.estimate(Observations(truth.uv, torch.full(seen.shape, 0.1), seen), rig, obj))
+    assert np.isinf(sigma[4]) and np.isfinite(np.delete(sigma, 4)).all()
 
 
 def test_sizes_that_wander_or_scatter_are_no_step() -> None:
