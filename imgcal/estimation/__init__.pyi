@@ -50,7 +50,7 @@ from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ScaleEvidence, Shap
 from .pose_initialization import initial_pose
 from .pose_support import UNPOSED, UndeterminedPosesError, has_poses, require_poses
 from .reference_cameras import Gauge
-from .rig_error import displace, error_between, step_by_error
+from .rig_error import displace, error_between, error_by_step, step_by_error
 from .rig_from_points import PointStart, cold_start_from_points, move_to_pair_frame, prior_of_pair
 from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens, robust_std, single_camera_poses
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion, uncertainty_over
@@ -102,6 +102,7 @@ __all__ = [
     "encode_options",
     "equations_at",
     "error_between",
+    "error_by_step",
     "estimate",
     "estimate_variance_components",
     "find_moves",

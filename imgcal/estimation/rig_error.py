@@ -83,3 +83,12 @@ def step_by_error(rig: CameraRig, turned: Tensor | None = None) -> Tensor:
     jacobian[..., :3, :3] = -rotation if turned is None else -torch.linalg.solve(left_jacobian(turned), rotation)
     jacobian[..., 3:6, :3] = -cross_matrix(positions)
     return jacobian
+
+
+def error_by_step(rig: CameraRig) -> Tensor:
+    """Derivative of the error by `CameraRig.retract`'s step from this rig: (*B, C, K, K), inverts `step_by_error`."""
+    back, positions = rig.cam_from_rig.rotation.mT, rig.positions
+    jacobian = torch.eye(rig.num_parameters, dtype=back.dtype, device=back.device).repeat(*positions.shape[:-1], 1, 1)
+    jacobian[..., :3, :3] = -back
+    jacobian[..., 3:6, :3] = -cross_matrix(positions) @ back
+    return jacobian

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.estimation import step_by_error
+from imgcal.estimation import error_by_step
 from imgcal.types import PARAMETER_KINDS, CameraRig
 
 CHANGES: Mapping[str, slice] = {kind: part for kind, part in PARAMETER_KINDS.items() if kind != "distortion"}
@@ -82,7 +82,7 @@ def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = 
 
 def camera_change_errors(rig: CameraRig, unit: Tensor) -> Tensor:
     """Derivative of errors in units by a camera's own parameters: (C, K, K); a turn about its centre shifts nothing."""
-    return torch.linalg.inv(step_by_error(rig)) / unit[:, :, None]
+    return error_by_step(rig) / unit[:, :, None]
 
 
 @dataclass(frozen=True)

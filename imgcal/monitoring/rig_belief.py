@@ -20,6 +20,7 @@ from torch import Tensor
 from imgcal.errors import RefusedError
 from imgcal.estimation import Problem, levenberg_marquardt_cpu, object_prior_std, step_by_error
 from imgcal.geometry import RigidTransform
+from imgcal.monitoring.change_test import camera_change_errors
 from imgcal.monitoring.measurement_update_cpu import NOTHING_KNOWN, WHY_NOT
 from imgcal.monitoring.rig_arrays import RigArrays
 from imgcal.monitoring.snapshot_information import SnapshotInformation, add_blocks
@@ -206,7 +207,7 @@ def widen(belief: RigBelief, variance: Tensor) -> RigBelief:
 def widen_along(belief: RigBelief, steps: Tensor) -> RigBelief:
     """Add uncertainty along joint changes of all cameras, each one standard deviation long: steps (M, C, K)."""
     covariance = torch.cholesky_inverse(belief.factor)
-    error = (_error_by_step(belief) @ steps[..., None]).flatten(1)
+    error = (camera_change_errors(belief.rig, belief.unit) @ steps[..., None]).flatten(1)
     wide = error.shape[1]
     covariance[:wide, :wide] += error.mT @ error
     return belief.with_covariance(covariance)
@@ -214,12 +215,8 @@ def widen_along(belief: RigBelief, steps: Tensor) -> RigBelief:
 
 def error_covariance(belief: RigBelief, variance: Tensor) -> Tensor:
     """Covariance (C, K, K) of errors in units, from variances (C, K) of a camera's own parameters."""
-    error_by_step = _error_by_step(belief)
-    return error_by_step @ torch.diag_embed(variance) @ error_by_step.mT
-
-
-def _error_by_step(belief: RigBelief) -> Tensor:
-    return torch.linalg.inv(step_by_error(belief.rig)) / belief.unit[:, :, None]
+    change = camera_change_errors(belief.rig, belief.unit)
+    return change @ torch.diag_embed(variance) @ change.mT
 
 
 def cholesky_factor(matrix: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 import torch
 
 import imgcal
-from imgcal.estimation import displace, error_between, step_by_error
+from imgcal.estimation import displace, error_between, error_by_step, step_by_error
 from imgcal.types import CameraRig
 
 UNITS = torch.tensor((0.02,) * 3 + (10.0,) * 3 + (20.0,) * 4 + (0.02,) * 5, dtype=torch.float64)
@@ -44,6 +44,7 @@ def test_step_by_error_is_the_derivative_of_the_step() -> None:
     found = torch.autograd.functional.jacobian(step, 1e-6 * errors(4, 4))
     expected = torch.stack([found[c, :, c] for c in range(4)])
     torch.testing.assert_close(step_by_error(rig), expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(error_by_step(rig), torch.linalg.inv(step_by_error(rig)))
 
 
 def test_step_by_error_follows_steps_from_another_rig() -> None:
