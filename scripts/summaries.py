@@ -148,11 +148,13 @@ def missed_gates() -> str:
             "(target: 1 %)."
         )
     targets = "one target is" if len(missed) == 1 else "these targets are"
-    first = f"With replayed noise, {targets} missed. " if missed else ""
-    return (
-        f"{first}{' '.join(missed)}\nLens models that are wrong by 0.05 px over hundreds of pixels "
-        f"caused {lens['alarms']} false alarms in {lens['snapshots']:,} snapshots."
-    )
+    found = [f"With replayed noise, {targets} missed. {' '.join(missed)}"] if missed else []
+    if lens["alarms"]:
+        found.append(
+            f"Lens models that are wrong by 0.05 px over hundreds of pixels caused {lens['alarms']} false alarms in "
+            f"{lens['snapshots']:,} snapshots."
+        )
+    return "\n".join(found)
 
 
 def paper_table() -> str:
