@@ -34,5 +34,5 @@ def test_a_number_that_is_none_is_null():
 
 def test_the_documents_name_every_event():
     text = (Path(__file__).parents[3] / "docs" / "live.md").read_text()
-    told = text.partition("Events: ")[2].partition("`keeper.save(path)`")[0]
+    told = text.partition("| event | means |")[2].partition("`keeper.save(path)`")[0]
     assert [kind for kind in EVENT_KINDS if f"`{kind}`" not in told] == []
