@@ -203,7 +203,8 @@ def remaining_variance(solution: Solution) -> NDArray[np.float64]:
     if equations.cost.device.type != "cpu":
         variance = _in_tensors(solution)
     elif missing := without_machine_code(_diagonal if few else _diagonal_without_poses):
-        variance = missing.call_twin(_in_tensors, change_precision(solution, torch.float64))  # as compiled
+        exact = change_precision(solution, torch.float64)  # the compiled functions convert, too
+        variance = missing.call_twin(_in_tensors, exact)
     else:
         variance = _by_poses(equations) if few else _by_cameras(equations)
     if not np.isfinite(variance).all():

@@ -161,7 +161,7 @@ class Places:
         root_weight[:, needed, place] = TRACE * problem.root_weight[:, needed, place]
         return replace(self, problem=replace(problem, root_weight=root_weight))
 
-    def comparable(self, place: int) -> NDArray[np.int64]:
+    def comparable_rows(self, place: int) -> NDArray[np.int64]:
         """Snapshots with labels of a place in which the others determine the object's pose: only these can judge it."""
         others = (self.problem.root_weight[0] > 0).numpy()
         others[:, place] = False
@@ -356,7 +356,7 @@ def _outlasts_an_episode(places: Places, divided: Places, camera: int, least: fl
     length, row = divided.episode(divided.camera[new]), divided.first[new]
     if not length:
         return True
-    shown = places.comparable(camera)
+    shown = places.comparable_rows(camera)
     saved = divided.costs(camera) - divided.costs(new)
     for rows, gain in ((shown[shown < row], -saved), (shown[shown >= row], saved)):
         moments, number = np.unique(places.moment[rows], return_inverse=True)
@@ -388,7 +388,7 @@ def _has_passed(places: Places, divided: Places, camera: int, options: Estimatio
     Arguments as for `_outlasts_an_episode`. Both places are estimated without the outermost snapshots in question.
     """
     new, row = len(divided.camera) - 1, divided.first[-1]
-    shown = places.comparable(camera)
+    shown = places.comparable_rows(camera)
     before, after = shown[shown < row], shown[shown >= row]
     near, own, other = (before, camera, new) if len(before) < len(after) else (after, new, camera)
     moments = np.unique(places.moment[near])

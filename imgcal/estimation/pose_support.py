@@ -15,7 +15,7 @@ from imgcal.messages import plural
 
 Parts: TypeAlias = NDArray[np.int64] | Tensor | None
 
-LEAST_LABELS = 4
+LEAST_POSE_LABELS = 4
 """Labels that determine the pose of a solid object, in all cameras together: three fit some pose exactly."""
 LEAST_BREADTH = 0.05
 """Breadth of the visible part, relative to the whole object's: below, a rotation about a line is undetermined."""
@@ -75,7 +75,7 @@ def has_poses(seen: NDArray[np.bool_], points: Tensor, part_of: Parts = None) ->
         enough: NDArray[np.bool_] = (seen.sum(1) >= 2).sum(1) >= least
         return enough
     shown, where = seen.any(1), points.detach().cpu().double().numpy()
-    whole, enough = breadth(where), seen.sum((1, 2)) >= LEAST_LABELS
+    whole, enough = breadth(where), seen.sum((1, 2)) >= LEAST_POSE_LABELS
     if whole > 0 and shown.all():
         return enough
     # Patterns repeat: thousands of snapshots show only a few different parts of an object.

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from imgcal import PipelineOptions, RefusedError, calibrate
+from imgcal import Calibration, PipelineOptions, RefusedError, calibrate
 from imgcal.association import associate
 from imgcal.fleet import Mapper, StoredResults, workers
 from imgcal.pipeline.motion_check import list_moves
@@ -76,6 +76,11 @@ def bumped(kind: str, degrees: float, share: float, seed: int) -> str:
         return "found" if right else "refused"
     except RefusedError:
         return "refused"
+    return _judge_accepted(result, rig)
+
+
+def _judge_accepted(result: Calibration, rig: faults.CameraRig) -> str:
+    """Tell whether an accepted result at least names the camera as doubtful."""
     named = rig.camera_names[CAMERA] in {camera.camera for camera in result.doubtful}
     return "doubted" if named else "accepted"
 
@@ -87,10 +92,10 @@ def wrong_image(kind: str, how: str, seed: int) -> str:
         truth = faults.with_camera(truth, obj, CAMERA, lambda r: faults.longer_lens(r, CAMERA))
     table = _damaged(faults.blobs(truth, seed), rig, how)
     try:
-        calibrate(table, rig, obj, PipelineOptions(blind_cameras=True))
+        result = calibrate(table, rig, obj, PipelineOptions(blind_cameras=True))
     except RefusedError as error:
         return "found" if rig.camera_names[CAMERA] in str(error) else "refused"
-    return "accepted"
+    return _judge_accepted(result, rig)
 
 
 def _damaged(table: Detections, rig: faults.CameraRig, how: str) -> Detections:
