@@ -15,10 +15,10 @@ from imgcal.estimation.rig_uncertainty import RigUncertainty, detach_double, unc
 from imgcal.geometry import rotate, undistort
 from imgcal.types import CameraRig
 
-GRID = 11
-"""Points along each side of the working volume; odd, so that one lies at the centre."""
-ANCHORS = 7
-"""Points along each side of the coarser grid on which the true and the estimated rig are aligned."""
+GRID = 7
+"""Cells along each side of the working volume; odd, so that one lies at the centre."""
+ANCHORS = 4
+"""Cells along each side of the coarser grid on which the true and the estimated rig are aligned."""
 MAP_SIZE = (16, 24)
 """Rows and columns of each camera's error map, which covers the whole image."""
 MAP_DEPTHS = (0.05, 0.5, 0.95)
@@ -42,8 +42,8 @@ class WorkingVolume:
     high: Tensor  # (3,) mm
 
     def grid(self, count: int = GRID) -> Tensor:
-        """Evenly spaced points, including the faces: (count, count, count, 3) mm, indexed by x, y, z."""
-        steps = torch.linspace(0, 1, count, dtype=self.low.dtype, device=self.low.device)
+        """Centres of equal cells that fill the box: (count, count, count, 3) mm, indexed by x, y, z."""
+        steps = (torch.arange(count, dtype=self.low.dtype, device=self.low.device) + 0.5) / count
         share = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), -1)
         return self.low + share * (self.high - self.low)
 

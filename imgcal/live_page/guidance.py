@@ -20,7 +20,7 @@ from imgcal.types import CameraRig
 
 FEW_CAMERAS = 16
 FINE, COARSE = 9, 7
-"""Points along each side of the volume for few cameras, and for many."""
+"""Cells along each side of the volume for few cameras, and for many."""
 PLACES = {True: 4, False: 3}
 """Places along each side where the object is tried, for few cameras and for many."""
 MOST_POINTS = 8  # fiducials that a try takes

@@ -23,6 +23,8 @@ MORE_SNAPSHOTS = (5, 10, 20, 30, 50, 100)
 """Numbers that are advised."""
 MAP = len(MAP_DEPTHS) // 2
 """The map that is drawn: the one in the middle of the depths."""
+SLICE = 15
+"""Cells along each side of the slice through the volume; odd, so that it passes through the middle."""
 
 
 def sentences(content: ReportContent) -> tuple[str, ...]:
@@ -115,9 +117,7 @@ def camera_map(predicted: PredictedError, camera: int, image_size: Array, limits
 def volume_slice(predicted: PredictedError, limits: Array) -> tuple[Markup, str]:
     """Draw the slice through the middle of the volume over which the error changes most, and name it."""
     mm = predicted.mm.numpy()
-    middle = mm.shape[0] // 2
-    slices = [mm.take(middle, axis=normal) for normal in range(3)]
-    normal = int(np.argmax([_range(part) for part in slices]))
+    normal = int(np.argmax([_range(mm.take(len(mm) // 2, axis=axis)) for axis in range(3)]))
     across, up = (axis for axis in range(3) if axis != normal)
     low, high = predicted.volume.low.numpy(), predicted.volume.high.numpy()
     width, height = float(high[across] - low[across]), float(high[up] - low[up])
@@ -126,11 +126,13 @@ def volume_slice(predicted: PredictedError, limits: Array) -> tuple[Markup, str]
         56, 56 + width * scale, 12, 12 + height * scale,
         (float(low[across]), float(high[across])), (float(low[up]), float(high[up])),
     )  # fmt: skip
-    error = slices[normal].T[::-1]  # rows from the top
+    rig, points = predicted.uncertainty.rig, predicted.volume.grid(SLICE).select(normal, SLICE // 2)
+    shown = predicted.uncertainty.point_error(points.flatten(0, 1), rig.project(points.flatten(0, 1)).visible)
+    error = shown.view(SLICE, SLICE).numpy().T[::-1]  # rows from the top
     step = (axes.right - axes.left) / error.shape[1], (axes.bottom - axes.top) / error.shape[0]
     cells = _cells(error, np.isfinite(error), axes.left, axes.top, *step, limits, "")
     names = "xyz"
-    positions = predicted.uncertainty.rig.positions.numpy()
+    positions = rig.positions.numpy()
     place = np.clip(positions, low, high)
     marks = svg.dots(axes.x(place[:, across]), axes.y(place[:, up]), "camera-mark")
     value = (low[normal] + high[normal]) / 2

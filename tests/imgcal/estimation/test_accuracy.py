@@ -52,6 +52,21 @@ def test_the_summary_is_plain_and_in_order(predicted):
     assert summary["per_camera_px"][summary["worst_camera"]] == summary["worst_camera_px"]
 
 
+def test_medians_are_those_of_the_whole_volume(predicted):
+    points = torch.lerp(
+        predicted.volume.low,
+        predicted.volume.high,
+        torch.rand(5000, 3, generator=torch.Generator().manual_seed(0), dtype=F64),
+    )
+    projection = predicted.uncertainty.rig.project(points)
+    px = torch.where(projection.visible, predicted.uncertainty.pixel_error(points), torch.nan)
+    mm = predicted.uncertainty.point_error(points, projection.visible)
+    assert predicted.median_px == pytest.approx(float(px.nanmedian()), rel=0.05)
+    assert predicted.median_mm == pytest.approx(float(mm.nanmedian()), rel=0.05)
+    assert predicted.p95_px == pytest.approx(float(px.nanquantile(0.95)), rel=0.08)
+    assert predicted.p95_mm == pytest.approx(float(mm.nanquantile(0.95)), rel=0.08)
+
+
 def test_more_snapshots_say_more(predicted, o10, asymmetric8):
     more = predicted_error(calibrate(captured(o10, asymmetric8, 20), o10, asymmetric8).estimate)
     assert more.median_px < 0.7 * predicted.median_px and more.median_mm < 0.7 * predicted.median_mm
