@@ -24,7 +24,16 @@ LOOKS = 9
 THREADS = "OMP_NUM_THREADS"
 HINT = "compiling for this machine: 10 to 60 s, once; `imgcal warmup` compiles everything ahead of time"
 WAIT = "waiting for another process that compiles for this machine"
-_helpers: list[subprocess.Popen[bytes]] = []  # processes that compile for this one
+
+
+class Helper(subprocess.Popen[bytes]):
+    """A process that goes on after the command that started it."""
+
+    def __del__(self) -> None:
+        """Leave it alone; Python would warn that it is forgotten."""
+
+
+_helpers: list[Helper] = []  # processes that compile for this one
 
 
 @contextlib.contextmanager
@@ -188,12 +197,12 @@ def _count_running() -> int:
     return int(Path("/proc/loadavg").read_text("ascii").split()[3].split("/")[0]) - 1
 
 
-def start_helper() -> subprocess.Popen[bytes]:
+def start_helper() -> Helper:
     """Start `imgcal.cli.background_compiler` in a second process, which has this package and says nothing."""
     # Not from the current folder, which anybody may have filled.
     path = os.pathsep.join(filter(None, (str(Path(imgcal.__file__).parents[1]), os.environ.get("PYTHONPATH"))))
     environment = os.environ | {"PYTHONPATH": path, THREADS: "1"}
     command, nothing = [sys.executable, "-P", "-m", "imgcal.cli.background_compiler"], subprocess.DEVNULL
-    return subprocess.Popen(
+    return Helper(
         command, stdin=subprocess.PIPE, stdout=nothing, stderr=nothing, env=environment, start_new_session=True
     )

@@ -1,9 +1,11 @@
 import contextlib
+import gc
 import os
 import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import numba
@@ -221,3 +223,21 @@ def test_without_help_functions_are_compiled_before_they_are_called(cache, monke
     monkeypatch.setattr(compiling, "is_useful", lambda: False)
     with help_to_compile():
         assert interpreting._patience is None
+
+
+def test_a_helper_that_goes_on_after_the_command_is_no_forgotten_process(monkeypatch):
+    started = []
+
+    def start():
+        process = compiling.Helper([sys.executable, "-c", "import time; time.sleep(60)"], stdin=subprocess.PIPE)
+        started.append(process.pid)
+        return process
+
+    monkeypatch.setattr(compiling, "start_helper", start)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        with compiling._run_helper():
+            pass
+        gc.collect()
+    os.kill(started[0], signal.SIGKILL)
+    assert not warned
