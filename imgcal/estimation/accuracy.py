@@ -140,8 +140,7 @@ class PredictedError:
     def mm_without_exceptions(self) -> Tensor:
         """`mm` with the exceptions excluded from triangulation: (X, Y, Z)."""
         others = self.uncertainty.drop_cameras(self.exceptions)
-        points = self.volume.grid().flatten(0, -2)
-        return others.point_error(points, others.rig.project(points).visible).view(self.mm.shape)
+        return others.point_error(self.volume.grid().flatten(0, -2)).view(self.mm.shape)
 
     @cached_property
     def maps(self) -> ErrorMaps:

@@ -59,17 +59,18 @@ class RigUncertainty:
         """
         return _pixel_error(_pixel_rows(self.rig, points), self.px_covariance)
 
-    def point_error(self, points: Tensor, seen: Tensor, noise: float = 0.0) -> Tensor:
+    def point_error(self, points: Tensor, seen: Tensor | None = None, noise: float = 0.0) -> Tensor:
         """Predicted error of triangulated points: (P,) mm, expected (RMS) distance.
 
         Args:
             points: (P, 3) mm in the rig frame.
-            seen: (C, P) bool, the cameras that take part, with equal weight.
+            seen: (C, P) bool, the cameras that take part, with equal weight; None = those with the point in view.
             noise: px, standard deviation of each axis of one measured pixel; 0 = error of the calibration alone.
 
         Returns:
             The error; nan where fewer than two cameras take part.
         """
+        seen = self.rig.project(points).visible if seen is None else seen
         triangulation, by_noise = _triangulation(_pixel_rows(self.rig, points), seen)
         variance = _point_variance(triangulation, self.mm_covariance)
         return _length(variance + noise**2 * by_noise if noise else variance, seen)

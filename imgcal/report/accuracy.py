@@ -126,13 +126,12 @@ def volume_slice(predicted: PredictedError, limits: Array) -> tuple[Markup, str]
         56, 56 + width * scale, 12, 12 + height * scale,
         (float(low[across]), float(high[across])), (float(low[up]), float(high[up])),
     )  # fmt: skip
-    rig, points = predicted.uncertainty.rig, predicted.volume.grid(SLICE).select(normal, SLICE // 2)
-    shown = predicted.uncertainty.point_error(points.flatten(0, 1), rig.project(points.flatten(0, 1)).visible)
-    error = shown.view(SLICE, SLICE).numpy().T[::-1]  # rows from the top
+    points = predicted.volume.grid(SLICE).select(normal, SLICE // 2).flatten(0, 1)
+    error = predicted.uncertainty.point_error(points).view(SLICE, SLICE).numpy().T[::-1]  # rows from the top
     step = (axes.right - axes.left) / error.shape[1], (axes.bottom - axes.top) / error.shape[0]
     cells = _cells(error, np.isfinite(error), axes.left, axes.top, *step, limits, "")
     names = "xyz"
-    positions = rig.positions.numpy()
+    positions = predicted.uncertainty.rig.positions.numpy()
     place = np.clip(positions, low, high)
     marks = svg.dots(axes.x(place[:, across]), axes.y(place[:, up]), "camera-mark")
     value = (low[normal] + high[normal]) / 2

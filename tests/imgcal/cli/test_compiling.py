@@ -240,4 +240,5 @@ def test_a_helper_that_goes_on_after_the_command_is_no_forgotten_process(monkeyp
             pass
         gc.collect()
     os.kill(started[0], signal.SIGKILL)
+    os.waitpid(started[0], 0)
     assert not warned
