@@ -55,14 +55,10 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
         RefusedError: the information is singular (a snapshot with too few fiducials).
     """
     cameras = estimate.rig.num_cameras
-    covariance = whitened_covariance(estimate.solution)
-    if estimate.inflation is not None:
-        # The prior's unit information contributes the covariance's square; only the rest comes from the observations.
-        by_prior, factor = (
-            covariance @ covariance,
-            estimate.inflation.repeat_interleave(covariance.shape[-1] // cameras),
-        )
-        covariance = by_prior + factor[:, None] * (covariance - by_prior) * factor
+    if estimate.inflation is None:
+        covariance = whitened_covariance(estimate.solution)
+    else:
+        covariance = _inflated_covariance(estimate.solution, estimate.inflation)
     covariance = covariance + _by_modes(estimate)
     if curved:
         covariance = covariance + whitened_curvature(estimate, covariance)
@@ -78,9 +74,25 @@ def _by_modes(estimate: Estimate) -> Tensor:
     """Covariance that the uncertainty of the object's modes adds to the cameras' whitened offsets."""
     if estimate.modes is None:
         return estimate.problem.prior_std.new_zeros(())
-    follow = estimate.modes.follow.flatten(1)
-    spread = torch.from_numpy(estimate.modes.covariance).to(follow) * estimate.mean_inflation**2
+    follow, modes = estimate.modes.follow.flatten(1), torch.from_numpy(estimate.modes.covariance)
+    by_prior = modes @ modes
+    spread = (by_prior + estimate.mean_inflation**2 * (modes - by_prior)).to(follow)
     return (follow.mT @ spread @ follow)[None]
+
+
+def _inflated_covariance(solution: Solution, inflation: Tensor) -> Tensor:
+    """`whitened_covariance` with what the observations contribute enlarged by a factor on each camera (C,).
+
+    The unit priors of cameras and object contribute the square of the covariance, which stays: images that disagree
+    more than their noise say nothing about the error of the object's scale.
+    """
+    reduced = factorize(solution.equations, cameras_first=False).reduced
+    if bool(reduced.failed.any()):
+        raise RefusedError(UNDETERMINED)
+    size = solution.equations.camera_gradient[0].numel()
+    with_object = torch.cholesky_inverse(reduced.kept)[:, :size]  # (B, K C, K C + M)
+    by_prior, factor = with_object @ with_object.mT, inflation.repeat_interleave(size // len(inflation))
+    return by_prior + factor[:, None] * (with_object[..., :size] - by_prior) * factor
 
 
 def whitened_covariance(solution: Solution) -> Tensor:

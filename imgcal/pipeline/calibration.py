@@ -28,7 +28,7 @@ from imgcal.pipeline.label_counts import LabelCounts, count_labels
 from imgcal.pipeline.lights import FoundLights
 from imgcal.pipeline.object_checks import CERTAIN, find_displaced, find_lost_fiducials
 from imgcal.pipeline.repeats import Repeats
-from imgcal.pipeline.scale import KnownDistance, Scale, find_scale
+from imgcal.pipeline.scale import KnownDistance, Scale, find_scale, remaining_tolerance
 from imgcal.pipeline.synchronization import Unsynchronized
 from imgcal.types import (
     BlobFlag,
@@ -187,11 +187,12 @@ class Calibration:
 
     @property
     def object(self) -> CalibrationObject:
-        """The object as estimated: its fiducials in their estimated positions, taken as exact."""
+        """The object as estimated, with the tolerances that remain: what a later calibration starts from."""
         board, bend = self.obj.board, self.bend
         if board is not None and bend is not None:
             board = replace(board, bend=(bend.x, bend.y), warp=max(bend.x_sigma, bend.y_sigma))
-        return replace(self.obj.as_exact(), points=self.points_object.detach(), board=board)
+        tolerance = remaining_tolerance(self.estimate, self.shape)
+        return replace(self.obj.as_exact(), points=self.points_object.detach(), board=board, tolerance=tolerance)
 
     @property
     def displaced(self) -> tuple[FiducialOffset, ...]:

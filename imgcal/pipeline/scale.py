@@ -1,18 +1,29 @@
 """What the scale of a recalibrated rig is based on, and the effect of an error in the object's file.
 
-Images alone do not determine lengths. The scale comes from the object's file, unless the file gives it a tolerance and
-the cameras' factory positions know it better. Residuals cannot show its error, so predicted errors do not include it.
+Images alone do not determine lengths. The scale comes from the object's file, unless its tolerances let the cameras'
+factory positions know it better. Residuals cannot show its error, so predicted errors include no more of it than the
+tolerances allow.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
-from imgcal.estimation import Estimate, WorkingVolume, camera_covariance, predicted_error, scale_response
+from imgcal.estimation import (
+    Estimate,
+    FiducialOffset,
+    WorkingVolume,
+    camera_covariance,
+    object_covariance,
+    predicted_error,
+    scale_response,
+)
 from imgcal.types import CalibrationObject
 
 NOTICED = 4.0
@@ -52,7 +63,7 @@ class Scale:
     """The source of the scale, and its reliability."""
 
     source: Literal["object", "cameras", "distance", "none"]
-    sigma: float  # relative, one standard deviation, given the tolerance of the object's file
+    sigma: float  # relative, one standard deviation; zero for an object that is exact
     noticed_from: float | None  # relative error of the object's scale that would be noticed; None = none would
     px_per_percent: float | None  # median error over the working volume per 1 % of the object's scale; None = unknown
     mm_per_percent: float | None
@@ -66,13 +77,20 @@ class Scale:
             return f"scale rests on the cameras' factory positions alone, which know it to {100 * self.sigma:.2g} %"
         if self.source == "cameras" or not self.px_per_percent:
             return ""
-        added = [f"{self.px_per_percent:.2g} px"]
-        if self.mm_per_percent:
-            added.insert(0, f"{self.mm_per_percent:.2g} mm")
-        words = f"scale rests on the object file alone: 1 % error in it adds {', '.join(added)} to this"
+        added = self._error(PERCENT)
+        if self.sigma:
+            known = f"scale is known to {100 * self.sigma:.2g} % from the object file and its tolerance"
+            words = f"{known}, {self._error(self.sigma)} of this; 1 % more error in the file adds {added}"
+        else:
+            words = f"scale rests on the object file alone: 1 % error in it adds {added} to this"
         if self.noticed_from is None:
             return f"{words}; such an error cannot be noticed"
         return f"{words}; errors above {100 * self.noticed_from:.2g} % would be noticed"
+
+    def _error(self, relative: float) -> str:
+        """Effect of an error of the scale, in words."""
+        per_percent = ((self.mm_per_percent, "mm"), (self.px_per_percent, "px"))
+        return ", ".join(f"{value * relative / PERCENT:.2g} {unit}" for value, unit in per_percent if value)
 
     @property
     def values(self) -> dict[str, Any]:
@@ -98,17 +116,57 @@ def find_scale(estimate: Estimate, obj: CalibrationObject, scale_sigma: float | 
     """
     if obj.pose_rank == 3:
         return Scale("cameras", _position_sigma(estimate), noticed_from=None, px_per_percent=None, mm_per_percent=None)
-    granted, known = obj.scale_tolerance, scale_sigma or math.inf
     response = scale_response(estimate) * PERCENT
     effect = predicted_error(estimate, volume=volume, covariance=response[:, None] * response)
-    noticed = NOTICED * math.hypot(known, granted)
+    granted, sigma = _object_sigmas(estimate)
+    noticed = NOTICED * math.hypot(scale_sigma or math.inf, obj.scale_tolerance)
     return Scale(
-        source="cameras" if known < granted else "object",
-        sigma=granted if math.isinf(known) else granted * known / (math.hypot(granted, known) or 1.0),
+        source="cameras" if 2 * sigma**2 < granted**2 else "object",
+        sigma=sigma,
         noticed_from=noticed if noticed < MOST_NOTICED else None,
         px_per_percent=_finite(effect.median_px),
         mm_per_percent=_finite(effect.median_mm),
     )
+
+
+def _object_sigmas(estimate: Estimate) -> tuple[float, float]:
+    """Relative standard deviation of the object's size, by its tolerances and in the estimate."""
+    problem = estimate.problem
+    if problem.object_prior_std is None:
+        return 0.0, 0.0
+    away = _from_centroids(estimate).flatten()
+    along, tolerance = away / away.square().sum(), problem.object_prior_std[0]
+    by_tolerance = float((along * tolerance[:-1]).square().sum() + tolerance[-1] ** 2)
+    estimated = float(along @ object_covariance(estimate, curved=False) @ along)
+    return math.sqrt(by_tolerance), math.sqrt(max(estimated, 0.0))
+
+
+def _from_centroids(estimate: Estimate) -> Tensor:
+    """Fiducials (N, 3) mm relative to the centroid of their object."""
+    points, part = estimate.problem.points, estimate.problem.part_of
+    if part is None:
+        return points - points.mean(0)
+    return torch.stack([point - points[part == own].mean(0) for point, own in zip(points, part, strict=True)])
+
+
+def remaining_tolerance(estimate: Estimate, shape: Sequence[FiducialOffset]) -> Tensor | None:
+    """Tolerance (N,) mm with which an estimated object is as uncertain as it is, in shape and in size.
+
+    A file states the fiducials' errors as independent. Those of an estimated object mostly are a common error of its
+    size, much larger than the average of independent ones, so that the size alone requires its own tolerance.
+
+    Args:
+        estimate: without batch axes.
+        shape: the estimated offset of each fiducial.
+
+    Returns:
+        None for an object that was taken as exact.
+    """
+    if estimate.problem.object_prior_std is None:
+        return None
+    by_size = _object_sigmas(estimate)[1] * float(_from_centroids(estimate).norm())
+    own = estimate.problem.points.new_tensor([offset.sigma for offset in shape])
+    return own.clamp_min(by_size)
 
 
 def _position_sigma(estimate: Estimate) -> float:

@@ -67,7 +67,7 @@ def large_board(folder: Path, work: Path) -> dict[str, Any]:
         obj = CalibrationObject.of_board(Board("checkerboard", 11, 11, 77.0, warp=warp))
         found = calibrate(part(seen, 1), rig, obj)
         bend = None if found.bend is None else vars(found.bend)
-        result[name] = {"even": held_out(part(seen, 0), found.rig, found.object), "bend_mm": bend}
+        result[name] = {"even": held_out(part(seen, 0), found.rig, found.object.as_exact()), "bend_mm": bend}
     return result
 
 

@@ -63,7 +63,7 @@ def start(calibration: imgcal.Calibration, lights: bool = False, stick: tuple[in
     """
     if not lights:
         return imgcal.RigKeeper(calibration.rig, calibration.obj)
-    known = [part_of(calibration.object, stick)] if stick else []  # lengths in its file are up to 0.4 % off
+    known = [part_of(calibration.object.as_exact(), stick)] if stick else []  # lengths in its file are up to 0.4 % off
     return imgcal.RigKeeper(calibration.rig, CalibrationObject.of_several([*known, CalibrationObject.unknown()]))
 
 

@@ -178,10 +178,10 @@ def recorded_residuals() -> Floats:
         return kept
     given, known = recording(), calibrated()
     calibration, frames = known.calibration, range(CALIBRATED.stop)
-    labelled = associate(given.chosen(frames), calibration.rig, calibration.object)
-    observations, poses = accepted_observations(labelled, calibration.rig, calibration.object)
+    labelled = associate(given.chosen(frames), calibration.rig, calibration.object.as_exact())
+    observations, poses = accepted_observations(labelled, calibration.rig, calibration.object.as_exact())
     fixed = torch.zeros(calibration.rig.num_cameras, calibration.rig.num_parameters, dtype=torch.float64)
-    fit = estimate(observations, calibration.rig, calibration.object, poses, prior_std=fixed)
+    fit = estimate(observations, calibration.rig, calibration.object.as_exact(), poses, prior_std=fixed)
     seen = observations.seen.numpy()
     values = 2.0 * seen.sum((1, 2))
     back = np.sqrt(values / np.maximum(values - POSE, 1.0))

@@ -217,8 +217,8 @@ def calibrated(anew: bool = False, arrangement: Arrangement = Arrangement()) -> 
     blobs = scored.select(kept[scored.snapshot])
     names = tuple(name for name, keep in zip(scored.snapshot_names, kept, strict=True) if keep)
     blobs = replace(blobs, snapshot=row[blobs.snapshot], snapshot_names=names)
-    labelled = imgcal.score(blobs, calibration.rig, calibration.object).labelled
-    observations, poses = accepted_observations(labelled, calibration.rig, calibration.object)
+    labelled = imgcal.score(blobs, calibration.rig, calibration.object.as_exact()).labelled
+    observations, poses = accepted_observations(labelled, calibration.rig, calibration.object.as_exact())
     if poses is None:
         raise InputError(f"{FOLDER}: found scored frames without a pose")
     result = Calibrated(calibration, observations, poses)

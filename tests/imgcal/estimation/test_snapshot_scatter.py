@@ -79,6 +79,23 @@ def test_inflation_leaves_the_prior_and_the_relations_alone(simulate) -> None:
     assert torch.linalg.eigvalsh(larger / (scale[:, None] * scale)).min() > 0
 
 
+@pytest.mark.parametrize("snapshots", [3, 20])  # poses kept, cameras kept
+def test_inflation_leaves_the_object_s_scale_as_uncertain_as_its_prior(simulate, snapshots: int) -> None:
+    """No image shows a rig and an object that are larger together, so disagreeing images say nothing about them."""
+    case = simulate(snapshots=snapshots, cameras=3, tolerance=0.3)
+    found = estimate(case.observations, case.factory, case.obj, prior_std=1e3 * case.prior_std)
+    away = found.rig.positions - found.rig.positions.mean(0)
+    size = torch.zeros(3, 15, dtype=torch.float64)
+    size[:, 3:6] = away / away.square().sum()
+    plain, larger = (
+        float(size.flatten() @ camera_covariance(replace(found, inflation=factor), curved=False) @ size.flatten())
+        for factor in (None, torch.full((3,), 3.0, dtype=torch.float64))
+    )
+    points = case.obj.points - case.obj.points.mean(0)
+    by_object = 0.3**2 / float(points.square().sum())
+    assert by_object < larger < by_object + 10 * (plain - by_object)
+
+
 def test_the_camera_whose_lens_is_bad_gets_the_larger_factor(simulate) -> None:
     case, _ = wandering(simulate, 1, 96)
     one = case.observations.of_snapshots(0)

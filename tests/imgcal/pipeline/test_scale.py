@@ -40,3 +40,43 @@ def test_a_scale_that_the_cameras_know_better_is_theirs() -> None:
     assert found.scale.values["from"] == "cameras"
     assert 0 < found.scale.sigma < 0.01
     assert str(found.scale) == ""
+
+
+@pytest.mark.parametrize("rig_name", ["T4", "O10"])
+def test_the_scale_s_share_of_the_predicted_error_is_stated(rig_name: str) -> None:
+    """An object with tolerances is as large as their mean says, and the predicted error includes that."""
+    rig = replace(imgcal.load_rig(rig_name), prior=RigPrior(position=100.0))
+    obj = imgcal.load_object("asymmetric8")
+    loose = replace(obj, tolerance=torch.full((8,), 0.5, dtype=torch.float64))
+    truth = simulate_truth(rig, obj, 10, torch.Generator().manual_seed(3), PhysicalDrift(position=1.0))
+    found = imgcal.calibrate(true_detections(truth), rig, loose)
+    away = obj.points - obj.points.mean(0)
+    assert found.scale.source == "object"
+    assert found.scale.sigma == pytest.approx(0.5 / float(away.norm()), rel=0.05)
+    share = 100 * found.scale.sigma * found.scale.mm_per_percent
+    assert 0.5 * found.predicted_error.median_mm < share < found.predicted_error.median_mm
+    assert f"from the object file and its tolerance, {share:.2g} mm" in str(found.scale)
+
+
+def test_tolerances_that_the_images_asked_for_count_as_well() -> None:
+    rig = replace(imgcal.load_rig("O10"), prior=RigPrior(position=100.0))
+    obj = imgcal.load_object("wand4")
+    shift = torch.zeros_like(obj.points)
+    shift[1, 0], shift[2, 1], shift[3, 0] = 0.7, -0.5, 0.6
+    truth = simulate_truth(
+        rig, replace(obj, points=obj.points + shift), 40, torch.Generator().manual_seed(5), PhysicalDrift()
+    )
+    found = imgcal.calibrate(true_detections(truth), rig, obj)
+    assert found.scale.source == "object" and found.scale.sigma > 1e-4
+
+
+def test_an_estimated_object_that_is_used_again_is_as_uncertain_as_before(tmp_path) -> None:
+    rig = replace(imgcal.load_rig("O10"), prior=RigPrior(position=100.0))
+    obj = imgcal.load_object("asymmetric8")
+    loose = replace(obj, tolerance=torch.full((8,), 0.5, dtype=torch.float64))
+    truth = simulate_truth(rig, obj, 10, torch.Generator().manual_seed(3), PhysicalDrift(position=1.0))
+    first = imgcal.calibrate(true_detections(truth), rig, loose)
+    imgcal.save_object(first.object, tmp_path / "object.csv")
+    again = imgcal.calibrate(true_detections(truth), rig, imgcal.load_object(tmp_path / "object.csv"))
+    assert again.scale.sigma == pytest.approx(first.scale.sigma, rel=0.1)
+    assert again.predicted_error.median_mm == pytest.approx(first.predicted_error.median_mm, rel=0.2)
