@@ -14,6 +14,7 @@ import torch
 from imgcal.association import PipelineOptions
 from imgcal.cli import arguments
 from imgcal.cli.common import (
+    RESULT,
     check_folder,
     drop_cameras,
     keep_memory,
@@ -23,6 +24,7 @@ from imgcal.cli.common import (
     read_detections,
     require_board_files,
     select_cameras,
+    spare_inputs,
     start_pose,
 )
 from imgcal.cli.outcome import doubtful_cameras, findings, print_outcome, refused_summary, summary
@@ -58,9 +60,7 @@ from imgcal.pipeline import (
 from imgcal.types import CalibrationObject, CameraRig, Detections, limits
 
 RIG = "rig.yaml"
-WRITTEN = ("report.html", RIG, "rig.posterior.safetensors", "object.csv", "board.yaml", "result.json")
-
-
+WRITTEN = ("report.html", RIG, "rig.posterior.safetensors", "object.csv", "board.yaml", RESULT)
 WORST_STD = 1e6  # in any unit: what is known so badly is not known
 
 
@@ -111,7 +111,7 @@ class Calibrate(arguments.Calibrate):
         if lacking:
             print(f"note: no report.html, which {advice(lacking)}", file=sys.stderr)
         earlier = (self.out / RIG).exists()
-        with publishing(self.out, WRITTEN, mark="result.json") as out:
+        with publishing(self.out, WRITTEN, mark=RESULT) as out:
             if isinstance(outcome, RefusedError):
                 if earlier:
                     keep_previous(self.out, out, WRITTEN)
@@ -131,7 +131,7 @@ class Calibrate(arguments.Calibrate):
                 from imgcal.report import write_report  # brings jinja2 along, which is not in the core
 
                 write_report(content, out / "report.html")
-            write_text(out / "result.json", json.dumps(result, indent=2) + "\n")
+            write_text(out / RESULT, json.dumps(result, indent=2) + "\n")
             if self.labelled is not None and not isinstance(outcome, RefusedError):
                 save_detections(outcome.labelled_detections, self.labelled, obj)
         if isinstance(outcome, RefusedError):
@@ -162,10 +162,11 @@ class Calibrate(arguments.Calibrate):
         replaced = list(WRITTEN)
         if (self.out / RIG).exists():
             replaced += self._previous()
-        for name in replaced:
-            for option, given in self._inputs():
-                if (self.out / name).exists() and given.exists() and (self.out / name).samefile(given):
-                    raise InputError(f"--out: {self.out / name} is also the input of {option}, expected another folder")
+        spare_inputs(self.out, replaced, self._inputs())
+        from imgcal.watch import STATE  # brings a server along
+
+        if (self.out / STATE).exists():
+            raise InputError(f"--out: {self.out} belongs to imgcal watch ({STATE}), expected another folder")
 
     def _previous(self) -> list[str]:
         """Files of an earlier run that a refusal would replace by those of the last one."""

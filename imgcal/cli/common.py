@@ -31,6 +31,8 @@ from imgcal.pipeline import LearnedMeasurer, detect_capture
 from imgcal.types import Board, CameraRig, Detections
 
 Item = TypeVar("Item")
+RESULT = "result.json"
+"""File of a calibration's result for scripts."""
 EVERY = 60.0  # s between lines on progress without a terminal
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # as glibc's malloc.h numbers them
 KEPT, LARGEST = 256 << 20, 32 << 20  # bytes: that are free and kept, and of an array that is
@@ -167,6 +169,23 @@ def check_folder(path: Path) -> None:
         raise InputError(f"{path}: {found}, expected a folder to write to")
     if not os.access(existing, os.W_OK):
         raise InputError(f"{path}: no permission to write to {existing}")
+
+
+def spare_inputs(out: Path, written: Iterable[str], inputs: Iterable[tuple[str, Path]]) -> None:
+    """Make sure that no input would be overwritten.
+
+    Args:
+        out: the output folder.
+        written: names of the files that are written to it.
+        inputs: the option of each input, and its path.
+
+    Raises:
+        InputError: names the file and the option.
+    """
+    for name in written:
+        for option, given in inputs:
+            if (out / name).exists() and given.exists() and (out / name).samefile(given):
+                raise InputError(f"--out: {out / name} is also the input of {option}, expected another folder")
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from rich.console import Console
 
 from imgcal.association import Proposer
 from imgcal.cli import arguments
-from imgcal.cli.common import check_folder, open_rig
+from imgcal.cli.common import RESULT, check_folder, open_rig, spare_inputs
 from imgcal.cli.watch_display import Display
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice, missing
@@ -90,7 +90,7 @@ class Watch(arguments.Watch):
     def run(self) -> None:
         """Watch until the end."""
         rig, given = open_rig(self.rig), load_objects(self.object)
-        check_folder(self.out)
+        self._check_out()
         _check_poses(self.poses, given.as_unknown(), self.out)
         if self.learn:
             self._check_learning(given)
@@ -179,6 +179,13 @@ class Watch(arguments.Watch):
         elif before:
             said = f"{said} | {before:,} had been read before"
         print(said)
+
+    def _check_out(self) -> None:
+        """The inputs must survive, and a calibration."""
+        check_folder(self.out)
+        spare_inputs(self.out, (CURRENT,), [("--rig", Path(self.rig))])
+        if (self.out / RESULT).exists():
+            raise InputError(f"--out: {self.out} holds a calibration ({RESULT}), expected another folder")
 
     def _origin(self) -> str:
         """Which source it is, wherever the command is run."""

@@ -530,3 +530,27 @@ def test_a_folder_that_is_not_ours_to_write_to_is_told_before_anything_is_writte
         assert watch("blobs.csv", "out", "--poses", name) == 2
         assert f"--poses: {name}: no permission to write to locked" in capsys.readouterr().err
     assert not Path("out").exists() and not list(Path("locked").iterdir())
+
+
+def test_a_calibration_is_no_folder_to_watch_into(blobs, tmp_path, capsys):
+    """Its rig.yaml would be lost, and with it the posterior that a running rig starts from."""
+    result, table = tmp_path / "result", tmp_path / "blobs.csv"
+    save_detections(blobs, table)
+    begun = ["calibrate", str(table), "--snapshots", "0:20", "--rig", "T4", "--object", "asymmetric8", "--no-report"]
+    assert main([*begun, "--out", str(result)]) == 0
+    rig, before = result / "rig.yaml", sorted((path.name, path.read_bytes()) for path in result.iterdir())
+    capsys.readouterr()
+    common = ["watch", str(table), "--object", "asymmetric8", "--out", str(result)]
+    assert main([*common, "--rig", str(rig)]) == 2
+    assert capsys.readouterr().err == (f"imgcal: --out: {rig} is also the input of --rig, expected another folder\n")
+    assert main([*common, "--rig", "T4"]) == 2
+    assert (
+        capsys.readouterr().err
+        == f"imgcal: --out: {result} holds a calibration (result.json), expected another folder\n"
+    )
+    assert sorted((path.name, path.read_bytes()) for path in result.iterdir()) == before
+    out = tmp_path / "out"
+    assert main([*common[:-1], str(out), "--rig", str(rig)]) == 0
+    capsys.readouterr()
+    assert main([*begun, "--out", str(out)]) == 2
+    assert "belongs to imgcal watch (state.json), expected another folder" in capsys.readouterr().err
