@@ -21,6 +21,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.pipeline.board_turns import settle_turns
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.clock_offset import LateCamera, find_late_camera, suspects
+from imgcal.pipeline.conventions import lines_of_sight_miss, require_conventions
 from imgcal.pipeline.fitting import fit_labelled, fit_steady
 from imgcal.pipeline.initialization import Initializer
 from imgcal.pipeline.label_counts import LabelCounts, count_labels
@@ -31,7 +32,7 @@ from imgcal.pipeline.lights import add_lights, find_lights
 from imgcal.pipeline.repeats import Repeats, drop_repeats, name_repeats
 from imgcal.pipeline.sources import Detector, Frames, check_frames, find_blobs, make_sight
 from imgcal.pipeline.synchronization import NOTICEABLE, find_unsynchronized
-from imgcal.pipeline.turned_images import require_upright_images
+from imgcal.pipeline.turned_images import require_right_images
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import (
     CalibrationObject,
@@ -41,6 +42,8 @@ from imgcal.types import (
     RigPrior,
 )
 
+LEAST_USED, MOST_USED = 0.5, 0.75
+"""Share of the snapshots below which images or rig may follow other conventions, and of those tried for one to fit."""
 FOUND = RigPrior(focal_length=5e-4, principal_point=0.5, distortion=0.01, rotation=5e-4, position=0.5)
 """Prior of a rig that was just found, for completing the labels of sticks: about a pixel."""
 
@@ -103,6 +106,11 @@ def calibrate(
     if obj.parts and (sight is not None or initializer is not None):
         obj.require_rigid("for detectors and networks that look for a pattern")
     labelled: Associations | None = None
+    is_solid = obj.pose_rank == 6 and not obj.parts
+    if is_solid and sight is None and not detections.labelled.any() and lines_of_sight_miss(detections, rig):
+        # Identity takes minutes to find nothing in a long capture.
+        doubt = RefusedError("identity: the cameras' lines of sight to the object do not meet")
+        _require_conventions(doubt, detections, rig, obj, options)
     try:
         with require_solvable():
             labelled = associate(detections, rig, obj, options, progress, sight)
@@ -123,13 +131,17 @@ def calibrate(
                 return calibrate(
                     detections, rig, obj, options, initializer=initializer, progress=progress, detector=other
                 )
-        # The extent of the view says nothing for a light, and little for a stick.
-        if obj.pose_rank == 6 and not obj.parts:
+        if is_solid:  # the extent of the view says nothing for a light, and little for a stick
+            _require_conventions(error, detections, rig, obj, options)
             require_units(error, detections, rig, obj)
         if labelled is not None:
-            require_upright_images(error, detections, labelled, rig, obj)
+            require_right_images(error, detections, labelled, rig, obj)
             require_same_moments(error, detections, labelled, rig, obj, options)
         raise
+    used, given_snapshots = len(fit.labelled.used), len(detections.snapshot_names)
+    if used < LEAST_USED * given_snapshots and is_solid:
+        doubt = RefusedError(f"identity: only {used} of {given_snapshots} snapshots could be used")
+        _require_conventions(doubt, detections, rig, obj, options)
     seconds = {
         "detection": found - started,
         "identity": identified - found,
@@ -137,6 +149,22 @@ def calibrate(
     }
     late = late_cameras(detections, fit.tally, rig, obj, options, labelled=fit.labelled)
     return replace(fit, labelled=name_repeats(fit.labelled, repeats), seconds=seconds, late=late, repeats=repeats)
+
+
+def _require_conventions(
+    error: RefusedError, detections: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> None:
+    """Replace a refusal if images or rig follow other conventions; see `require_conventions`."""
+    options = replace(options, blind_cameras=True)
+
+    def fit(some: Detections, rig: CameraRig) -> float:
+        with require_solvable():
+            found = fit_steady(associate(some, rig, obj, options), some, rig, obj, options)
+        if len(found.labelled.used) < MOST_USED * len(some.snapshot_names):
+            raise RefusedError("identity: the object was found in few of the snapshots")
+        return float(found.rms)
+
+    require_conventions(error, detections, rig, fit)
 
 
 def _calibrate_lights(

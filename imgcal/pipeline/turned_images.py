@@ -1,12 +1,14 @@
-"""Find a camera whose image is turned or mirrored, once a calibration has failed.
+"""Find a camera whose image is turned, mirrored or another camera's, once a calibration has failed.
 
-The other cameras say where the markers are in its image. In a turned image they are there only after turning it back.
+The other cameras say where the markers are in its image. In a turned image they are there only after turning it back;
+those of two exchanged cameras are in each other's places.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 import torch
@@ -71,10 +73,10 @@ class ImageTurn:
         )
 
 
-def require_upright_images(
+def require_right_images(
     error: RefusedError, detections: Detections, labelled: Associations, rig: CameraRig, obj: CalibrationObject
 ) -> None:
-    """Replace a refusal if its cause is a camera whose image is turned or mirrored.
+    """Replace a refusal if its cause is a camera whose image is turned or mirrored, or two that are exchanged.
 
     Args:
         error: the refusal.
@@ -84,7 +86,7 @@ def require_upright_images(
         obj: the calibration object.
 
     Raises:
-        RefusedError: names the camera.
+        RefusedError: names the camera, or both.
     """
     try:
         arranged = arrange_labels(labelled, rig, obj)
@@ -92,7 +94,7 @@ def require_upright_images(
         return
     if len(arranged.labelled.used) < LEAST_LABELLED * len(arranged.labelled.snapshots):
         return
-    _require_upright(error, detections, rig, obj, arranged)
+    _require_right(error, detections, rig, obj, arranged)
     if (detections.fiducial >= 0).any() and obj.pose_rank == 6 and not obj.parts:
         # Labels of a turned image fit, too: take the object's poses from the other cameras alone.
         for camera in range(rig.num_cameras):
@@ -102,26 +104,42 @@ def require_upright_images(
             if posed.sum() >= LEAST_LABELLED * len(posed):
                 rest = arranged.drop_snapshots(np.flatnonzero(~posed).tolist(), rig, obj)
                 poses = initial_pose(replace(rest.observations, seen=others[torch.from_numpy(posed)]), rig, obj)
-                _require_upright(error, detections, rig, obj, replace(rest, poses=poses))
+                _require_right(error, detections, rig, obj, replace(rest, poses=poses))
 
 
-def _require_upright(
+def _require_right(
     error: RefusedError, detections: Detections, rig: CameraRig, obj: CalibrationObject, arranged: LabelledCapture
 ) -> None:
-    """Replace a refusal if a camera is turned, by the object's poses in a labelled capture."""
+    """Replace a refusal if a camera is turned or two are exchanged, by the object's poses in a labelled capture."""
     points = arranged.poses.apply(obj.points.to(rig.focal_length))
     image = rig.expand(len(points)).project_values(points, obj.radius)
     seen = image.visible.numpy() & arranged.labelled.columns(obj)
     moments = arranged.labelled.moments[arranged.labelled.used]
     uv = image.uv.numpy()
-    images = []
-    for camera in range(rig.num_cameras):
-        row, fiducial = np.nonzero(seen[:, camera])
-        images.append(compare_turns(detections, rig, camera, moments[row], uv[row, camera, fiducial]))
+    places = [
+        (moments[row], uv[row, camera, fiducial])
+        for camera, (row, fiducial) in enumerate(map(np.nonzero, seen.swapaxes(0, 1)))
+    ]
+    images = [compare_turns(detections, rig, camera, *place) for camera, place in enumerate(places)]
     known = [image for image in images if image is not None]
     turned = [image for image in known if not image.upright]
     if turned and 2 * len(turned) <= len(known):  # otherwise, the places are wrong
         raise turned[0].refusal() from error
+    for pair in combinations([camera for camera, image in enumerate(images) if image is None], 2):
+        exchanged = replace(detections, camera=_exchange(detections.camera, *pair))
+        fits = [compare_turns(exchanged, rig, camera, *places[camera]) for camera in pair]
+        if all(image is not None and image.upright for image in fits):
+            first, second = (rig.camera_names[camera] for camera in pair)
+            raise RefusedError(
+                f"cameras {first} and {second} seem to be exchanged: the blobs of each are where the rest of the "
+                "rig puts the fiducials in the other's image",
+                python="exchange their names in the detections or in the rig",
+                command="exchange their names in the input or in the rig file",
+            ) from error
+
+
+def _exchange(cameras: NDArray[np.int64], first: int, second: int) -> NDArray[np.int64]:
+    return np.where(cameras == first, second, np.where(cameras == second, first, cameras))
 
 
 def compare_turns(

@@ -12,12 +12,12 @@ from contextlib import contextmanager
 
 import numpy as np
 import torch
-from torch.nn.functional import normalize
 
 from imgcal.association import to_observations
 from imgcal.errors import RefusedError
 from imgcal.estimation import single_camera_poses
 from imgcal.geometry import vector_from_rotation
+from imgcal.pipeline.lines_of_sight import sight_angles
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
 LEAST_IMAGE, LARGEST_IMAGE = 3.0, 5.0
@@ -36,8 +36,6 @@ LEAST_RATIO, LEAST_LOOKS = 3.0, 6.0
 """Minimum ratio of lengths for different units: between cameras with labels, and from image sizes without labels."""
 LEAST_TURN = math.radians(20)
 """Minimum rotation error of most pairs of cameras for a rig with rotations in degrees."""
-LEAST_BLOBS = 3
-"""Minimum number of blobs of a camera for a direction."""
 MOST_ASKED = 8
 """Maximum number of snapshots to use."""
 
@@ -183,28 +181,14 @@ def _doubt_by_poses(detections: Detections, rig: CameraRig, obj: CalibrationObje
 
 
 def _doubt_by_directions(detections: Detections, rig: CameraRig) -> str:
-    """Test by how much viewing directions of pairs of cameras miss each other: the epipolar constraint."""
-    missed = []
-    for snapshot in np.unique(detections.snapshot)[:MOST_ASKED]:
-        mine = (detections.snapshot == snapshot) & detections.usable
-        cameras = np.flatnonzero(np.bincount(detections.camera[mine], minlength=rig.num_cameras) >= LEAST_BLOBS)
-        if len(cameras) < 2:
-            continue
-        middle = np.stack([np.median(detections.uv[mine & (detections.camera == c)], axis=0) for c in cameras])
-        seen = rig.select(cameras.tolist()).to(torch.float64)
-        xy = (torch.from_numpy(middle).double() - seen.principal_point) / seen.focal_length
-        rays = normalize(
-            seen.cam_from_rig.rotation.mT @ torch.cat((xy, torch.ones_like(xy[:, :1])), 1)[..., None], dim=1
-        )
-        first, second = torch.triu_indices(len(cameras), len(cameras), 1)
-        planes = torch.linalg.cross(rays[first, :, 0], seen.positions[second] - seen.positions[first])
-        missed.append((normalize(planes) * rays[second, :, 0]).sum(1).abs().asin())
-    if not missed or float(torch.cat(missed).median()) < LEAST_TURN:
+    """Test by how much the cameras' lines of sight to the object miss each other."""
+    angles = sight_angles(detections, rig.to(torch.float64))
+    missed = float(np.median(angles[np.isfinite(angles)])) if np.isfinite(angles).any() else 0.0
+    if missed < LEAST_TURN:
         return ""
     return (
         "with the rig's rotations, the cameras' lines of sight to the object miss each other by "
-        f"{math.degrees(float(torch.cat(missed).median())):.0f} deg; expected rotations in radians that take the rig "
-        "to the camera (cam_from_rig)"
+        f"{math.degrees(missed):.0f} deg; expected rotations in radians that take the rig to the camera (cam_from_rig)"
     )
 
 

@@ -1,0 +1,73 @@
+"""Do the cameras' lines of sight to the object meet? A check of a rig and its images that needs no identity."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imgcal.association import undistort
+from imgcal.types import CameraRig, Detections
+
+LEAST_BLOBS, LEAST_CAMERAS = 3, 2
+"""Minimum number of blobs of a camera for a direction, and of such cameras for a meeting point."""
+MOST_ASKED = 8
+"""Maximum number of snapshots to use."""
+ROBUST = np.radians(3.0)
+"""A line of sight that misses by this angle counts half."""
+ROUNDS = 6
+"""Iterations of reweighting."""
+
+Array = NDArray[np.float64]
+
+
+def telling_snapshots(detections: Detections, cameras: int, most: int = MOST_ASKED) -> NDArray[np.int64]:
+    """Choose snapshots that many cameras see, spread over the capture: their numbers, at most `most`."""
+    rows = detections.usable
+    count = np.zeros((int(detections.snapshot.max(initial=-1)) + 1, cameras), dtype=int)
+    np.add.at(count, (detections.snapshot[rows], detections.camera[rows]), 1)
+    seeing = (count >= LEAST_BLOBS).sum(1)
+    best = np.flatnonzero((seeing >= LEAST_CAMERAS) & (seeing >= np.sort(seeing)[-most:].min(initial=0)))
+    return best[np.linspace(0, len(best) - 1, min(len(best), most)).astype(int)]
+
+
+def sight_angles(detections: Detections, rig: CameraRig) -> Array:
+    """Angles by which the cameras' lines of sight to the object miss their meeting point.
+
+    A line of sight goes through the median of a camera's blobs, forward. The meeting point minimizes the squared
+    distances from the lines, those that miss it weighing less.
+
+    Args:
+        detections: blobs; the median must be near the object, which clutter may prevent.
+        rig: in float64.
+
+    Returns:
+        (S, C) rad for at most `MOST_ASKED` snapshots; nan where a camera has too few blobs.
+    """
+    snapshots = telling_snapshots(detections, rig.num_cameras)
+    middle = np.full((len(snapshots), rig.num_cameras, 2), np.nan)
+    for number, snapshot in enumerate(snapshots):
+        mine = (detections.snapshot == snapshot) & detections.usable
+        for c in np.flatnonzero(np.bincount(detections.camera[mine]) >= LEAST_BLOBS):
+            middle[number, c] = np.median(detections.uv[mine & (detections.camera == c)], axis=0)
+    row, camera = np.nonzero(np.isfinite(middle).all(-1))
+    focal, rotation, positions = (
+        rig.focal_length.mean(-1).numpy(),
+        rig.cam_from_rig.rotation.numpy(),
+        rig.positions.numpy(),
+    )
+    xy = undistort(middle[row, camera], camera, rig) / focal[camera, None]
+    ray = np.concatenate((xy, np.ones((len(xy), 1))), axis=1)
+    forward = np.zeros((*middle.shape[:2], 3))
+    forward[row, camera] = np.einsum("nij,ni->nj", rotation[camera], ray / np.linalg.norm(ray, axis=1, keepdims=True))
+    known = np.isfinite(forward).all(-1) & forward.any(-1)
+    forward[~known] = 0
+    across = np.eye(3) - forward[..., :, None] * forward[..., None, :]
+    weight = known.astype(float)
+    for _ in range(ROUNDS):
+        normal = np.einsum("sc,scij->sij", weight, across) + 1e-9 * np.eye(3)
+        right = np.einsum("sc,scij,cj->si", weight, across, positions)
+        towards = np.linalg.solve(normal, right[..., None])[..., 0][:, None] - positions
+        cosine = (towards * forward).sum(-1) / np.maximum(np.linalg.norm(towards, axis=-1), 1e-12)
+        angle = np.arccos(np.clip(cosine, -1, 1))
+        weight = known / (1 + (angle / ROBUST) ** 2)
+    return np.where(known, angle, np.nan)

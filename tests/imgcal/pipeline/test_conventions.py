@@ -1,0 +1,124 @@
+"""Images or rigs in other conventions are refused by name; a capture that fails for another reason is not."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+import imgcal
+from imgcal.errors import RefusedError
+from imgcal.geometry import RigidTransform
+from imgcal.pipeline.conventions import other_readings
+from imgcal.pipeline.lines_of_sight import sight_angles
+from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+from imgcal.types import CameraRig, Detections
+
+
+@cache
+def seen(name: str) -> tuple[CameraRig, Detections]:
+    rig = imgcal.load_rig(name).to(torch.float64)
+    truth = simulate_truth(rig, imgcal.load_object("asymmetric8"), 6, torch.Generator().manual_seed(0), PhysicalDrift())
+    blobs = true_detections(truth)
+    return rig, replace(blobs, uv=blobs.uv + 0.05 * np.random.default_rng(0).standard_normal(blobs.uv.shape))
+
+
+Change = Callable[[CameraRig, Detections], tuple[CameraRig, Detections]]
+
+
+def with_images(function: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Change:
+    def change(rig: CameraRig, blobs: Detections) -> tuple[CameraRig, Detections]:
+        return rig, replace(blobs, uv=function(blobs.uv, rig.image_size.double().numpy()[blobs.camera]))
+
+    return change
+
+
+def with_poses(function: Callable[[RigidTransform], RigidTransform]) -> Change:
+    return lambda rig, blobs: (replace(rig, cam_from_rig=function(rig.cam_from_rig)), blobs)
+
+
+def flipped(pose: RigidTransform) -> RigidTransform:
+    flip = pose.rotation.new_tensor([1.0, -1.0, -1.0])
+    return RigidTransform(flip[:, None] * pose.rotation, flip * pose.translation)
+
+
+def at_positions(pose: RigidTransform) -> RigidTransform:
+    return RigidTransform(pose.rotation, pose.inverse().translation)
+
+
+MISTAKES = {
+    "v from the bottom": (
+        with_images(lambda uv, size: np.stack((uv[:, 0], size[:, 1] - 1 - uv[:, 1]), 1)),
+        "all images seem to be mirrored top to bottom .as if v were counted from the bottom.; read like that",
+    ),
+    "u from the right": (
+        with_images(lambda uv, size: np.stack((size[:, 0] - 1 - uv[:, 0], uv[:, 1]), 1)),
+        "all images seem to be mirrored left to right .as if u were counted from the right.; read like that",
+    ),
+    "upside down": (with_images(lambda uv, size: size - 1 - uv), "all images seem to be turned by 180 degrees"),
+    "shares": (
+        with_images(lambda uv, size: (uv + 0.5) / size),
+        "u and v seem to be shares of the image's width and hei",
+    ),
+    "inverse poses": (
+        with_poses(RigidTransform.inverse),
+        ".*the rig's poses seem to take a camera to the rig, expected",
+    ),
+    "OpenGL": (with_poses(flipped), "the rig's cameras seem to look along -z with y up"),
+    "positions": (with_poses(at_positions), "the rig's translations seem to be positions of the cameras"),
+}
+
+
+@pytest.mark.parametrize("labelled", [True, False])
+@pytest.mark.parametrize("mistake", MISTAKES)
+@pytest.mark.parametrize("name", ["O10", "T4"])
+def test_another_convention_is_refused_and_named(name: str, mistake: str, labelled: bool) -> None:
+    change, expected = MISTAKES[mistake]
+    rig, blobs = seen(name)
+    if not labelled:
+        blobs = replace(blobs, fiducial=np.full_like(blobs.fiducial, -1))
+    rig, blobs = change(rig, blobs)
+    with pytest.raises(RefusedError, match=rf"^{expected}.*; so "):
+        imgcal.calibrate(blobs, rig, imgcal.load_object("asymmetric8"))
+
+
+@pytest.mark.parametrize("labelled", [True, False])
+def test_two_exchanged_cameras_are_named(labelled: bool) -> None:
+    rig = imgcal.load_rig("O10").to(torch.float64)
+    obj = imgcal.load_object("cube8")
+    truth = simulate_truth(rig, obj, 8, torch.Generator().manual_seed(0), PhysicalDrift())
+    blobs = true_detections(truth)
+    exchanged = np.where(blobs.camera == 1, 2, np.where(blobs.camera == 2, 1, blobs.camera))
+    blobs = replace(blobs, camera=exchanged, fiducial=blobs.fiducial if labelled else np.full_like(blobs.fiducial, -1))
+    with pytest.raises(RefusedError, match=r"^cameras cam02 and cam03 seem to be exchanged"):
+        imgcal.calibrate(blobs, rig, obj)
+
+
+def test_another_object_is_no_other_convention() -> None:
+    rig, blobs = seen("T4")
+    unlabelled = replace(blobs, fiducial=np.full_like(blobs.fiducial, -1))
+    with pytest.raises(RefusedError, match=r"^(identity|camera|estimation)") as caught:
+        imgcal.calibrate(unlabelled, rig, imgcal.load_object("wand4"))
+    assert "seem" not in caught.value.reason
+
+
+def test_lines_of_sight_meet_in_our_convention_only() -> None:
+    """Around a room, the directions alone tell the readings apart."""
+    rig = imgcal.load_rig("room10").to(torch.float64)
+    generator = torch.Generator().manual_seed(1)
+    points = 2000 * torch.rand(6, 3, generator=generator, dtype=torch.float64) + torch.tensor([-1000.0, -1000.0, 0.0])
+    offsets = 60 * torch.randn(5, 3, generator=generator, dtype=torch.float64)
+    image = rig.expand(6).project(points[:, None] + offsets)
+    snapshot, camera, fiducial = np.nonzero(image.visible.numpy())
+    blobs = Detections(
+        uv=image.uv.numpy()[snapshot, camera, fiducial], sigma=np.full(len(snapshot), 0.05), camera=camera,
+        snapshot=snapshot, fiducial=np.full_like(fiducial, -1), radius=np.full(len(snapshot), np.nan),
+        flags=np.zeros(len(snapshot), dtype=np.uint8), camera_names=rig.camera_names,
+        snapshot_names=tuple("012345"),
+    )  # fmt: skip
+    own = float(np.nanmean(sight_angles(blobs, rig)))
+    assert own < np.radians(0.5)
+    for reading in other_readings(blobs, rig):
+        assert reading.miss > 3 * own + np.radians(0.5), reading.words
