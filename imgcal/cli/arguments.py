@@ -181,7 +181,7 @@ class Calibrate:
     first_guess: str = "none"  #: start of the fit: none (factory rig), points, vit, cnn (shipped), a file or run
     trust: tuple[str, ...] = ()
     """with --first-guess FILE: your own encoders (package.module:Class) that the file may name; their code is run"""
-    without: tuple[str, ...] = ()  #: cameras to leave out
+    without: tuple[str, ...] = ()  #: cameras to leave out, of the rig or of INPUT only
     blind_cameras: bool = False  #: accept cameras that see nothing; they keep their factory values
     after_last_move: bool = False  #: if a camera moved during the capture, use only the snapshots since then
     labelled: Path | None = None

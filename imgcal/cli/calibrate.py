@@ -81,7 +81,8 @@ class Calibrate(arguments.Calibrate):
             after_last_move=self.after_last_move,
             start_pose=start_pose(self.start_pose),
         )
-        source = open_input(self.input, complete, obj.rows, self.videos_differ)
+        foreign = [name for name in self.without if name not in complete.camera_names]
+        source = open_input(self.input, complete, obj.rows, self.videos_differ, foreign)
         self._require_frames(source, rig)
         require_board_files(self.object, source)
         measurer = None if self.measurer is None else LearnedMeasurer.load(self.measurer)

@@ -26,7 +26,7 @@ from imgcal.errors import InputError
 from imgcal.formats import find_format, is_foreign, load_rig, read_foreign_rig
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import Capture, Frame
-from imgcal.messages import list_names, plural, shorten, with_article
+from imgcal.messages import plural, shorten, with_article
 from imgcal.pipeline import LearnedMeasurer, detect_capture
 from imgcal.types import Board, CameraRig, Detections
 
@@ -139,11 +139,6 @@ def start_pose(values: StartPose | None) -> RigidTransform | None:
 
 def drop_cameras(rig: CameraRig, names: tuple[str, ...]) -> CameraRig:
     """Leave cameras out of a rig."""
-    unknown = [name for name in names if name not in rig.camera_names]
-    if unknown:
-        raise InputError(
-            f"--without: found {list_names(unknown)}, expected cameras of the rig: {list_names(rig.camera_names)}"
-        )
     if set(rig.camera_names) <= set(names):
         raise InputError(f"--without: found all {rig.num_cameras} cameras of the rig, expected at least one to remain")
     return rig.select([i for i, name in enumerate(rig.camera_names) if name not in names])

@@ -7,7 +7,7 @@ Optional beside `frames/`: `capture.yaml` (format, bit_depth, note) and `masks/<
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +19,7 @@ from imgcal.errors import InputError
 from imgcal.io.atomic import is_unfinished, write_text
 from imgcal.io.detections_csv import Fiducials, load_detections
 from imgcal.io.frames import IMAGE_SUFFIXES, TIFF_SUFFIXES, VIDEO_SUFFIXES, Frame, Video, count_frames, read_frame
-from imgcal.io.names import is_file_name, natural_key, nearest, sample_path
+from imgcal.io.names import is_file_name, natural_key, nearest, require_left_out, sample_path
 from imgcal.io.validation import StrictModel, validate
 from imgcal.io.yaml_file import read_yaml, yaml_text
 from imgcal.messages import list_names
@@ -124,7 +124,9 @@ class Capture:
             raise InputError(f"{path}: found the value {frame.max()}, expected at most 4095 (12 bit in the low bits)")
 
 
-def open_capture(folder: str | Path, rig: CameraRig | None = None, videos_differ: bool = False) -> Capture:
+def open_capture(
+    folder: str | Path, rig: CameraRig | None = None, videos_differ: bool = False, without: Collection[str] = ()
+) -> Capture:
     """Find the frames of a capture.
 
     Args:
@@ -132,6 +134,7 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None, videos_differ
         rig: gives the cameras, their order and image sizes; a camera without files is allowed. None = what is there.
         videos_differ: accept videos (and TIFFs of several pages) whose numbers of frames or time stamps differ; their
             frames go together by number.
+        without: cameras that the rig does not have, whose files are left out.
 
     Raises:
         InputError: one line with the file or folder, what was found and what was expected.
@@ -158,6 +161,8 @@ def open_capture(folder: str | Path, rig: CameraRig | None = None, videos_differ
             raise InputError(f"{frames}: found camera {camera} more than once, expected one folder or file for it")
         files[camera] = _folder_snapshots(path) if path.is_dir() else _file_snapshots(path)
     if rig is not None:
+        require_left_out(frames, without, files)
+        files = {camera: found for camera, found in files.items() if camera not in without}
         _check_cameras(frames, files, rig)
     if not any(files.values()):
         raise InputError(f"{frames}: found no frames, expected images or videos of the cameras")
@@ -185,6 +190,7 @@ def open_input(
     rig: CameraRig | None = None,
     fiducials: Fiducials | None = None,
     videos_differ: bool = False,
+    without: Collection[str] = (),
 ) -> Capture | Detections:
     """Open the input of a command: a capture folder, a detections file, or a sample by its name (`sample:O10`).
 
@@ -195,14 +201,14 @@ def open_input(
     """
     path = sample_path(path)
     if path.is_dir():
-        return open_capture(path, rig, videos_differ)
+        return open_capture(path, rig, videos_differ, without)
     if not path.is_file():
         found = "found a device or pipe" if path.exists() else "no such file or folder"
         raise InputError(f"{path}: {found}, expected a capture folder or a detections file (.csv, .csv.gz)")
     suffix = path.suffix.lower()
     if suffix in IMAGE_SUFFIXES | VIDEO_SUFFIXES:
         raise InputError(f"{path}: found one image or video, expected the capture folder that holds frames/")
-    return load_detections(path, rig, fiducials)
+    return load_detections(path, rig, fiducials, without)
 
 
 def save_capture_settings(folder: str | Path, bit_depth: int, note: str | None = None) -> None:

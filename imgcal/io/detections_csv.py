@@ -13,7 +13,7 @@ from __future__ import annotations
 import csv
 import gzip
 import io
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from imgcal.errors import InputError
 from imgcal.io.atomic import replacing
 from imgcal.io.csv_file import Chunk, fail_row, read_chunks
-from imgcal.io.names import is_file_name, nearest
+from imgcal.io.names import is_file_name, nearest, require_left_out
 from imgcal.messages import list_names, shorten
 from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections, limits
 
@@ -36,10 +36,18 @@ Fiducials = int | Sequence[int] | Sequence[tuple[str, int]]
 DEFAULT_SIGMA = 0.1
 """Pixels, one standard deviation of each axis, for files without the column `sigma`."""
 
+LEFT_OUT = -1
+"""Number of a camera whose rows are left out."""
+
 MARGIN = 5.0  # pixels outside the image that are still taken: centres of cut discs, rounding
 
 
-def load_detections(path: str | Path, rig: CameraRig | None = None, fiducials: Fiducials | None = None) -> Detections:
+def load_detections(
+    path: str | Path,
+    rig: CameraRig | None = None,
+    fiducials: Fiducials | None = None,
+    without: Collection[str] = (),
+) -> Detections:
     r"""Read detections; a million rows take a few seconds.
 
     Args:
@@ -47,6 +55,7 @@ def load_detections(path: str | Path, rig: CameraRig | None = None, fiducials: F
         rig: gives the cameras and their order, and the image sizes that are checked; None = cameras in file order.
         fiducials: number of points of the object, the limit of the column `fiducial`; or what that calls them, in the
             order of the object; None = not checked. It is `CalibrationObject.rows`.
+        without: cameras that the rig does not have, whose rows are left out.
 
     Returns:
         Detections; snapshots in file order, which is the order in which their names first appear.
@@ -66,6 +75,9 @@ def load_detections(path: str | Path, rig: CameraRig | None = None, fiducials: F
     path = Path(path)
     cameras = {} if rig is None else {name: index for index, name in enumerate(rig.camera_names)}
     known_cameras = None if rig is None else rig.camera_names
+    if known_cameras is not None:
+        cameras |= dict.fromkeys(without, LEFT_OUT)
+    left_out: set[str] = set()
     snapshots: dict[str, int] = {}
     parts: list[dict[str, NDArray[Any]]] = []
     for chunk in read_chunks(path, REQUIRED, OPTIONAL):
@@ -75,10 +87,15 @@ def load_detections(path: str | Path, rig: CameraRig | None = None, fiducials: F
             **_numbers(chunk, fiducials),
         }
         if rig is not None:
+            kept = part["camera"] != LEFT_OUT
             _check_inside(chunk, part, rig)
+            left_out |= {chunk.columns["camera"][row] for row in np.flatnonzero(~kept)}
+            part = {name: values[kept] for name, values in part.items()}
         parts.append(part)
     if not parts:
         raise InputError(f"{path}: found a header and no rows, expected at least one blob")
+    require_left_out(path, without, left_out)
+    cameras = {name: index for name, index in cameras.items() if index != LEFT_OUT}
     column = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     _check_unique(path, column, tuple(cameras), tuple(snapshots))
     return Detections(
@@ -242,7 +259,7 @@ def _fill_column(chunk: Chunk, column: str, default: str) -> Chunk:
 def _check_inside(chunk: Chunk, part: dict[str, NDArray[Any]], rig: CameraRig) -> None:
     size = rig.image_size.cpu().numpy()[part["camera"]]
     uv = np.stack((part["u"], part["v"]), axis=1)
-    outside = ((uv < -0.5 - MARGIN) | (uv > size - 0.5 + MARGIN)).any(axis=1)
+    outside = ((uv < -0.5 - MARGIN) | (uv > size - 0.5 + MARGIN)).any(axis=1) & (part["camera"] != LEFT_OUT)
     if outside.any():
         row = int(outside.argmax())
         u, v = (shorten(chunk.columns[axis][row]) for axis in "uv")

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from imgcal.errors import InputError
+from imgcal.messages import shorten
 
 SAMPLE = "sample"
 """What the names of shipped captures begin with, before a colon."""
@@ -164,3 +165,14 @@ def find_file(path: str | Path, kind: str, suffix: str, other: str | None = None
     near = nearest(path.stem, [*shipped, *([other] if other else [])])
     nor = f"nor {other}, nor" if other else "nor"
     raise InputError(f"{path}: no such file, {nor} one of the shipped {kind} ({', '.join(names)}){near}")
+
+
+def require_left_out(path: Path, without: Collection[str], found: Collection[str]) -> None:
+    """Refuse to leave out a camera that is not there, which may be misspelt.
+
+    Raises:
+        InputError: names the first one.
+    """
+    missing = next((camera for camera in without if camera not in found), None)
+    if missing is not None:
+        raise InputError(f"{path}: found no camera {shorten(missing)} to leave out, neither here nor in the rig")

@@ -91,9 +91,8 @@ def test_cameras_are_left_out_of_rigs_and_tables(o10, asymmetric8) -> None:
     assert len(select_cameras(table.select(np.zeros(len(table), bool)), rig)) == 0
 
 
-def test_cameras_that_are_not_there_or_all_of_them_cannot_be_left_out(o10) -> None:
-    with pytest.raises(InputError, match="--without: found cam11, expected cameras of the rig: cam01"):
-        drop_cameras(o10, ("cam02", "cam11"))
+def test_all_cameras_cannot_be_left_out(o10) -> None:
+    assert drop_cameras(o10, ("cam02", "cam11")).num_cameras == 9  # of the input: checked where that is read
     with pytest.raises(InputError, match="found all 10 cameras"):
         drop_cameras(o10, o10.camera_names)
 

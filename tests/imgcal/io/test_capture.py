@@ -312,3 +312,26 @@ def test_real_captures(captures: Path, name: str, cameras: tuple[str, ...], shap
     for frame in frames.values():
         assert frame is not None
         assert (frame.shape, frame.dtype) == (shape, np.uint8)
+
+
+def test_a_camera_that_the_rig_does_not_have_can_be_left_out(tmp_path: Path) -> None:
+    rig = make_rig("cam01", "cam02")
+    rows = [f"0,{camera},10,5" for camera in (*rig.camera_names, "cam09")]
+    (tmp_path / "blobs.csv").write_text("\n".join(["snapshot,camera,u,v", *rows]))
+    with pytest.raises(InputError, match=r"line 4: camera: found 'cam09' .*, expected a camera of the rig: cam01"):
+        open_input(tmp_path / "blobs.csv", rig)
+    found = open_input(tmp_path / "blobs.csv", rig, without=["cam09"])
+    assert isinstance(found, Detections)
+    assert found.camera_names == rig.camera_names and len(found) == 2
+    for camera in (*rig.camera_names, "cam09"):
+        path = tmp_path / "capture" / "frames" / camera / "0.png"
+        path.parent.mkdir(parents=True)
+        write_frame(path, grey())
+    with pytest.raises(InputError, match="frames: found cam09, expected the cameras of rig"):
+        open_input(tmp_path / "capture", rig)
+    capture = open_input(tmp_path / "capture", rig, without=["cam09"])
+    assert isinstance(capture, Capture)
+    assert capture.camera_names == rig.camera_names
+    for source in ("blobs.csv", "capture"):
+        with pytest.raises(InputError, match="found no camera cam08 to leave out, neither here nor in the rig"):
+            open_input(tmp_path / source, rig, without=["cam09", "cam08"])
