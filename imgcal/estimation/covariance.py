@@ -380,7 +380,10 @@ def relative_covariance(estimate: Estimate, reference: int = 0) -> Tensor:
         return relative_difference(rigs, centre, reference).flatten(-2)
 
     flat = jacobian @ covariance @ jacobian.mT
-    return flat + curvature_covariance(estimate, relative, flat)
+    covariance = flat + curvature_covariance(estimate, relative, flat)
+    own = slice(first := reference * estimate.rig.num_parameters, first + POSE_PARAMETERS)
+    covariance[..., own, :] = covariance[..., own] = 0  # exactly, in spite of rounding in the second order
+    return covariance
 
 
 def relative_jacobian(rig: CameraRig, reference: int) -> Tensor:
