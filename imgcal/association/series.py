@@ -190,7 +190,7 @@ class _Series:
         self.detections, self.tracker, self.sight = detections, tracker, sight
         self.count = len(detections.snapshot_names)
         self.coded = _coded_snapshots(detections, self.count)
-        self.rows = _rows_by_snapshot(detections, self.count)
+        self.rows = rows_by_snapshot(detections, self.count)
         self.results: dict[int, tuple[SnapshotIdentity, NDArray[np.int64]]] = {}
         self.looked: dict[int, Detections] = {}  # measurements in the frames that replace blobs
         self.rigs: dict[int, CameraRig] = {}  # the rig with which each snapshot was decided
@@ -425,7 +425,7 @@ def _label_blobs(
     return table.select(np.lexsort((table.camera, table.snapshot)))
 
 
-def _rows_by_snapshot(detections: Detections, count: int) -> list[NDArray[np.int64]]:
+def rows_by_snapshot(detections: Detections, count: int) -> list[NDArray[np.int64]]:
     """Rows of the usable blobs of each snapshot, in one pass over the table."""
     usable = np.flatnonzero(detections.usable)
     snapshot = detections.snapshot[usable]

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from imgcal.association.identity import Identity, PipelineOptions
-from imgcal.association.series import NOT_TRIED, Associations, Patience, Progress
+from imgcal.association.series import NOT_TRIED, Associations, Patience, Progress, rows_by_snapshot
 from imgcal.association.tracker import MOST_REMEMBERED, LearntRig, SnapshotIdentity, Tracker
 from imgcal.errors import InputError
 from imgcal.types import CalibrationObject, CameraRig, Detections
@@ -77,9 +77,7 @@ class _Capture:
     def __init__(self, detections: Detections, trackers: Sequence[Tracker], obj: CalibrationObject) -> None:
         self.detections, self.trackers, self.obj = detections, trackers, obj
         count = len(detections.snapshot_names)
-        usable = np.flatnonzero(detections.usable)
-        order = usable[np.argsort(detections.snapshot[usable], kind="stable")]
-        self.rows = np.split(order, np.searchsorted(detections.snapshot[order], np.arange(1, count)))[:count]
+        self.rows = rows_by_snapshot(detections, count)
         self.coded = np.zeros(count, dtype=bool)
         self.coded[detections.snapshot[detections.fiducial >= 0]] = True
         self.found: dict[int, list[Row]] = {s: [] for s in range(count)}  # accepted rows by snapshot

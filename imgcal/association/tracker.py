@@ -157,7 +157,7 @@ class Tracker:
         identity, found, found_by = self._judge(sight, snapshot)
         identity = self._adopt(identity)
         if not identity.accepted and not sight.where_blobs_fail:
-            told = self._identify(blobs)
+            told = self._adopt(self.propose(blobs))
             if told.accepted and told.rig_from_object is not None:
                 there, at, by = self._judge(sight, replace(snapshot, candidates=(told.rig_from_object,)))
                 if there.accepted:
@@ -211,9 +211,6 @@ class Tracker:
         """
         self.pose = pose
         return ("ambiguous" if self.alternatives > 1 else "by_tracking"), max(self.alternatives, 1)
-
-    def _identify(self, blobs: Detections) -> Identity:
-        return self._adopt(self.propose(blobs))
 
     def propose(self, blobs: Detections, expected: RigidTransform | None = None, search: bool = True) -> Identity:
         """Label the blobs of one snapshot without changing the state.

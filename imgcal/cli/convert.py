@@ -131,12 +131,9 @@ class Convert(arguments.Convert):
             )
         return fill_image_sizes(rig, where, sizes), title
 
-    def _output_paths(self, files: Files) -> list[Path]:
-        return [self.out / name if name else self.out for name in files]
-
     def _write(self, files: Files) -> list[Path]:
         """In one step; the sources must survive."""
-        written = self._output_paths(files)
+        written = [self.out / name if name else self.out for name in files]
         for path in written:
             for what, source in [*(("SOURCE", one) for one in self.source), *(("--into", one) for one in self.into)]:
                 if path.exists() and source.exists() and (path.samefile(source) or path.parent.samefile(source)):

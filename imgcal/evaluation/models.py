@@ -82,7 +82,9 @@ def load_models(
         check_says_rigs(path, checkpoint.experiment)
         rig, obj = rig or checkpoint.rig, obj or checkpoint.obj
         network = checkpoint.network.to(device)
-        models.append(Model(name, path, checkpoint, network_method(network), _history(path.parent / METRICS)))
+        models.append(
+            Model(name, path, checkpoint, network_method(network), tuple(read_metrics(path.parent / METRICS)))
+        )
     return models
 
 
@@ -94,7 +96,3 @@ def _names(paths: Sequence[Path]) -> list[str]:
         if len(set(names)) == len(names):
             return names
     raise InputError(f"models: found {', '.join(map(str, paths))}, expected each one once")
-
-
-def _history(path: Path) -> tuple[dict[str, Any], ...]:
-    return tuple(read_metrics(path))

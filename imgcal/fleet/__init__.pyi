@@ -2,7 +2,7 @@ from .dataset import Dataset
 from .drift_information import KINDS, DriftInformation, parameter_units
 from .engine import Done, Engine, Lost
 from .fleet_summary import KindOfRig, refusals, rig_kinds
-from .job import STATUSES, Settings
+from .job import Settings
 from .learnt_prior import LearntPrior, OutlierCamera, Spread, Trend, learn_prior, outlier_cameras, standardized_offsets
 from .manifest import Item, Manifest, write_manifest
 from .run import FleetCount, recalibrate_fleet
@@ -10,7 +10,6 @@ from .work_items import Mapper, StoredResults, workers
 
 __all__ = [
     "KINDS",
-    "STATUSES",
     "Dataset",
     "Done",
     "DriftInformation",

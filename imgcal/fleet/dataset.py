@@ -177,7 +177,6 @@ class Writer:
     def __init__(self, dataset: Dataset) -> None:
         """Start empty; `Dataset.written` makes one."""
         self.dataset = dataset
-        self.written = 0
         self._rows: list[dict[str, Any]] = []
 
     @cached_property
@@ -220,7 +219,6 @@ class Writer:
                 raise InputError(
                     f"{folder}: cannot be written: {short_reason(error)}; {self.waiting} results were not saved"
                 ) from error
-            self.written += len(rows)
             self._rows = [row for row in self._rows if _day(row) != day]
 
 

@@ -15,7 +15,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Any, Generic, TypeVar
 
 from imgcal.errors import InputError, RefusedError
@@ -109,9 +108,7 @@ class Engine:
         self.cores = int(ray.cluster_resources().get("CPU", self.cores))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Leave the cluster, or end it."""
         import ray
 

@@ -40,9 +40,6 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
 Status = Literal["ok", "refused", "unusable", "unreachable", "timed_out", "out_of_memory", "crashed", "fault"]
-STATUSES: tuple[Status, ...] = (
-    "ok", "refused", "unusable", "unreachable", "timed_out", "out_of_memory", "crashed", "fault",
-)  # fmt: skip
 """What became of a capture. `unusable`: its files are wrong; `unreachable`: not to be read; `fault`: one of imgcal."""
 TRANSIENT = frozenset({"unreachable", "timed_out", "out_of_memory", "crashed"})
 """What another try may mend."""

@@ -1,5 +1,5 @@
 from .conversion import (
-    Held,
+    StorableRig,
     describe_lens,
     fill_image_sizes,
     fit_to_target,
@@ -29,9 +29,9 @@ __all__ = [
     "ForeignCamera",
     "ForeignRig",
     "Format",
-    "Held",
     "Holds",
     "Lens",
+    "StorableRig",
     "Updated",
     "Written",
     "convert_rig",

@@ -29,16 +29,11 @@ LENGTH = re.compile(r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)?\s*([a-z]+)")
 
 
 @dataclass(frozen=True)
-class Held:
+class StorableRig:
     """A rig whose lenses a target format can store."""
 
     rig: ForeignRig
     fits: tuple[Fit, ...]  # one a camera
-
-    @property
-    def worst(self) -> float:
-        """The largest residual of a lens in pixels; 0 where all are exact."""
-        return max(fit.worst for fit in self.fits)
 
 
 def millimetres(unit: str, what: str = "--unit") -> float:
@@ -138,7 +133,7 @@ def fill_image_sizes(rig: ForeignRig, where: str, sizes: Mapping[str, tuple[int,
     return replace(rig, cameras=tuple(cameras))
 
 
-def fit_to_target(rig: ForeignRig, holds: Holds, title: str, limit: float = LIMIT) -> Held:
+def fit_to_target(rig: ForeignRig, holds: Holds, title: str, limit: float = LIMIT) -> StorableRig:
     """Express every lens in a model of the target.
 
     Raises:
@@ -156,7 +151,7 @@ def fit_to_target(rig: ForeignRig, holds: Holds, title: str, limit: float = LIMI
             )
         fits.append(fit)
     cameras = tuple(replace(camera, lens=fit.lens) for camera, fit in zip(rig.cameras, fits, strict=True))
-    return Held(replace(rig, cameras=cameras), tuple(fits))
+    return StorableRig(replace(rig, cameras=cameras), tuple(fits))
 
 
 def lens_refusal(camera: ForeignCamera, fit: Fit, title: str, nearest: str, limit: float) -> str:

@@ -114,7 +114,7 @@ def _write_back(
     wanted = replace(old, cameras=tuple(cameras))
     if old.root is not None:
         wanted = wanted.in_camera_frame(old.root)
-    notes = _frame_notes(where, old, wanted, found)
+    notes = _frame_notes(old, wanted, found)
     contents = {path: read_bytes(path, MOST_BYTES) for path in _list_files(original)}
     changes = _changes(old, wanted)
     sized = _fill_sizes(wanted, rig)
@@ -170,7 +170,7 @@ def _is_unchanged(camera: ForeignCamera, new: ForeignCamera) -> bool:
     return bool(near and turned and worst_difference(other, one)[0] <= STAYED)
 
 
-def _frame_notes(where: str, old: ForeignRig, wanted: ForeignRig, found: Mapping[str, ForeignCamera]) -> list[str]:
+def _frame_notes(old: ForeignRig, wanted: ForeignRig, found: Mapping[str, ForeignCamera]) -> list[str]:
     """Report a rig whose frame is not the file's: cameras that are not in the rig would stay behind.
 
     Raises:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from imgcal.errors import InputError
 from imgcal.formats.conversion import (
     NATIVE,
-    Held,
+    StorableRig,
     fit_note,
     fit_to_target,
     from_camera_rig,
@@ -102,12 +102,12 @@ def convert_rig(
     return _compare(rig, held, back, files, notes)
 
 
-def _valid_covariance(held: Held) -> RigCovariance | None:
+def _valid_covariance(held: StorableRig) -> RigCovariance | None:
     """The uncertainty of the rig, where no lens was fitted: fitted parameters have another one."""
     return held.rig.covariance if all(fit.exact for fit in held.fits) else None
 
 
-def _compare(rig: ForeignRig, held: Held, back: ForeignRig, files: Files, notes: list[str]) -> Written:
+def _compare(rig: ForeignRig, held: StorableRig, back: ForeignRig, files: Files, notes: list[str]) -> Written:
     """Compare what was read back with what was to be written, and with the source."""
     exact, _ = worst_difference(held.rig, back)
     between, points = worst_difference(rig, back)

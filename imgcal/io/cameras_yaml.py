@@ -22,7 +22,6 @@ from imgcal.io.yaml_file import Flow, read_yaml, yaml_text
 from imgcal.types import CameraRig, RigPrior, limits
 
 FORMAT = "imgcal-cameras/1"
-ENTRY_NAMES = {"cameras": "camera"}
 FOCAL_SPREAD = 0.15
 """Relative: how far a focal length that is called rough may be off, one standard deviation."""
 CENTRE_SPREAD = 0.02
@@ -87,7 +86,7 @@ def load_cameras(path: str | Path) -> CameraRig:
     path = Path(path)
     if not path.is_file() or _starts_with(path, RIG_FORMAT):
         return drop_poses(read_rig(path))
-    content = read_yaml(path, _CamerasFile, FORMAT, ENTRY_NAMES)
+    content = read_yaml(path, _CamerasFile, FORMAT)
     cameras = content.cameras
     sizes = torch.tensor([camera.image_size for camera in cameras])
     middle = ((sizes - 1) / 2).tolist()
@@ -145,7 +144,7 @@ def save_cameras(image_size: Mapping[str, tuple[int, int]], field_of_view_deg: f
             for name, size in image_size.items()
         ],
     }
-    validate(content, _CamerasFile, f"{path}: not written", ENTRY_NAMES)
+    validate(content, _CamerasFile, f"{path}: not written")
     write_text(path, yaml_text(content))
 
 

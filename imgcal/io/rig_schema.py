@@ -18,7 +18,6 @@ from imgcal.messages import list_names, quote
 from imgcal.types import ConvexVolume, DriftRate, RigPrior, limits, parameter_names
 
 FORMAT = "imgcal-rig/1"
-ENTRY_NAMES = {"cameras": "camera"}
 
 # How far the distortion may move a point at half the image diagonal, in units of its distance from the centre.
 LARGEST_DISTORTION = 10.0
@@ -52,7 +51,7 @@ class _Transform(StrictModel):
     translation: Annotated[list[Shift], _of_length(3)]
 
     @model_validator(mode="after")
-    def _convert_to_radians(self) -> _Transform:
+    def _check_angle(self) -> _Transform:
         angle = math.hypot(*self.rotation_vector)
         if angle > 2 * math.pi + 1e-9:
             raise ValueError(f"found a rotation vector of length {angle:g}, expected rad, at most 2 pi")
@@ -96,11 +95,7 @@ class CameraEntry(CameraImages):
     std: Std | None = None
 
     @model_validator(mode="after")
-    def _check_values(self) -> CameraEntry:
-        self._check_lens()
-        return self
-
-    def _check_lens(self) -> None:
+    def _check_lens(self) -> CameraEntry:
         if self.model not in LENS_MODELS:
             raise ValueError(f"model: found {quote(self.model)!r}, expected one of {list_names(LENS_MODELS)}")
         model = LENS_MODELS[self.model]
@@ -115,6 +110,7 @@ class CameraEntry(CameraImages):
                 f"distortion: found {self.distortion}, which moves the image corners by {shift:.0f} times their "
                 f"distance from the centre; expected {names} on the z = 1 plane"
             )
+        return self
 
 
 def _shift(model: LensModel, coefficients: list[float], radius: float) -> float:

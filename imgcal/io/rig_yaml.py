@@ -22,7 +22,7 @@ from imgcal.geometry import (
 from imgcal.io.atomic import write_text
 from imgcal.io.names import find_file, is_file_name, title_from_name
 from imgcal.io.posterior_file import read_posterior, write_posterior
-from imgcal.io.rig_schema import ENTRY_NAMES, FORMAT, CameraEntry, RigFile, Std, collect_std
+from imgcal.io.rig_schema import FORMAT, CameraEntry, RigFile, Std, collect_std
 from imgcal.io.validation import validate
 from imgcal.io.yaml_file import Flow, FlowMap, read_yaml, record_from_yaml, yaml_text
 from imgcal.types import CameraRig, ConvexVolume, DriftRate, RigPosterior, RigPrior, parameter_names
@@ -78,7 +78,7 @@ def rig_from_text(text: str, where: str) -> CameraRig:
     Raises:
         InputError: as `read_rig`.
     """
-    content = record_from_yaml(text.encode(errors="replace"), where, RigFile, FORMAT, ENTRY_NAMES)
+    content = record_from_yaml(text.encode(errors="replace"), where, RigFile, FORMAT)
     return _parse_rig(content, where)
 
 
@@ -157,13 +157,13 @@ def rig_text(
         content["volume"] = _volume_entry(rig.volume)
     if covariance is not None:
         content["covariance"] = _covariance_entry(covariance, rig, full, where)
-    validate(content, RigFile, f"{where}: not written", ENTRY_NAMES)
+    validate(content, RigFile, f"{where}: not written")
     return yaml_text(content)
 
 
 def _read(path: str | Path) -> tuple[RigFile, Path]:
     path = find_file(path, "rigs", ".yaml")
-    return read_yaml(path, RigFile, FORMAT, ENTRY_NAMES), path
+    return read_yaml(path, RigFile, FORMAT), path
 
 
 def _parse_rig(content: RigFile, name: str) -> CameraRig:

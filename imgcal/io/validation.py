@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Any, TypeVar, get_type_hints
@@ -44,7 +43,7 @@ class StrictRecord:
         try:
             checked = model.model_validate(content)
         except ValidationError as error:
-            raise InputError(_summary(error, content, model, {})) from error
+            raise InputError(_summary(error, content, model)) from error
         for name, value in checked:
             object.__setattr__(self, name, value)
 
@@ -59,19 +58,19 @@ class StrictRecord:
         return schema
 
 
+ENTRY_NAMES = {"cameras": "camera"}
+"""What one record is called, of keys that hold a list of named records."""
+
 Model = TypeVar("Model", bound=StrictModel)
 
 
-def validate(
-    content: dict[str, Any], model: type[Model], where: str, entry_names: Mapping[str, str] | None = None
-) -> Model:
+def validate(content: dict[str, Any], model: type[Model], where: str) -> Model:
     """Validate plain values, read or about to be written.
 
     Args:
         content: the values.
         model: what they must be.
         where: what errors begin with.
-        entry_names: for keys that hold a list of named records, what one record is called: {"cameras": "camera"}.
 
     Raises:
         InputError: one line with the place, what was found and what was expected.
@@ -79,7 +78,7 @@ def validate(
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        raise InputError(f"{where}: {_summary(error, content, model, entry_names or {})}") from error
+        raise InputError(f"{where}: {_summary(error, content, model)}") from error
 
 
 @cache
@@ -90,7 +89,7 @@ def _make_model(record: type[StrictRecord]) -> type[BaseModel]:
     return create_model(record.__name__, __config__=STRICT, **own)
 
 
-def _summary(error: ValidationError, content: Any, model: type, entry_names: Mapping[str, str]) -> str:
+def _summary(error: ValidationError, content: Any, model: type) -> str:
     """Describe the first problem; a misspelt key comes before the missing key that it causes."""
     if error.error_count() > MOST_PROBLEMS:
         keys = ", ".join(_keys(model, ()))
@@ -100,16 +99,16 @@ def _summary(error: ValidationError, content: Any, model: type, entry_names: Map
     first = problems[0]
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     location, found = first["loc"], reprlib.repr(first["input"])
-    place = _place(location, content, entry_names)
+    place = _place(location, content)
     context = first.get("ctx", {})
     match first["type"]:
         case "extra_forbidden" | "unexpected_keyword_argument":
             key = shorten(str(location[-1]))
             known = _keys(model, location[:-1])
-            before = _place(location[:-1], content, entry_names)
+            before = _place(location[:-1], content)
             return f"{before}unknown key `{key}`{nearest(key, known) or ', expected one of ' + ', '.join(known)}{more}"
         case "missing":
-            return f"{_place(location[:-1], content, entry_names)}key `{location[-1]}` is missing{more}"
+            return f"{_place(location[:-1], content)}key `{location[-1]}` is missing{more}"
         case "too_short":
             return f"{place}found {context['actual_length']} values, expected {context['min_length']} or more{more}"
         case "too_long":
@@ -121,7 +120,7 @@ def _summary(error: ValidationError, content: Any, model: type, entry_names: Map
     return f"{place}found {found}, expected {first['msg'].removeprefix('Input should be ')}{more}"
 
 
-def _place(location: tuple[str | int, ...], content: Any, entry_names: Mapping[str, str]) -> str:
+def _place(location: tuple[str | int, ...], content: Any) -> str:
     """Name the place of a problem: `camera cam03: focal_length[1]: `."""
     words: list[str] = []
     previous = ""
@@ -130,9 +129,9 @@ def _place(location: tuple[str | int, ...], content: Any, entry_names: Mapping[s
             content = content[step]
         except (KeyError, IndexError, TypeError):
             content = None
-        if isinstance(step, int) and previous in entry_names:
+        if isinstance(step, int) and previous in ENTRY_NAMES:
             name = content.get("name") if isinstance(content, dict) else None
-            words[-1] = f"{entry_names[previous]} {shorten(name) if isinstance(name, str) else f'number {step + 1}'}"
+            words[-1] = f"{ENTRY_NAMES[previous]} {shorten(name) if isinstance(name, str) else f'number {step + 1}'}"
         elif isinstance(step, int):
             words[-1] += f"[{step}]"
         else:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 import reprlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -223,26 +222,23 @@ class FlowMap(dict[str, Any]):
     """A mapping that is written on one line: `{a: 1.0, b: 2.0}`."""
 
 
-def read_yaml(path: Path, model: type[Model], file_format: str, entry_names: Mapping[str, str] | None = None) -> Model:
+def read_yaml(path: Path, model: type[Model], file_format: str) -> Model:
     """Read and validate a YAML file.
 
     Args:
         path: the file.
         model: what the file holds; it has a field `format`.
         file_format: the required value of the key `format`, such as "imgcal-rig/1".
-        entry_names: for keys that hold a list of named records, what one record is called: {"cameras": "camera"}.
 
     Raises:
         InputError: one line with the file, what was found and what was expected.
     """
-    return record_from_yaml(read_bytes(path), str(path), model, file_format, entry_names)
+    return record_from_yaml(read_bytes(path), str(path), model, file_format)
 
 
-def record_from_yaml(
-    content: bytes, where: str, model: type[Model], file_format: str, entry_names: Mapping[str, str] | None = None
-) -> Model:
+def record_from_yaml(content: bytes, where: str, model: type[Model], file_format: str) -> Model:
     """Do the work of `read_yaml` on the text of a file; errors begin with `where`."""
-    return validate(_check_format(content, where, file_format), model, where, entry_names)
+    return validate(_check_format(content, where, file_format), model, where)
 
 
 def read_yaml_mapping(path: Path, file_format: str) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,6 +37,7 @@ from imgcal.pipeline.refusals import (
     require_same_residuals,
     require_views,
 )
+from imgcal.pipeline.scale import finite
 from imgcal.types import (
     CalibrationObject,
     CameraRig,
@@ -228,8 +228,3 @@ def _is_nearer(guess: Initialization, factory: Prediction, observations: Observa
     return bool(
         prediction_residual(start, observations, obj).norm() < prediction_residual(factory, observations, obj).norm()
     )
-
-
-def finite(value: float) -> float | None:
-    """None for an unknown value."""
-    return value if np.isfinite(value) else None

@@ -18,7 +18,6 @@ from torch import Tensor
 from imgcal.association import (
     Associations,
     Lights,
-    PipelineOptions,
     SnapshotIdentity,
     align_camera,
     align_rig,
@@ -149,16 +148,13 @@ class FoundLights:
         return np.bincount(self.detections.camera[rows], minlength=len(self.detections.camera_names))
 
 
-def find_lights(
-    detections: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions = PipelineOptions()
-) -> FoundLights:
+def find_lights(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> FoundLights:
     """Find the markers of each moment with a factory rig that may be off by more than the spacing of the markers.
 
     Args:
         detections: blobs of all moments; labels are ignored.
         rig: the factory rig, float64.
         obj: one point.
-        options: how certain the result must be.
 
     Raises:
         RefusedError: the blobs cannot be associated.

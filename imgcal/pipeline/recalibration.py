@@ -178,7 +178,7 @@ def _calibrate_lights(
     """Calibrate from unknown markers; `detecting`: seconds that detection took."""
     started = time.perf_counter()
     with require_solvable():
-        lights = find_lights(detections, rig, obj, options)
+        lights = find_lights(detections, rig, obj)
         identified = time.perf_counter()
         fit = fit_steady(lights.labelled, lights.labelled.detections, rig, obj, options)
     seconds = {

@@ -97,7 +97,7 @@ class Scale:
         """Values for scripts."""
         return {
             "from": self.source,
-            "sigma_percent": _finite(100 * self.sigma),
+            "sigma_percent": finite(100 * self.sigma),
             "noticed_from_percent": None if self.noticed_from is None else 100 * self.noticed_from,
             "px_per_percent": self.px_per_percent,
             "mm_per_percent": self.mm_per_percent,
@@ -124,8 +124,8 @@ def find_scale(estimate: Estimate, obj: CalibrationObject, scale_sigma: float | 
         source="cameras" if 2 * sigma**2 < granted**2 else "object",
         sigma=sigma,
         noticed_from=noticed if noticed < MOST_NOTICED else None,
-        px_per_percent=_finite(effect.median_px),
-        mm_per_percent=_finite(effect.median_mm),
+        px_per_percent=finite(effect.median_px),
+        mm_per_percent=finite(effect.median_mm),
     )
 
 
@@ -178,5 +178,6 @@ def _position_sigma(estimate: Estimate) -> float:
     return float(variance.clamp_min(0).sqrt() / away.square().sum())
 
 
-def _finite(value: float) -> float | None:
+def finite(value: float) -> float | None:
+    """None for an unknown value."""
     return value if math.isfinite(value) else None

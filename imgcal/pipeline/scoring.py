@@ -119,7 +119,7 @@ def score(
     obj = as_unknown_marker(obj, detections)
     if obj.unknown_markers:
         with require_solvable():
-            lights = find_lights(detections, rig, obj, options)
+            lights = find_lights(detections, rig, obj)
             return replace(_fit_poses(lights.labelled, rig, obj, options), lights=lights)
     try:
         with require_solvable():

@@ -9,6 +9,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from imgcal.pipeline import FIELDS
 from imgcal.report import svg
 from imgcal.report.content import ReportContent
 from imgcal.report.svg import Array, Axes
@@ -17,7 +18,6 @@ LARGEST_SCATTER = 6000  # residuals in one scatter
 LARGEST_PANEL = 1200  # observations in one camera's panel of the coverage, less with more than ten cameras
 FEW = 500  # residuals: fewer are drawn as larger dots
 RESIDUAL_CLASSES = 6  # colours of the residual's size: classes c0 to c5 of the style sheet
-COVERAGE_FIELDS = 8  # an image is divided into 8 x 8 fields to count how much of it was reached
 
 
 def sample(rows: NDArray[np.int64], largest: int) -> NDArray[np.int64]:
@@ -160,9 +160,9 @@ def coverage_panel(content: ReportContent, camera: int, limits: Array) -> Markup
 def covered_share(content: ReportContent, camera: int) -> float:
     """Share of an 8 x 8 division of the image in which blobs were used (or labelled, where none could be used)."""
     rows = (content.detections.camera == camera) & (content.used if content.used.any() else content.labels >= 0)
-    place = (content.detections.uv[rows] + 0.5) / content.image_size[camera] * COVERAGE_FIELDS
-    field = np.clip(place, 0, COVERAGE_FIELDS - 1).astype(int)
-    return len(np.unique(field[:, 0] * COVERAGE_FIELDS + field[:, 1])) / COVERAGE_FIELDS**2
+    place = (content.detections.uv[rows] + 0.5) / content.image_size[camera] * FIELDS
+    field = np.clip(place, 0, FIELDS - 1).astype(int)
+    return len(np.unique(field[:, 0] * FIELDS + field[:, 1])) / FIELDS**2
 
 
 def snapshot_strip(content: ReportContent) -> Markup:

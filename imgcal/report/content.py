@@ -80,7 +80,6 @@ class ReportContent:
     seconds: Mapping[str, float] = field(default_factory=dict)  # by stage, in the order in which they ran
     command: str = ""
     versions: Mapping[str, str] = field(default_factory=dict)
-    seeds: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         blobs, cameras = len(self.detections), self.factory.num_cameras

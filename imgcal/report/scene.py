@@ -32,7 +32,7 @@ def describe_scene(content: ReportContent) -> DrawnScene:
     Convention: drawn in the factory's rig frame; the recalibrated rig is aligned to the factory's by `content.gauge`.
     """
     factory = content.factory.to(torch.float64)
-    points = _object_points(content, factory)
+    points = _object_points(content)
     rigs = [DrawnRig("factory", "--ghost", (factory,))]
     factors: tuple[int, ...] = ()
     start = 0
@@ -69,7 +69,7 @@ def _evenly(count: int, largest: int) -> NDArray[np.int64]:
     return np.linspace(0, max(count - 1, 0), min(count, largest)).round().astype(np.int64)
 
 
-def _object_points(content: ReportContent, factory: CameraRig) -> Array | None:
+def _object_points(content: ReportContent) -> Array | None:
     """Fiducials of the drawn snapshots in the factory's rig frame: (S', N', 3) mm."""
     snapshots, fiducials = choose_fiducials(content)
     if content.recalibrated is None or content.rig_from_object is None or not len(snapshots):

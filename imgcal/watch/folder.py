@@ -80,7 +80,7 @@ class Folder:
         heard, looks = time.monotonic(), 0
         while self.until_idle is None or time.monotonic() - heard < self.until_idle:
             now = time.monotonic()
-            ready = [(path, name) for name, camera in cameras.items() for path in camera.stable_files(now)]
+            ready = [(path, name) for name, camera in cameras.items() for path in camera.stable_files()]
             for path, name in sorted(ready, key=lambda pair: (natural_key(pair[0].stem), pair[1])):
                 item = self._read(cameras[name], name, path, now)
                 if item is not None:
@@ -133,7 +133,7 @@ class _Camera:
         self._growing: dict[str, tuple[int, int]] = {}  # size and modification time in the last scan
         self._since: dict[str, float] = {}  # when a file was first found stable but unreadable
 
-    def stable_files(self, now: float) -> list[Path]:
+    def stable_files(self) -> list[Path]:
         """New files whose size has not changed since the last scan."""
         steady: list[Path] = []
         growing: dict[str, tuple[int, int]] = {}

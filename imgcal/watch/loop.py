@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Protocol
 
 from imgcal.association import Proposer
@@ -167,9 +166,7 @@ class Watch:
         self._log, self._files = EventLog(self.folder / EVENTS), RigFiles(self.folder)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Save the state, and close the outputs."""
         self.save()
         self._files.close()

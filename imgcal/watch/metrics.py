@@ -6,7 +6,6 @@ import bisect
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from imgcal.errors import InputError
@@ -87,9 +86,7 @@ class Metrics:
             raise InputError(f"--metrics: {host}:{port} cannot be used: {reason}") from error
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Stop the server."""
         self._server.shutdown()
         self._server.server_close()

@@ -7,7 +7,6 @@ import math
 import threading
 from collections import deque
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Literal, Protocol
 
 from imgcal.geometry import vector_from_rotation
@@ -157,9 +156,7 @@ class Poses:
         """Return itself."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Let the sink take the waiting poses for a while, and close it."""
         with self._changed:
             self._closing = True

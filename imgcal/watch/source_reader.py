@@ -7,7 +7,6 @@ import threading
 import time
 from collections import Counter, deque
 from dataclasses import dataclass
-from types import TracebackType
 
 from imgcal.errors import InputError
 from imgcal.messages import one_line
@@ -105,9 +104,7 @@ class SourceReader:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """End reading."""
         with self._changed:
             self._closing = True

@@ -42,7 +42,7 @@ cameras:
 
 def read(path: Path, text: str) -> Rig:
     path.write_text(text)
-    return read_yaml(path, Rig, "test/1", {"cameras": "camera"})
+    return read_yaml(path, Rig, "test/1")
 
 
 def test_what_is_there_is_read(tmp_path: Path) -> None:

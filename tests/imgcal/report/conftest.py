@@ -54,7 +54,7 @@ def empty_content(refused_content: ReportContent) -> ReportContent:
     none = np.zeros(len(refused_content.labels), dtype=bool)
     return replace(
         refused_content, detections=refused_content.detections.select(none), labels=refused_content.labels[none],
-        frames=(), snapshots=(), seconds={}, command="", versions={}, seeds={},
+        frames=(), snapshots=(), seconds={}, command="", versions={},
     )  # fmt: skip
 
 
@@ -123,7 +123,6 @@ def calibrated(
         seconds={"read": 0.31, "detect": 0.142, "identify": 0.061, "estimate": 0.0042, "covariance": 0.0061},
         command="imgcal calibrate capture --rig O10.yaml --object asymmetric8.csv --out result",
         versions={"imgcal": "0.1.0", "python": "3.11.9", "torch": "2.13.0", "opencv": "5.0.0"},
-        seeds={"identity": 0},
     )
 
 

@@ -127,7 +127,6 @@ def test_strings_of_users_stay_strings(kind: str, request: pytest.FixtureRequest
         seconds={HOSTILE: 1.0},
         command=HOSTILE,
         versions={HOSTILE: HOSTILE},
-        seeds={HOSTILE: 1},
     )
     calm, page = Page(render(content)), Page(render(hostile))
     assert {tag for tag, _ in page.elements} == {tag for tag, _ in calm.elements}
