@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.watch import EventLog, forget_after
+from imgcal.watch import EventLog, event_log, forget_after
 from tests.imgcal.watch.states import event
 
 
@@ -62,7 +62,7 @@ def test_where_the_long_file_cannot_be_put_aside_nothing_is_lost_nor_written_els
         raise OSError("no such luck")
 
     with monkeypatch.context() as broken, open(tmp_path / "others", "wb") as others:
-        broken.setattr(os, "replace", refuse) if fails == "replace" else broken.setattr(log, "_open_file", refuse)
+        broken.setattr(*((os, "replace") if fails == "replace" else (event_log, "LineFile")), refuse)
         for number in (3, 4):
             with pytest.raises(OSError, match="no such luck"):
                 log.append(event(number, message="x" * 100))

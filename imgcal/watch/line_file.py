@@ -1,0 +1,64 @@
+"""A file to which whole lines are appended; an unfinished line of a killed process is removed on reopening."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+LONGEST = 2**16
+"""Bytes of a line, more than any event or pose needs."""
+
+
+class LineFile:
+    """Appends lines of text to a file.
+
+    Each line is written by one system call, so all but the last are whole whatever happens to the process. A last line
+    that is incomplete because of a kill or a power failure is removed when the file is opened again.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open or create the file.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self.path = path
+        _cut(path)
+        # Without it, Windows would convert line ends.
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0)
+        self._descriptor: int | None = os.open(path, flags, 0o644)  # None = closed
+
+    @property
+    def size(self) -> int | None:
+        """Size of the file in bytes; None = closed."""
+        return None if self._descriptor is None else os.fstat(self._descriptor).st_size
+
+    def append(self, line: bytes) -> None:
+        """Write a line, its end included.
+
+        Raises:
+            OSError: nothing of it was written, for example because the disk is full.
+        """
+        if self._descriptor is None:
+            raise OSError(f"{self.path}: closed")
+        size = os.fstat(self._descriptor).st_size
+        written = os.write(self._descriptor, line)
+        if written < len(line):
+            os.ftruncate(self._descriptor, size)
+            raise OSError(f"{self.path}: {written} of {len(line)} bytes could be written")
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._descriptor is not None:
+            descriptor, self._descriptor = self._descriptor, None
+            os.close(descriptor)
+
+
+def _cut(path: Path) -> None:
+    """Remove an unfinished line."""
+    if not path.exists() or not (size := path.stat().st_size):
+        return
+    with open(path, "r+b") as file:
+        file.seek(max(size - LONGEST, 0))
+        end = file.read()
+        file.truncate(size - len(end) + end.rfind(b"\n") + 1)
