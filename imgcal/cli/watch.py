@@ -156,6 +156,8 @@ class Watch(arguments.Watch):
             if restored or anew:
                 how = "resumed from the saved state" if restored else "started anew from the factory calibration"
                 loop.publish_event(Event(time.time(), 0, "restart", message=how))
+            if rate is not None and self.rate is None:
+                print(f"note: {rate:g} snapshots a second are assumed; --rate says otherwise", file=sys.stderr)
             loop.run(intake, stopped, display.draw)
         tally = loop.tally
         said = display.result(self.out / CURRENT)

@@ -84,6 +84,14 @@ def test_a_table_of_blobs_is_watched_once(blobs, stream, tmp_path, capsys):
     assert watch(tmp_path / "blobs.csv.gz", out, "--rate", "60", "--fresh") == 0
 
 
+def test_an_assumed_rate_is_stated(blobs, tmp_path, capsys):
+    save_detections(blobs, tmp_path / "blobs.csv")
+    assert watch(tmp_path / "blobs.csv", tmp_path / "out", "--rate", "60") == 0
+    assert "snapshots a second" not in capsys.readouterr().err
+    assert watch(tmp_path / "blobs.csv", tmp_path / "other") == 0
+    assert "note: 30 snapshots a second are assumed; --rate says otherwise\n" in capsys.readouterr().err
+
+
 def test_lines_on_standard_input_and_garbage_among_them(blobs, tmp_path, monkeypatch, capsys):
     given = lines(blobs)[: 4 * 20]
     given[10:10] = ["junk\n", '{"camera": "cam09", "time": 0.1, "uv": []}\n']
