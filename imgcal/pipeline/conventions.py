@@ -48,8 +48,7 @@ class Reading:
     @property
     def miss(self) -> float:
         """Mean angle (rad) by which lines of sight miss the object."""
-        with np.errstate(invalid="ignore"):
-            angles = sight_angles(self.detections, self.rig)
+        angles = sight_angles(self.detections, self.rig)
         return float(np.fmin(angles[np.isfinite(angles)], FARTHEST).mean()) if np.isfinite(angles).any() else FARTHEST
 
 

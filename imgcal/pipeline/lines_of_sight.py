@@ -50,17 +50,14 @@ def sight_angles(detections: Detections, rig: CameraRig) -> Array:
         for c in np.flatnonzero(np.bincount(detections.camera[mine]) >= LEAST_BLOBS):
             middle[number, c] = np.median(detections.uv[mine & (detections.camera == c)], axis=0)
     row, camera = np.nonzero(np.isfinite(middle).all(-1))
-    focal, rotation, positions = (
-        rig.focal_length.mean(-1).numpy(),
-        rig.cam_from_rig.rotation.numpy(),
-        rig.positions.numpy(),
-    )
-    xy = undistort(middle[row, camera], camera, rig) / focal[camera, None]
-    ray = np.concatenate((xy, np.ones((len(xy), 1))), axis=1)
+    focal, rotation, positions = rig.focal_length.mean(-1), rig.cam_from_rig.rotation.numpy(), rig.positions.numpy()
+    ideal = undistort(middle[row, camera], camera, rig).astype(np.float64)
+    finite = np.isfinite(ideal).all(1)  # the others: beyond what the lens shows
+    row, camera, ideal = row[finite], camera[finite], ideal[finite]
+    ray = np.concatenate((ideal, focal.numpy()[camera, None]), axis=1)
     forward = np.zeros((*middle.shape[:2], 3))
     forward[row, camera] = np.einsum("nij,ni->nj", rotation[camera], ray / np.linalg.norm(ray, axis=1, keepdims=True))
-    known = np.isfinite(forward).all(-1) & forward.any(-1)
-    forward[~known] = 0
+    known = forward.any(-1)
     across = np.eye(3) - forward[..., :, None] * forward[..., None, :]
     weight = known.astype(float)
     for _ in range(ROUNDS):

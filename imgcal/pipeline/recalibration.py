@@ -132,14 +132,15 @@ def calibrate(
                     detections, rig, obj, options, initializer=initializer, progress=progress, detector=other
                 )
         if is_solid:  # the extent of the view says nothing for a light, and little for a stick
-            _require_conventions(error, detections, rig, obj, options)
+            if sight is None:
+                _require_conventions(error, detections, rig, obj, options)
             require_units(error, detections, rig, obj)
         if labelled is not None:
             require_right_images(error, detections, labelled, rig, obj)
             require_same_moments(error, detections, labelled, rig, obj, options)
         raise
     used, given_snapshots = len(fit.labelled.used), len(detections.snapshot_names)
-    if used < LEAST_USED * given_snapshots and is_solid:
+    if is_solid and sight is None and used < LEAST_USED * given_snapshots:
         doubt = RefusedError(f"identity: only {used} of {given_snapshots} snapshots could be used")
         _require_conventions(doubt, detections, rig, obj, options)
     seconds = {
