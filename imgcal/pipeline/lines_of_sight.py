@@ -49,7 +49,7 @@ def sight_angles(detections: Detections, rig: CameraRig) -> Array:
         mine = (detections.snapshot == snapshot) & detections.usable
         for c in np.flatnonzero(np.bincount(detections.camera[mine]) >= LEAST_BLOBS):
             middle[number, c] = np.median(detections.uv[mine & (detections.camera == c)], axis=0)
-    row, camera = np.nonzero(np.isfinite(middle).all(-1))
+    row, camera = (index.copy() for index in np.nonzero(np.isfinite(middle).all(-1)))  # contiguous, as compiled ahead
     focal, rotation, positions = rig.focal_length.mean(-1), rig.cam_from_rig.rotation.numpy(), rig.positions.numpy()
     ideal = undistort(middle[row, camera], camera, rig).astype(np.float64)
     finite = np.isfinite(ideal).all(1)  # the others: beyond what the lens shows
