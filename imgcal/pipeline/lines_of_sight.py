@@ -44,18 +44,13 @@ def sight_angles(detections: Detections, rig: CameraRig) -> Array:
         (S, C) rad for at most `MOST_ASKED` snapshots; nan where a camera has too few blobs.
     """
     snapshots = telling_snapshots(detections, rig.num_cameras)
-    middle = np.full((len(snapshots), rig.num_cameras, 2), np.nan)
-    for number, snapshot in enumerate(snapshots):
-        mine = (detections.snapshot == snapshot) & detections.usable
-        for c in np.flatnonzero(np.bincount(detections.camera[mine]) >= LEAST_BLOBS):
-            middle[number, c] = np.median(detections.uv[mine & (detections.camera == c)], axis=0)
-    row, camera = (index.copy() for index in np.nonzero(np.isfinite(middle).all(-1)))  # contiguous, as compiled ahead
+    row, camera, middle = _middles(detections, snapshots, rig.num_cameras)
     focal, rotation, positions = rig.focal_length.mean(-1), rig.cam_from_rig.rotation.numpy(), rig.positions.numpy()
-    ideal = undistort(middle[row, camera], camera, rig).astype(np.float64)
+    ideal = undistort(middle, camera, rig).astype(np.float64)
     finite = np.isfinite(ideal).all(1)  # the others: beyond what the lens shows
     row, camera, ideal = row[finite], camera[finite], ideal[finite]
     ray = np.concatenate((ideal, focal.numpy()[camera, None]), axis=1)
-    forward = np.zeros((*middle.shape[:2], 3))
+    forward = np.zeros((len(snapshots), rig.num_cameras, 3))
     forward[row, camera] = np.einsum("nij,ni->nj", rotation[camera], ray / np.linalg.norm(ray, axis=1, keepdims=True))
     known = forward.any(-1)
     across = np.eye(3) - forward[..., :, None] * forward[..., None, :]
@@ -68,3 +63,21 @@ def sight_angles(detections: Detections, rig: CameraRig) -> Array:
         angle = np.arccos(np.clip(cosine, -1, 1))
         weight = known / (1 + (angle / ROBUST) ** 2)
     return np.where(known, angle, np.nan)
+
+
+def _middles(
+    detections: Detections, snapshots: NDArray[np.int64], cameras: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Median of the blobs of each camera that has enough: index into `snapshots` (R,), camera (R,), and (R, 2) px."""
+    rows = np.flatnonzero(detections.usable & np.isin(detections.snapshot, snapshots))
+    group = np.searchsorted(snapshots, detections.snapshot[rows]) * cameras + detections.camera[rows]
+    count = np.bincount(group, minlength=len(snapshots) * cameras)
+    first = np.cumsum(count) - count
+    known = np.flatnonzero(count >= LEAST_BLOBS)
+    middle = np.empty((len(known), 2))
+    for axis in range(2):
+        value = detections.uv[rows, axis]
+        value = value[np.lexsort((value, group))]
+        low, high = (first[known] + half for half in ((count[known] - 1) // 2, count[known] // 2))
+        middle[:, axis] = (value[low] + value[high]) / 2
+    return known // cameras, known % cameras, middle
