@@ -73,7 +73,10 @@ def convert_rig(
     target = find_format(to)
     if target.write is None:
         able = ", ".join(one.name for one in FORMATS if one.write is not None)
-        raise InputError(f"--to {to}: {target.title} can only be read, expected one of imgcal, {able}")
+        raise InputError(
+            f"--to {to}: {target.title} can only be read, or written back into its own file (--into FILE), expected one "
+            f"of imgcal, {able}"
+        )
     least, most = target.cameras
     if not least <= len(rig.cameras) <= most:
         count = f"{least}" if least == most else f"{least} to {most}"
