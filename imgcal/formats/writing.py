@@ -74,8 +74,8 @@ def convert_rig(
     if target.write is None:
         able = ", ".join(one.name for one in FORMATS if one.write is not None)
         raise InputError(
-            f"--to {to}: {target.title} can only be read, or written back into its own file (--into FILE), expected one "
-            f"of imgcal, {able}"
+            f"--to {to}: {target.title} can only be read, or written back into its own file (--into FILE), expected "
+            f"one of imgcal, {able}"
         )
     least, most = target.cameras
     if not least <= len(rig.cameras) <= most:
