@@ -86,7 +86,10 @@ def _inflated_covariance(solution: Solution, inflation: Tensor) -> Tensor:
     The unit priors of cameras and object contribute the square of the covariance, which stays: images that disagree
     more than their noise say nothing about the error of the object's scale.
     """
-    reduced = factorize(solution.equations, cameras_first=False).reduced
+    factorization = solution.factorization
+    if factorization.cameras_first:
+        factorization = factorize(solution.equations, cameras_first=False)
+    reduced = factorization.reduced
     if bool(reduced.failed.any()):
         raise RefusedError(UNDETERMINED)
     size = solution.equations.camera_gradient[0].numel()

@@ -185,7 +185,7 @@ class Calibration:
         factor = self.estimate.mean_inflation
         return Bend(x + dx, y + dy, min(factor * sx, std), min(factor * sy, std))
 
-    @property
+    @cached_property
     def object(self) -> CalibrationObject:
         """The object as estimated, with the tolerances that remain: what a later calibration starts from."""
         board, bend = self.obj.board, self.bend

@@ -69,6 +69,8 @@ def require_conventions(error: RefusedError, detections: Detections, rig: Camera
     Raises:
         RefusedError: names the convention.
     """
+    asked = telling_snapshots(detections, rig.num_cameras)
+    detections = detections.select(np.isin(detections.snapshot, asked))  # reading all of a long capture takes its time
     chosen = telling_snapshots(detections, rig.num_cameras, MOST_TRIED)
     if len(chosen) == 0 or _fit_some(fit, Reading("", detections, rig), chosen) is not None:
         return

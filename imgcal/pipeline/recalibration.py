@@ -107,10 +107,12 @@ def calibrate(
         obj.require_rigid("for detectors and networks that look for a pattern")
     labelled: Associations | None = None
     is_solid = obj.pose_rank == 6 and not obj.parts
-    if is_solid and sight is None and not detections.labelled.any() and lines_of_sight_miss(detections, rig):
+    may_be_misread = is_solid and sight is None  # once it has been asked, images and rig follow our conventions
+    if may_be_misread and not detections.labelled.any() and lines_of_sight_miss(detections, rig):
         # Identity takes minutes to find nothing in a long capture.
         doubt = RefusedError("identity: the cameras' lines of sight to the object do not meet")
         _require_conventions(doubt, detections, rig, obj, options)
+        may_be_misread = False
     try:
         with require_solvable():
             labelled = associate(detections, rig, obj, options, progress, sight)
@@ -132,7 +134,7 @@ def calibrate(
                     detections, rig, obj, options, initializer=initializer, progress=progress, detector=other
                 )
         if is_solid:  # the extent of the view says nothing for a light, and little for a stick
-            if sight is None:
+            if may_be_misread:
                 _require_conventions(error, detections, rig, obj, options)
             require_units(error, detections, rig, obj)
         if labelled is not None:
@@ -140,7 +142,7 @@ def calibrate(
             require_same_moments(error, detections, labelled, rig, obj, options)
         raise
     used, given_snapshots = len(fit.labelled.used), len(detections.snapshot_names)
-    if is_solid and sight is None and used < LEAST_USED * given_snapshots:
+    if may_be_misread and used < LEAST_USED * given_snapshots:
         doubt = RefusedError(f"identity: only {used} of {given_snapshots} snapshots could be used")
         _require_conventions(doubt, detections, rig, obj, options)
     seconds = {

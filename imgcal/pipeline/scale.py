@@ -143,10 +143,9 @@ def _object_sigmas(estimate: Estimate) -> tuple[float, float]:
 
 def _from_centroids(estimate: Estimate) -> Tensor:
     """Fiducials (N, 3) mm relative to the centroid of their object."""
-    points, part = estimate.problem.points, estimate.problem.part_of
-    if part is None:
-        return points - points.mean(0)
-    return torch.stack([point - points[part == own].mean(0) for point, own in zip(points, part, strict=True)])
+    problem = estimate.problem
+    centroids = torch.stack([points.mean(0) for points in problem.points_of_parts()])
+    return problem.points - (centroids if problem.part_of is None else centroids[problem.part_of])
 
 
 def remaining_tolerance(estimate: Estimate, shape: Sequence[FiducialOffset]) -> Tensor | None:
