@@ -58,6 +58,7 @@ from imgcal.pipeline import (
     unit_doubt,
 )
 from imgcal.types import CalibrationObject, CameraRig, Detections, limits
+from imgcal.watch import STATE
 
 RIG = "rig.yaml"
 WRITTEN = ("report.html", RIG, "rig.posterior.safetensors", "object.csv", "board.yaml", RESULT)
@@ -164,8 +165,6 @@ class Calibrate(arguments.Calibrate):
         if (self.out / RIG).exists():
             replaced += self._previous()
         spare_inputs(self.out, replaced, self._inputs())
-        from imgcal.watch import STATE  # brings a server along
-
         if (self.out / STATE).exists():
             raise InputError(f"--out: {self.out} belongs to imgcal watch ({STATE}), expected another folder")
 

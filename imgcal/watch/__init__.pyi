@@ -23,7 +23,7 @@ from .learning import (
     run_networks,
     send,
 )
-from .loop import EVENTS, STATE, Keeper, Page, Progress, Watch
+from .loop import EVENTS, Keeper, Page, Progress, Watch
 from .marker_files import MarkerFile
 from .metrics import Metrics, Tally
 from .open_igt_link import OpenIGTLink, listening_address
@@ -32,7 +32,7 @@ from .pose_zeromq import PosePublisher
 from .poses import PoseRecord, Poses, PoseSink
 from .qualisys import Qualisys
 from .recordings import BlobTable, Videos, holds_videos
-from .rig_files import CURRENT, RigFiles, put_aside
+from .rig_files import CURRENT, STATE, RigFiles, put_aside
 from .source_reader import Known, SourceReader
 from .synchronization import COUNTS, Synchronizer, TimedSnapshot
 from .timing import Timing
