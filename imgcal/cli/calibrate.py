@@ -16,6 +16,7 @@ from imgcal.cli import arguments
 from imgcal.cli.common import (
     RESULT,
     check_folder,
+    check_inputs_survive,
     drop_cameras,
     keep_memory,
     open_rig,
@@ -24,7 +25,6 @@ from imgcal.cli.common import (
     read_detections,
     require_board_files,
     select_cameras,
-    spare_inputs,
     start_pose,
 )
 from imgcal.cli.outcome import doubtful_cameras, findings, print_outcome, refused_summary, summary
@@ -164,7 +164,7 @@ class Calibrate(arguments.Calibrate):
         replaced = list(WRITTEN)
         if (self.out / RIG).exists():
             replaced += self._previous()
-        spare_inputs(self.out, replaced, self._inputs())
+        check_inputs_survive(self.out, replaced, self._inputs())
         if (self.out / STATE).exists():
             raise InputError(f"--out: {self.out} belongs to imgcal watch ({STATE}), expected another folder")
 

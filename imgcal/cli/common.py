@@ -166,7 +166,7 @@ def check_folder(path: Path) -> None:
         raise InputError(f"{path}: no permission to write to {existing}")
 
 
-def spare_inputs(out: Path, written: Iterable[str], inputs: Iterable[tuple[str, Path]]) -> None:
+def check_inputs_survive(out: Path, written: Iterable[str], inputs: Iterable[tuple[str, Path]]) -> None:
     """Make sure that no input would be overwritten.
 
     Args:

@@ -19,7 +19,7 @@ from rich.console import Console
 
 from imgcal.association import Proposer
 from imgcal.cli import arguments
-from imgcal.cli.common import RESULT, check_folder, open_rig, spare_inputs
+from imgcal.cli.common import RESULT, check_folder, check_inputs_survive, open_rig
 from imgcal.cli.watch_display import Display
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice, missing
@@ -185,7 +185,7 @@ class Watch(arguments.Watch):
     def _check_out(self) -> None:
         """The inputs must survive, and a calibration."""
         check_folder(self.out)
-        spare_inputs(self.out, (CURRENT,), [("--rig", Path(self.rig))])
+        check_inputs_survive(self.out, (CURRENT,), [("--rig", Path(self.rig))])
         if (self.out / RESULT).exists():
             raise InputError(f"--out: {self.out} holds a calibration ({RESULT}), expected another folder")
 

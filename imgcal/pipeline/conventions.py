@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
-from imgcal.pipeline.lines_of_sight import sight_angles, telling_snapshots
+from imgcal.pipeline.lines_of_sight import choose_telling_snapshots, sight_angles
 from imgcal.pipeline.turned_images import UPRIGHT, WAYS, turn
 from imgcal.types import CameraRig, Detections
 
@@ -69,9 +69,9 @@ def require_conventions(error: RefusedError, detections: Detections, rig: Camera
     Raises:
         RefusedError: names the convention.
     """
-    asked = telling_snapshots(detections, rig.num_cameras)
+    asked = choose_telling_snapshots(detections, rig.num_cameras)
     detections = detections.select(np.isin(detections.snapshot, asked))  # reading all of a long capture takes its time
-    chosen = telling_snapshots(detections, rig.num_cameras, MOST_TRIED)
+    chosen = choose_telling_snapshots(detections, rig.num_cameras, MOST_TRIED)
     if len(chosen) == 0 or _fit_some(fit, Reading("", detections, rig), chosen) is not None:
         return
     readings = list(other_readings(detections, rig))

@@ -20,7 +20,7 @@ ROUNDS = 6
 Array = NDArray[np.float64]
 
 
-def telling_snapshots(detections: Detections, cameras: int, most: int = MOST_ASKED) -> NDArray[np.int64]:
+def choose_telling_snapshots(detections: Detections, cameras: int, most: int = MOST_ASKED) -> NDArray[np.int64]:
     """Choose snapshots that many cameras see, spread over the capture: their numbers, at most `most`."""
     rows = detections.usable
     count = np.zeros((int(detections.snapshot.max(initial=-1)) + 1, cameras), dtype=int)
@@ -43,8 +43,8 @@ def sight_angles(detections: Detections, rig: CameraRig) -> Array:
     Returns:
         (S, C) rad for at most `MOST_ASKED` snapshots; nan where a camera has too few blobs.
     """
-    snapshots = telling_snapshots(detections, rig.num_cameras)
-    row, camera, middle = _middles(detections, snapshots, rig.num_cameras)
+    snapshots = choose_telling_snapshots(detections, rig.num_cameras)
+    row, camera, middle = _find_medians(detections, snapshots, rig.num_cameras)
     focal, rotation, positions = rig.focal_length.mean(-1), rig.cam_from_rig.rotation.numpy(), rig.positions.numpy()
     ideal = undistort(middle, camera, rig).astype(np.float64)
     finite = np.isfinite(ideal).all(1)  # the others: beyond what the lens shows
@@ -65,7 +65,7 @@ def sight_angles(detections: Detections, rig: CameraRig) -> Array:
     return np.where(known, angle, np.nan)
 
 
-def _middles(
+def _find_medians(
     detections: Detections, snapshots: NDArray[np.int64], cameras: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Median of the blobs of each camera that has enough: index into `snapshots` (R,), camera (R,), and (R, 2) px."""

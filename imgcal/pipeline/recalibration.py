@@ -32,7 +32,7 @@ from imgcal.pipeline.lights import add_lights, find_lights
 from imgcal.pipeline.repeats import Repeats, drop_repeats, name_repeats
 from imgcal.pipeline.sources import Detector, Frames, check_frames, find_blobs, make_sight
 from imgcal.pipeline.synchronization import NOTICEABLE, find_unsynchronized
-from imgcal.pipeline.turned_images import require_right_images
+from imgcal.pipeline.turned_images import require_matching_images
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import (
     CalibrationObject,
@@ -138,7 +138,7 @@ def calibrate(
                 _require_conventions(error, detections, rig, obj, options)
             require_units(error, detections, rig, obj)
         if labelled is not None:
-            require_right_images(error, detections, labelled, rig, obj)
+            require_matching_images(error, detections, labelled, rig, obj)
             require_same_moments(error, detections, labelled, rig, obj, options)
         raise
     used, given_snapshots = len(fit.labelled.used), len(detections.snapshot_names)

@@ -73,7 +73,7 @@ class ImageTurn:
         )
 
 
-def require_right_images(
+def require_matching_images(
     error: RefusedError, detections: Detections, labelled: Associations, rig: CameraRig, obj: CalibrationObject
 ) -> None:
     """Replace a refusal if its cause is a camera whose image is turned or mirrored, or two that are exchanged.
@@ -94,7 +94,7 @@ def require_right_images(
         return
     if len(arranged.labelled.used) < LEAST_LABELLED * len(arranged.labelled.snapshots):
         return
-    _require_right(error, detections, rig, obj, arranged)
+    _require_matching(error, detections, rig, obj, arranged)
     if (detections.fiducial >= 0).any() and obj.pose_rank == 6 and not obj.parts:
         # Labels of a turned image fit, too: take the object's poses from the other cameras alone.
         for camera in range(rig.num_cameras):
@@ -104,10 +104,10 @@ def require_right_images(
             if posed.sum() >= LEAST_LABELLED * len(posed):
                 rest = arranged.drop_snapshots(np.flatnonzero(~posed).tolist(), rig, obj)
                 poses = initial_pose(replace(rest.observations, seen=others[torch.from_numpy(posed)]), rig, obj)
-                _require_right(error, detections, rig, obj, replace(rest, poses=poses))
+                _require_matching(error, detections, rig, obj, replace(rest, poses=poses))
 
 
-def _require_right(
+def _require_matching(
     error: RefusedError, detections: Detections, rig: CameraRig, obj: CalibrationObject, arranged: LabelledCapture
 ) -> None:
     """Replace a refusal if a camera is turned or two are exchanged, by the object's poses in a labelled capture."""
