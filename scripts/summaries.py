@@ -209,8 +209,8 @@ def _recalibration_rows() -> list[list[str]]:
     peers = ", ".join(f"{name} {100 * converged[key][at]:.0f}" for key, name in names.items())
     return [
         [
-            "rig of ten cameras from 1 / 20 / 100 snapshots, start pose given",
-            f"{cell('imgcal', time)} ms; {over_bound('imgcal')} times the Cramér-Rao bound",
+            "time and error of a calibration of ten cameras from 1 / 20 / 100 snapshots, start pose given",
+            f"{cell('imgcal', time)} ms; {over_bound('imgcal')} times the Cramér-Rao bound (below 1: chance)",
             f"{mrcal}; {over_bound('mrcal')} times",
         ],
         [

@@ -268,6 +268,7 @@ def _shorten(problem: str, arguments: list[str]) -> str:
 
 
 def _list_alternatives(words: list[str]) -> str:
+    words = [word for word in words if word]
     return f"{', '.join(words[:-1])} or {words[-1]}" if len(words) > 1 else words[0]
 
 

@@ -18,7 +18,7 @@ from imgcal.watch import EVENTS, Hook, SourceReader, Tally
 
 SAID_EVERY = 10.0  # s between two lines without a terminal
 DRAWN_EVERY = 0.25  # s
-SHOWN = ("late", "duplicate", "astray", "beside")
+SHOWN = ("late", "duplicate", "clock_off", "out_of_tolerance")
 """Problems of exposures that are counted in the line; missing ones show as lost cameras."""
 CLOCK_SIGMAS = 5.0
 LEAST_OFFSET = 5e-4  # s: smaller ones are the exposure's length

@@ -57,7 +57,7 @@ class Motion:
 
     @property
     def sentence(self) -> str:
-        """Describe them: "1 of 8 cameras moved relative to the others: mocap1 (2.01 deg, 15.2 mm)"."""
+        """Describe them: "1 of 8 cameras moved since the factory calibration: mocap1 (2.01 deg, 15.2 mm)"."""
         moved, count = self.moved, len(self.camera_names)
         if count == 1:
             return ""
@@ -68,7 +68,7 @@ class Motion:
             for c in moved[:3]
         )
         most = ", most of all" if len(moved) > 3 else ":"
-        return f"{len(moved)} of {count} cameras moved relative to the others{most} {named}"
+        return f"{len(moved)} of {count} cameras moved since the factory calibration{most} {named}"
 
 
 def motion_since_factory(calibration: Calibration, gauge: Gauge | None = None) -> Motion:

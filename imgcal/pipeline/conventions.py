@@ -15,14 +15,12 @@ from numpy.typing import NDArray
 
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
-from imgcal.pipeline.lines_of_sight import choose_telling_snapshots, sight_angles
-from imgcal.pipeline.turned_images import UPRIGHT, WAYS, turn
+from imgcal.pipeline.lines_of_sight import FARTHEST, choose_telling_snapshots, mean_miss
+from imgcal.pipeline.turned_images import UPRIGHT, WAYS, turn, undo
 from imgcal.types import CameraRig, Detections
 
 MOST_TRIED = 4
 """Snapshots that are calibrated."""
-FARTHEST = np.radians(20.0)
-"""A line of sight that misses by more counts as this much."""
 LIKELY, CLOSE = 2.0, np.radians(0.5)
 """A reading is tried if its lines of sight miss by at most this factor, or this angle, more than those of the best."""
 CLEAR = np.radians(5.0)
@@ -45,16 +43,11 @@ class Reading:
     detections: Detections
     rig: CameraRig
 
-    @property
-    def miss(self) -> float:
-        """Mean angle (rad) by which lines of sight miss the object."""
-        angles = sight_angles(self.detections, self.rig)
-        return float(np.fmin(angles[np.isfinite(angles)], FARTHEST).mean()) if np.isfinite(angles).any() else FARTHEST
-
 
 def lines_of_sight_miss(detections: Detections, rig: CameraRig) -> bool:
     """Tell whether the cameras' lines of sight to the object clearly do not meet."""
-    return Reading("", detections, rig).miss > CLEAR
+    miss = mean_miss(detections, rig)
+    return miss is not None and miss > CLEAR
 
 
 def require_conventions(error: RefusedError, detections: Detections, rig: CameraRig, fit: Fit) -> None:
@@ -72,30 +65,30 @@ def require_conventions(error: RefusedError, detections: Detections, rig: Camera
     asked = choose_telling_snapshots(detections, rig.num_cameras)
     detections = detections.select(np.isin(detections.snapshot, asked))  # reading all of a long capture takes its time
     chosen = choose_telling_snapshots(detections, rig.num_cameras, MOST_TRIED)
-    if len(chosen) == 0 or _fit_some(fit, Reading("", detections, rig), chosen) is not None:
+    if len(chosen) == 0 or _fit_some(fit, detections, rig, chosen) is not None:
         return
     readings = list(other_readings(detections, rig))
-    misses = [reading.miss for reading in readings]
+    told = [mean_miss(reading.detections, reading.rig) for reading in readings]
+    misses = [FARTHEST if miss is None else miss for miss in told]
     likely = max(LIKELY * min(misses), min(misses) + CLOSE)
     fitting = {
         reading.words: rms
         for reading, miss in zip(readings, misses, strict=True)
-        if miss <= likely and (rms := _fit_some(fit, reading, chosen)) is not None
+        if miss <= likely and (rms := _fit_some(fit, reading.detections, reading.rig, chosen)) is not None
     }
     if fitting:
         words, rms = ", or ".join(fitting), max(fitting.values())
         raise RefusedError(f"{words}; read like that, images and rig fit to {rms:.2g} px; so {error.reason}") from error
 
 
-def _fit_some(fit: Fit, reading: Reading, snapshots: NDArray[np.int64]) -> float | None:
-    """Calibrate some snapshots, the first by itself at first: the RMS in pixels; None = refused."""
+def _fit_some(fit: Fit, detections: Detections, rig: CameraRig, snapshots: NDArray[np.int64]) -> float | None:
+    """Calibrate one snapshot that most cameras see, then these: the RMS in pixels; None = refused."""
     rms = None
-    for some in (snapshots[:1], snapshots):
-        rows = np.isin(reading.detections.snapshot, some)
-        kept = reading.detections.select(rows)
+    for some in (choose_telling_snapshots(detections, rig.num_cameras, 1), snapshots):
+        kept = detections.select(np.isin(detections.snapshot, some))
         names = tuple(kept.snapshot_names[snapshot] for snapshot in some)
         try:
-            rms = fit(replace(kept, snapshot=np.searchsorted(some, kept.snapshot), snapshot_names=names), reading.rig)
+            rms = fit(replace(kept, snapshot=np.searchsorted(some, kept.snapshot), snapshot_names=names), rig)
         except RefusedError:
             return None
     return rms
@@ -106,10 +99,10 @@ def other_readings(detections: Detections, rig: CameraRig) -> Iterator[Reading]:
     size = rig.image_size.double().numpy()[detections.camera]
     for way, name in WAYS.items():
         if name != UPRIGHT:
-            words = f"all images seem to be {name}{AS_IN_TABLES.get(way, '')}"
+            words = f"all images seem to be {WAYS[undo(way)]}{AS_IN_TABLES.get(way, '')}"
             yield Reading(words, replace(detections, uv=turn(detections.uv, size - 1, way)), rig)
     if len(detections.uv) and detections.uv.min() >= -1 and detections.uv.max() <= 2:
-        words = "u and v seem to be shares of the image's width and height, expected pixels"
+        words = "u and v seem to be normalized by the image's width and height, expected pixels"
         yield Reading(words, replace(detections, uv=detections.uv * size - 0.5), rig)
     cam_from_rig = rig.cam_from_rig
     words = "the rig's poses seem to take a camera to the rig, expected the rig to the camera (cam_from_rig)"

@@ -16,18 +16,29 @@ ROBUST = np.radians(3.0)
 """A line of sight that misses by this angle counts half."""
 ROUNDS = 6
 """Iterations of reweighting."""
+FARTHEST = np.radians(20.0)
+"""A line of sight that misses by more counts as this much in the mean."""
 
 Array = NDArray[np.float64]
 
 
-def choose_telling_snapshots(detections: Detections, cameras: int, most: int = MOST_ASKED) -> NDArray[np.int64]:
-    """Choose snapshots that many cameras see, spread over the capture: their numbers, at most `most`."""
+def choose_telling_snapshots(
+    detections: Detections, cameras: int, most: int = MOST_ASKED, least_cameras: int = LEAST_CAMERAS
+) -> NDArray[np.int64]:
+    """Choose snapshots that many cameras see, spread over the capture: their numbers in time order, at most `most`."""
     rows = detections.usable
     count = np.zeros((int(detections.snapshot.max(initial=-1)) + 1, cameras), dtype=int)
     np.add.at(count, (detections.snapshot[rows], detections.camera[rows]), 1)
     seeing = (count >= LEAST_BLOBS).sum(1)
-    best = np.flatnonzero((seeing >= LEAST_CAMERAS) & (seeing >= np.sort(seeing)[-most:].min(initial=0)))
+    best = np.flatnonzero((seeing >= least_cameras) & (seeing >= np.sort(seeing)[-most:][:1]))
     return best[np.linspace(0, len(best) - 1, min(len(best), most)).astype(int)]
+
+
+def mean_miss(detections: Detections, rig: CameraRig) -> float | None:
+    """Mean angle (rad) by which the lines of sight miss, see `sight_angles`; None = nothing to compare."""
+    angles = sight_angles(detections, rig)
+    known = np.isfinite(angles)
+    return float(np.fmin(angles[known], FARTHEST).mean()) if known.any() else None
 
 
 def sight_angles(detections: Detections, rig: CameraRig) -> Array:
@@ -41,7 +52,7 @@ def sight_angles(detections: Detections, rig: CameraRig) -> Array:
         rig: in float64.
 
     Returns:
-        (S, C) rad for at most `MOST_ASKED` snapshots; nan where a camera has too few blobs.
+        (S, C) rad for at most `MOST_ASKED` snapshots that two cameras see; nan where a camera has too few blobs.
     """
     snapshots = choose_telling_snapshots(detections, rig.num_cameras)
     row, camera, middle = _find_medians(detections, snapshots, rig.num_cameras)

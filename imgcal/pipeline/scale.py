@@ -82,10 +82,10 @@ class Scale:
             known = f"scale is known to {100 * self.sigma:.2g} % from the object file and its tolerance"
             words = f"{known}, {self._error(self.sigma)} of this; 1 % more error in the file adds {added}"
         else:
-            words = f"scale rests on the object file alone: 1 % error in it adds {added} to this"
+            words = f"scale comes from the object file: 1 % error in it adds {added} to this"
         if self.noticed_from is None:
             return f"{words}; such an error cannot be noticed"
-        return f"{words}; errors above {100 * self.noticed_from:.2g} % would be noticed"
+        return f"{words}; the cameras' factory positions would reveal errors above {100 * self.noticed_from:.2g} %"
 
     def _error(self, relative: float) -> str:
         """Effect of an error of the scale, in words."""

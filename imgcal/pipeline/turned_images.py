@@ -26,10 +26,10 @@ WAYS = {
     (False, True, True): "turned by 180 degrees",
     (False, True, False): "mirrored left to right",
     (False, False, True): "mirrored top to bottom",
-    (True, True, False): "turned by 90 degrees",
-    (True, False, True): "turned by 90 degrees",
-    (True, False, False): "mirrored and turned by 90 degrees",
-    (True, True, True): "mirrored and turned by 90 degrees",
+    (True, True, False): "turned clockwise by 90 degrees",
+    (True, False, True): "turned counterclockwise by 90 degrees",
+    (True, False, False): "mirrored about the main diagonal",
+    (True, True, True): "mirrored about the other diagonal",
 }
 """Exchange u and v, then reverse u, then reverse v: what these do to an image."""
 REACH, WIDEST = 3.0, 0.08
@@ -112,10 +112,10 @@ def _require_matching(
 ) -> None:
     """Replace a refusal if a camera is turned or two are exchanged, by the object's poses in a labelled capture."""
     points = arranged.poses.apply(obj.points.to(rig.focal_length))
-    image = rig.expand(len(points)).project_values(points, obj.radius)
-    seen = image.visible.numpy() & arranged.labelled.columns(obj)
+    predicted = rig.expand(len(points)).project_values(points, obj.radius)
+    seen = predicted.visible.numpy() & arranged.labelled.columns(obj)
     moments = arranged.labelled.moments[arranged.labelled.used]
-    uv = image.uv.numpy()
+    uv = predicted.uv.numpy()
     places = [
         (moments[row], uv[row, camera, fiducial])
         for camera, (row, fiducial) in enumerate(map(np.nonzero, seen.swapaxes(0, 1)))
@@ -155,7 +155,7 @@ def compare_turns(
         uv: (P, 2) px, their places in the image.
 
     Returns:
-        How the image fits; None if no way fits, or several do.
+        How the image fits; None if no way fits, several do, or fewer than `LEAST_PLACES` markers are known.
     """
     size = rig.image_size[camera].double().numpy()
     spread = float(image_error(rig, (rig.prior or RigPrior()).std(rig))[camera])
@@ -208,6 +208,12 @@ def _nearest_offset(blobs: NDArray[np.float64], expected: NDArray[np.float64]) -
     offset = blobs - expected[:, None]
     nearest = np.linalg.norm(offset, axis=-1).argmin(1)
     return np.asarray(offset[np.arange(len(expected)), nearest])
+
+
+def undo(way: tuple[bool, bool, bool]) -> tuple[bool, bool, bool]:
+    """Return the way that turns an image back."""
+    swap, reverse_u, reverse_v = way
+    return (swap, reverse_v, reverse_u) if swap else way
 
 
 def turn(uv: NDArray[np.float64], last: NDArray[np.float64], way: Sequence[bool]) -> NDArray[np.float64]:

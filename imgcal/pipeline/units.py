@@ -17,7 +17,7 @@ from imgcal.association import to_observations
 from imgcal.errors import RefusedError
 from imgcal.estimation import single_camera_poses
 from imgcal.geometry import vector_from_rotation
-from imgcal.pipeline.lines_of_sight import sight_angles
+from imgcal.pipeline.lines_of_sight import choose_telling_snapshots, sight_angles
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
 LEAST_IMAGE, LARGEST_IMAGE = 3.0, 5.0
@@ -36,8 +36,6 @@ LEAST_RATIO, LEAST_LOOKS = 3.0, 6.0
 """Minimum ratio of lengths for different units: between cameras with labels, and from image sizes without labels."""
 LEAST_TURN = math.radians(20)
 """Minimum rotation error of most pairs of cameras for a rig with rotations in degrees."""
-MOST_ASKED = 8
-"""Maximum number of snapshots to use."""
 
 
 def unit_doubt(rig: CameraRig, obj: CalibrationObject, from_scratch: bool = False) -> str:
@@ -156,9 +154,9 @@ def _focal_doubt(rig: CameraRig) -> str:
 
 def _doubt_by_poses(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> str:
     """Compare the cameras' relative poses, by the object in each camera alone, with the rig's."""
-    rows = np.flatnonzero((detections.fiducial >= 0) & detections.usable)
-    snapshots = np.unique(detections.snapshot[rows])[:MOST_ASKED]
-    seen = to_observations(detections.select(rows[np.isin(detections.snapshot[rows], snapshots)]), rig, obj)
+    labelled = detections.select((detections.fiducial >= 0) & detections.usable)
+    snapshots = choose_telling_snapshots(labelled, rig.num_cameras)
+    seen = to_observations(labelled.select(np.isin(labelled.snapshot, snapshots)), rig, obj)
     placed, known = single_camera_poses(seen, rig, obj)
     lengths, turns = [], []
     for first in range(rig.num_cameras):
@@ -198,7 +196,7 @@ def _doubt_by_size(detections: Detections, rig: CameraRig, obj: CalibrationObjec
     if distance is None:
         return ""
     sizes = []
-    for snapshot in np.unique(detections.snapshot)[:MOST_ASKED]:
+    for snapshot in choose_telling_snapshots(detections, rig.num_cameras, least_cameras=1):
         for camera in range(rig.num_cameras):
             mine = (detections.snapshot == snapshot) & (detections.camera == camera) & detections.usable
             if 3 <= int(mine.sum()) <= obj.num_fiducials:

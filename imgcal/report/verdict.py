@@ -140,13 +140,13 @@ def _movement(content: ReportContent) -> tuple[str, ...]:
     shift = np.linalg.norm(content.change[:, 3:6], axis=1)
     moved = content.moved[:, :6].any(axis=1)
     reference = content.reference
-    others = "the others" if reference is None else content.cameras[reference]
+    since = "since the factory calibration" if reference is None else f"relative to {content.cameras[reference]}"
     if not moved.any():
-        return (f"No camera moved measurably relative to {others} (within {MOVED:g} standard deviations).",)
+        return (f"No camera moved measurably {since} (within {MOVED:g} standard deviations).",)
     by_size = np.argsort(-np.where(moved, angle + shift / 10, -1))[: min(3, int(moved.sum()))]
     parts = [f"{content.cameras[i]} ({angle[i]:.2f}°, {shift[i]:.1f} mm)" for i in by_size]
     count = len(content.cameras) - (reference is not None)
-    words = f"{int(moved.sum())} of {count} cameras moved relative to {others}"
+    words = f"{int(moved.sum())} of {count} cameras moved {since}"
     return (f"{words}, most of all {', '.join(parts)}.",)
 
 

@@ -35,11 +35,11 @@ LONGEST_ASTRAY = 100
 REMEMBERED = 4096
 """Number of remembered names of released snapshots."""
 
-COUNTS = ("received", "missing", "late", "duplicate", "out_of_order", "astray", "beside")
+COUNTS = ("received", "missing", "late", "duplicate", "out_of_order", "clock_off", "out_of_tolerance")
 """Counters of each camera.
 
 `missing`: snapshots without it although it was due. `late`: it came after its snapshot was released. `duplicate`: a
-second exposure for the same snapshot. `astray`: its clock is off by more than `LEAP`. `beside`: its time stamps have
+second exposure for the same snapshot. `clock_off`: its clock is off by more than `LEAP`. `out_of_tolerance`: its time stamps have
 differed from the others' for long. These four are left out. `out_of_order`: earlier than a previous one; used if its
 snapshot has not been released.
 """
@@ -166,7 +166,7 @@ class Synchronizer:
         if exposure.snapshot is not None or not self._has_leapt(exposure, now):
             self._add(exposure, now)
             return self.release_due(now)
-        self.counts["astray"][exposure.camera] += 1
+        self.counts["clock_off"][exposure.camera] += 1
         self._astray[exposure.camera] = exposure
         self._astray_in_a_row += 1
         believed = [waiting for waiting in self._astray.values() if abs(waiting.time - exposure.time) <= LEAP]
@@ -175,7 +175,7 @@ class Synchronizer:
         done = self.flush()
         self._reset()
         for waiting in sorted(believed, key=lambda waiting: waiting.time):
-            self.counts["astray"][waiting.camera] -= 1
+            self.counts["clock_off"][waiting.camera] -= 1
             self._add(waiting, now)
         return done + self.release_due(now)
 
@@ -196,7 +196,7 @@ class Synchronizer:
         kept = []
         for snapshot in done:
             if len(snapshot.exposures) == 1 and (name := next(iter(snapshot.exposures))) in self.alone:
-                self.counts["beside"][name] += 1
+                self.counts["out_of_tolerance"][name] += 1
             else:
                 kept.append(snapshot)
         return tuple(kept)

@@ -268,7 +268,7 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
         "infrared accuracy": accuracy(),
         "infrared others": markdown(["right % / wrong %", *others], rows),
         "infrared harder": markdown(
-            ["right % / wrong %", *(f"{name}, {d} degrees off" for name in beyond for d in beyond[name])],
+            ["right % / wrong %", *(f"{name}, {d} {'degree' if d == 1 else 'degrees'} off" for name in beyond for d in beyond[name])],
             [[level, *(cell(row) for said in by.values() for row in said.values())] for level, by in harder.items()],
         ),
         "infrared lost": markdown(

@@ -13,7 +13,7 @@ RESULT = {
     "rms_px_before": None,
     "rms_px_after": 0.0512,
     "predicted_error": {**PREDICTED, "worst_camera": "cam03", "worst_camera_px": 0.2},
-    "scale": {"note": "scale rests on the object file alone"},
+    "scale": {"note": "scale comes from the object file"},
     "unsynchronized": None,
     "board_bend": None,
     "lights": None,
@@ -45,7 +45,7 @@ def test_results_go_to_standard_output_and_notes_to_standard_error(capsys: pytes
     said = capsys.readouterr()
     assert said.out.splitlines() == [
         "reprojection error without a factory calibration 0.0512 px (RMS)",
-        predicted_line(RESULT["predicted_error"]) + "; scale rests on the object file alone",
+        predicted_line(RESULT["predicted_error"]) + "; scale comes from the object file",
         "identity unique, 5 snapshots used, 1 rejected",
         "rig     out/rig.yaml",
         "object  out/object.csv",

@@ -31,7 +31,7 @@ def test_the_bumped_camera_is_named_even_if_it_is_the_first(camera, o10, asymmet
     assert motion.rotation_deg[camera] == pytest.approx(np.degrees(0.008), abs=0.1)
     others = [i for i in range(10) if i != camera]
     assert motion.position_mm[others].max() < 2
-    assert f"1 of 10 cameras moved relative to the others: {name} (0.4" in motion.sentence
+    assert f"1 of 10 cameras moved since the factory calibration: {name} (0.4" in motion.sentence
     (move,) = motion.moves
     assert (move.camera, move.snapshot, move.kind, move.unit) == (name, None, "position", "mm")  # the surer of both
     assert move.size == pytest.approx(float(motion.position_mm[camera])) and 0 < move.sigma < 0.1 * move.size

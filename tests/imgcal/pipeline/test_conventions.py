@@ -11,8 +11,9 @@ import torch
 import imgcal
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
-from imgcal.pipeline.conventions import other_readings
-from imgcal.pipeline.lines_of_sight import sight_angles
+from imgcal.pipeline.conventions import lines_of_sight_miss, other_readings
+from imgcal.pipeline.lines_of_sight import choose_telling_snapshots, mean_miss, sight_angles
+from imgcal.pipeline.turned_images import WAYS, turn, undo
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from imgcal.types import CameraRig, Detections
 
@@ -58,9 +59,9 @@ MISTAKES = {
         "all images seem to be mirrored left to right .as if u were counted from the right.; read like that",
     ),
     "upside down": (with_images(lambda uv, size: size - 1 - uv), "all images seem to be turned by 180 degrees"),
-    "shares": (
+    "normalized": (
         with_images(lambda uv, size: (uv + 0.5) / size),
-        "u and v seem to be shares of the image's width and hei",
+        "u and v seem to be normalized by the image's width and hei",
     ),
     "inverse poses": (
         with_poses(RigidTransform.inverse),
@@ -82,6 +83,36 @@ def test_another_convention_is_refused_and_named(name: str, mistake: str, labell
     rig, blobs = change(rig, blobs)
     with pytest.raises(RefusedError, match=rf"^{expected}.*; so "):
         imgcal.calibrate(blobs, rig, imgcal.load_object("asymmetric8"))
+
+
+def keep_little(blobs: Detections, snapshots: int) -> Detections:
+    """Keep three blobs in each of two cameras of the first snapshots."""
+    rank = np.zeros(len(blobs.uv), dtype=int)
+    for snapshot in range(snapshots):
+        for camera in range(2):
+            rows = np.flatnonzero((blobs.snapshot == snapshot) & (blobs.camera == camera))
+            rank[rows[3:]] = 1
+    return blobs.select((blobs.snapshot >= snapshots) | ((blobs.camera < 2) & (rank == 0)))
+
+
+def test_a_snapshot_that_few_cameras_see_hides_no_convention() -> None:
+    rig, blobs = MISTAKES["v from the bottom"][0](*seen("O10"))
+    blobs = keep_little(replace(blobs, fiducial=np.full_like(blobs.fiducial, -1)), 1)
+    with pytest.raises(RefusedError, match=r"^all images seem to be mirrored top to bottom"):
+        imgcal.calibrate(blobs, rig, imgcal.load_object("asymmetric8"))
+
+
+def test_snapshots_that_many_cameras_see_are_asked() -> None:
+    rig, blobs = seen("O10")
+    assert choose_telling_snapshots(keep_little(blobs, 4), rig.num_cameras, 2).tolist() == [4, 5]
+    assert choose_telling_snapshots(blobs.select(blobs.camera == 0), rig.num_cameras).size == 0
+    assert choose_telling_snapshots(blobs.select(np.zeros(0, dtype=int)), rig.num_cameras).size == 0
+
+
+def test_nothing_to_compare_is_no_miss() -> None:
+    rig, blobs = seen("O10")
+    alone = blobs.select(blobs.camera == 0)
+    assert mean_miss(alone, rig) is None and not lines_of_sight_miss(alone, rig)
 
 
 @pytest.mark.parametrize("labelled", [True, False])
@@ -121,4 +152,14 @@ def test_lines_of_sight_meet_in_our_convention_only() -> None:
     own = float(np.nanmean(sight_angles(blobs, rig)))
     assert own < np.radians(0.5)
     for reading in other_readings(blobs, rig):
-        assert reading.miss > 3 * own + np.radians(0.5), reading.words
+        miss = mean_miss(reading.detections, reading.rig)
+        assert miss is not None and miss > 3 * own + np.radians(0.5), reading.words
+
+
+def test_each_way_to_turn_an_image_has_its_name_and_is_undone() -> None:
+    assert len(set(WAYS.values())) == len(WAYS)
+    uv, last = np.array([[3.0, 1.0], [0.0, 5.0]]), np.array([9.0, 9.0])
+    for way in WAYS:
+        np.testing.assert_array_equal(turn(turn(uv, last, way), last, undo(way)), uv)
+    (clockwise,) = (way for way, name in WAYS.items() if name == "turned clockwise by 90 degrees")
+    np.testing.assert_array_equal(turn(np.zeros((1, 2)), last, clockwise), [[9.0, 0.0]])  # top left to top right

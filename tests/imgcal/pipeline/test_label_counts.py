@@ -18,7 +18,7 @@ WAYS = {
     "u": "mirrored left to right",
     "v": "mirrored top to bottom",
     "both": "turned by 180 degrees",
-    "turned": "turned by 90 degrees",
+    "turned": "turned counterclockwise by 90 degrees",
 }
 MAKE = {"room": damage.wand_in_a_room, "ring": damage.object_before_a_ring}
 

@@ -1,5 +1,6 @@
 """Values in other units than millimetres, radians and pixels are noticed; rigs and objects that ship are not."""
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -11,6 +12,7 @@ from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_rotation
 from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate, score, unit_doubt
+from imgcal.pipeline.units import image_doubt
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 
 RIGS = ("O10", "O6", "U7", "T4", "room10")
@@ -104,6 +106,15 @@ def test_a_mistaken_unit_is_named_where_no_blob_has_a_label(mistake):
         calibrate(
             replace(blobs, fiducial=np.full_like(blobs.fiducial, -1)), *change(rig_of("T4"), load_object("asymmetric8"))
         )
+
+
+def test_snapshots_of_one_camera_at_the_start_hide_no_unit():
+    change, expected = MISTAKES["rig in metres"]
+    rig, obj = change(rig_of("T4"), load_object("asymmetric8"))
+    truth = simulate_truth(rig_of("T4"), load_object("asymmetric8"), 12, torch.Generator().manual_seed(0), None)
+    blobs = true_detections(truth)
+    blobs = blobs.select((blobs.camera == 0) | (blobs.snapshot >= 8))
+    assert re.match(expected, image_doubt(blobs, rig, obj))
 
 
 @pytest.mark.parametrize("mistake", ["object in metres", "rotations in degrees", "focal length in millimetres"])
