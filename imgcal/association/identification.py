@@ -274,8 +274,8 @@ def _explain_too_few_labels(name: str, fitted: float, certain_share: float, leas
     """Say why too few labels are certain: nothing fits, or the fit is ambiguous."""
     if fitted >= least:
         return (
-            f"the best fit explains {100 * fitted:.0f} % of the visible markers, but only {100 * certain_share:.0f} % of "
-            f"them can be labelled with certainty ({100 * least:.0f} % needed): too few blobs, or too many that are not "
+            f"the best fit explains {100 * fitted:.0f} % of the visible markers, but only {100 * certain_share:.0f} % "
+            f"can be labelled with certainty ({100 * least:.0f} % needed): too few blobs, or too many that are not "
             "fiducials; show more of the object, to more cameras"
         )
     return (

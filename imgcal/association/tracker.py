@@ -150,10 +150,11 @@ class Tracker:
 
         If it sees nothing, and blobs have not been tried yet, they give a pose to try, or decide themselves.
         """
+        frames = sight.frames(number)
+        if all(frame is None for frame in frames.values()):
+            return *self.decide(blobs, name), blobs
         known = () if self.pose is None else (self.pose,)
-        snapshot = Snapshot(
-            sight.frames(number), blobs, self.rig, self.obj, self.prior_std, known, sight.detection, sight.masks
-        )
+        snapshot = Snapshot(frames, blobs, self.rig, self.obj, self.prior_std, known, sight.detection, sight.masks)
         identity, found, found_by = self._judge(sight, snapshot)
         identity = self._adopt(identity)
         if not identity.accepted and not sight.where_blobs_fail:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import signal
 import sys
 import threading
@@ -24,6 +23,7 @@ from imgcal.cli.watch_display import Display
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice, missing
 from imgcal.io import Fiducials, holding, load_objects, open_input
+from imgcal.live_page import parse_address
 from imgcal.messages import plural, shorten
 from imgcal.online import Event, RigKeeper
 from imgcal.pipeline import DETECTORS, DetectorName, LearnedMeasurer, choose_proposer
@@ -69,7 +69,7 @@ from imgcal.watch import (
 from imgcal.watch import Watch as Loop
 
 MARKER_SUFFIXES, TABLE_SUFFIXES = (".c3d", ".trc"), (".csv", ".jsonl")
-POSE_OUTPUTS = "FILE.csv, FILE.jsonl, FILE.c3d, FILE.trc, tcp://HOST:PORT or igtl://[HOST:]PORT"
+POSE_OUTPUTS = "FILE.csv, FILE.jsonl, FILE.c3d, FILE.trc, tcp://HOST:PORT, ipc://PATH or igtl://[HOST:]PORT"
 BLOBS_ONLY = (BlobTable, JsonLines, LabStreaming, Qualisys)
 LEARNING_CODE = "from imgcal.cli.learning_process import main; main()"
 USUAL_RATE = 30.0  # snapshots a second of a table of blobs
@@ -92,6 +92,10 @@ class Watch(arguments.Watch):
         rig, given = open_rig(self.rig), load_objects(self.object)
         self._check_out()
         _check_poses(self.poses, given.as_unknown(), self.out)
+        if self.serve is not None:
+            parse_address(self.serve)
+        if self.metrics is not None:
+            parse_address(self.metrics, "--metrics", None)
         if self.learn:
             self._check_learning(given)
         detector = self._detector()
@@ -133,7 +137,7 @@ class Watch(arguments.Watch):
                 print(f"learning from the frames of this rig: {folder / LEARNING}")
             page = None
             if self.serve is not None:
-                from imgcal.live_page import LivePage, parse_address  # brings a server along, which is not in the core
+                from imgcal.live_page import LivePage  # brings a server along, which is not in the core
 
                 page = stack.enter_context(LivePage(rig, obj, parse_address(self.serve), problem=display.warn))
                 print(page.notice)
@@ -143,7 +147,8 @@ class Watch(arguments.Watch):
                 poses=poses, learning=learning,
             )  # fmt: skip
             if self.metrics is not None:
-                stack.enter_context(Metrics(loop.tally, intake, hook, metrics_address(self.metrics)))
+                address = parse_address(self.metrics, "--metrics", None)
+                stack.enter_context(Metrics(loop.tally, intake, hook, address))
             told = 0 if not restored else None if progress is None else progress.logged
             if not (
                 goes_on or self.fresh or told is None or self._is_another(progress)
@@ -236,7 +241,8 @@ class Watch(arguments.Watch):
         if path.is_dir():
             self._check_options("a folder of videos")
             return Videos(path, rig, self.videos_differ)
-        self._check_options("a table of blobs")
+        if path.exists():
+            self._check_options("a table of blobs")
         rate = USUAL_RATE if self.rate is None else self.rate
         if not 0 < rate < 1e6:
             raise InputError(f"--rate: found {rate:g}, expected more than 0 and less than 1e6 snapshots per second")
@@ -381,14 +387,6 @@ def _stop_at_signals() -> Iterator[_Stopped]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def metrics_address(text: str) -> tuple[str, int]:
-    """Read [HOST:]PORT; the host is this machine alone if it is not given."""
-    host, _, port = text.rpartition(":")
-    if not re.fullmatch(r"\d{1,5}", port) or int(port) >= 2**16:
-        raise InputError(f"found {shorten(text)!r}, expected [HOST:]PORT")
-    return host.strip("[]") or "127.0.0.1", int(port)
 
 
 def _check_poses(names: tuple[str, ...], obj: CalibrationObject, out: Path) -> None:

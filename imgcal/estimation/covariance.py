@@ -32,8 +32,6 @@ from renderers.interpreting import without_machine_code
 UNDETERMINED = "covariance: the observations do not determine the object's pose in every snapshot"
 LEAST_STD = 1e-9
 """Floor of prior standard deviations (rad, mm, pixels, 1) in divisions, for fixed parameters."""
-HUBER = 3.0
-"""Huber threshold in standard deviations, as for an estimate: larger residuals count less in couplings."""
 FEW_POSES = 10
 """Up to this many, `remaining_variance` eliminates the cameras (exact object only) instead of the poses."""
 
@@ -74,10 +72,8 @@ def _by_modes(estimate: Estimate) -> Tensor:
     """Covariance that the uncertainty of the object's modes adds to the cameras' whitened offsets."""
     if estimate.modes is None:
         return estimate.problem.prior_std.new_zeros(())
-    follow, modes = estimate.modes.follow.flatten(1), torch.from_numpy(estimate.modes.covariance)
-    by_prior = modes @ modes
-    spread = (by_prior + estimate.mean_inflation**2 * (modes - by_prior)).to(follow)
-    return (follow.mT @ spread @ follow)[None]
+    follow = estimate.modes.follow.flatten(1)
+    return (follow.mT @ estimate.mode_covariance().to(follow) @ follow)[None]
 
 
 def _inflated_covariance(solution: Solution, inflation: Tensor) -> Tensor:
@@ -142,19 +138,17 @@ def joint_information(estimate: Estimate) -> Tensor:
     if bool(reduced.failed.any()):
         raise RefusedError(UNDETERMINED)
     information = (reduced.kept @ reduced.kept.mT)[0]
-    prior = torch.eye(len(information), dtype=information.dtype)
     if estimate.modes is not None:
         # Woodbury: the uncertainty of the modes reduces the information about the cameras that they affect.
         follow = information.new_zeros(len(estimate.modes.offset), len(information))
         of_cameras = estimate.modes.follow.flatten(1)
         follow[:, : of_cameras.shape[1]] = of_cameras
-        precise = torch.linalg.inv(torch.from_numpy(estimate.modes.covariance) * estimate.mean_inflation**2)
+        precise = torch.linalg.inv(estimate.mode_covariance())
         across = follow @ information
         information = information - across.mT @ torch.linalg.solve(precise + across @ follow.mT, across)
     by_step = torch.linalg.inv(_unwhitening(_floor_prior_std(estimate, LEAST_STD))[0])  # whitened offsets by parameters
-    cameras, wide = len(by_step), problem.prior_std[0].numel()
-    whole = prior.clone()
-    whole[:wide, :wide] = torch.block_diag(*by_step) if cameras else prior
+    others = len(information) - problem.prior_std[0].numel()
+    whole = torch.block_diag(*by_step, torch.eye(others, dtype=information.dtype))
     return whole.mT @ information @ whole
 
 
@@ -167,7 +161,7 @@ def _weakened_equations(estimate: Estimate, inflation: Tensor) -> NormalEquation
     """
     problem, solution = estimate.problem, estimate.solution
     distance = solution.equations.residual.square().sum(-2).sqrt() * problem.root_weight  # (1, S, C, N)
-    robust = (HUBER / distance.clamp_min(HUBER)).sqrt()  # square root of the loss's weight
+    robust = estimate.loss(distance.square())[1].sqrt()
     weaker = replace(problem, root_weight=problem.root_weight * robust / inflation[:, None])
     return equations_at(weaker, solution.state, NamedLoss("squared"))
 
@@ -198,7 +192,10 @@ def camera_std(estimate: Estimate) -> Tensor:
 
 
 def flat_std(estimate: Estimate) -> Tensor:
-    """`camera_std` without the second order, a hundred times faster: (*B, C, K)."""
+    """Standard deviation of every parameter by the noise alone, a hundred times faster than `camera_std`: (*B, C, K).
+
+    Without inflation, the uncertainty of the object's modes and the second order.
+    """
     left = torch.from_numpy(remaining_variance(estimate.solution)).to(estimate.problem.prior_std)
     std = left.clamp_min(0).sqrt() * estimate.problem.prior_std
     return std.reshape(*estimate.chi2.shape, *std.shape[1:])
@@ -207,7 +204,7 @@ def flat_std(estimate: Estimate) -> Tensor:
 def remaining_variance(solution: Solution) -> NDArray[np.float64]:
     """Share of each factory value's prior variance that remains: (B, C, K); 1 = the observations add nothing.
 
-    Equals `camera_std` over the prior's, squared, except for the curvature of rotations, and is much faster.
+    Equals `flat_std` over the prior's, squared.
 
     Raises:
         RefusedError: the information is singular.
@@ -458,7 +455,7 @@ def scale_response(estimate: Estimate) -> Tensor:
         unit = problem.object_prior_std.clone()
     unit[:, -1] = 1.0
     free = replace(problem, points=points, object_prior_std=unit)
-    equations = equations_at(free, replace(state, object_offset=torch.zeros_like(unit)), NamedLoss("huber", HUBER))
+    equations = equations_at(free, replace(state, object_offset=torch.zeros_like(unit)), estimate.loss)
     factorization = factorize(equations, cameras_first=False)
     if bool(factorization.reduced.failed.any()):
         raise RefusedError(UNDETERMINED)

@@ -76,6 +76,7 @@ class Estimate:
     points_object: Tensor  # (*B, N, 3) mm, the fiducials as estimated; as given where the object is exact
     problem: Problem  # (B,) flattened, as solved
     solution: levenberg_marquardt.Solution  # (B,) flattened: state and normal equations at the minimum
+    loss: NamedLoss = field(default=NamedLoss("huber"), kw_only=True)  # of the observations
     inflation: Tensor | None = field(default=None, kw_only=True)
     """(C,) factors on the noise part of each camera's standard deviations, where blocks of snapshots scatter more than
     the noise: `block_scatter`; None = they do not."""
@@ -86,6 +87,16 @@ class Estimate:
     def mean_inflation(self) -> float:
         """Root mean square of `inflation`, for the object, which all cameras see; 1 = no inflation."""
         return 1.0 if self.inflation is None else float(self.inflation.square().mean().sqrt())
+
+    def mode_covariance(self) -> Tensor:
+        """Covariance of the object's modes (M, M), in standard deviations of their prior, with the inflation.
+
+        The prior contributes the square of the covariance, which stays: images that scatter say nothing about it.
+        """
+        assert self.modes is not None
+        plain = torch.from_numpy(self.modes.covariance)
+        by_prior = plain @ plain
+        return by_prior + self.mean_inflation**2 * (plain - by_prior)
 
     def covariance(self, reference: int = 0) -> Tensor:
         """Covariance of the cameras relative to one of them: (*B, K C, K C); see `relative_covariance`."""
@@ -162,7 +173,8 @@ def estimate(
         with torch.no_grad():
             rig_from_object = initial_pose(observations, initial_rig or rig, obj)
     solution = minimize(problem, initial_state(problem, rig_from_object, initial_rig), options)
-    return make_estimate(problem, solution, implicit.attach_gradient(problem, solution, make_loss(options)), batch)
+    loss = make_loss(options)
+    return make_estimate(problem, solution, implicit.attach_gradient(problem, solution, loss), loss, batch)
 
 
 def make_loss(options: EstimationOptions) -> NamedLoss:
@@ -241,7 +253,11 @@ def equations_by_snapshot(problem: Problem, state: State, loss: NamedLoss) -> No
 
 
 def make_estimate(
-    problem: Problem, solution: levenberg_marquardt.Solution, state: State, batch: torch.Size = torch.Size()
+    problem: Problem,
+    solution: levenberg_marquardt.Solution,
+    state: State,
+    loss: NamedLoss,
+    batch: torch.Size = torch.Size(),
 ) -> Estimate:
     """Build the estimate from a solution; `state` is the solution's, possibly with a gradient."""
     seen = problem.root_weight > 0
@@ -260,6 +276,7 @@ def make_estimate(
         points_object=(points_at(problem, state) + problem.centroid).reshape(*batch, -1, 3),
         problem=problem,
         solution=solution,
+        loss=loss,
     )
 
 

@@ -25,7 +25,7 @@ import torch
 import imgcal
 from imgcal.association import PipelineOptions
 from imgcal.errors import InputError, RefusedError
-from imgcal.estimation import flat_std, whitened_covariance
+from imgcal.estimation import camera_covariance, whitened_covariance
 from imgcal.fleet.drift_information import parameter_units
 from imgcal.fleet.manifest import Item, open_file, short_reason
 from imgcal.formats import load_rig
@@ -249,7 +249,7 @@ def result_columns(result: Calibration) -> dict[str, Any]:
         "parameters": [name for camera in range(cameras) for name in result.rig.parameter_names_of(camera)],
         "identity": result.identity,
         "offset": offset.flatten().tolist(),
-        "std": flat_std(estimate).flatten().tolist(),
+        "std": camera_covariance(estimate, curved=False).diagonal().clamp_min(0).sqrt().tolist(),
         "prior_std": estimate.problem.prior_std.flatten().tolist(),
         "unit": parameter_units(result.factory).flatten().tolist(),
         "whitened_offset": solution.state.offset.flatten().tolist(),

@@ -56,8 +56,13 @@ class Address:
         return listening
 
 
-def parse_address(text: str | None) -> Address:
-    """Read `HOST:PORT`, `HOST`, `:PORT` or `PORT`; None = this machine, the usual port.
+def parse_address(text: str | None, option: str = "--serve", usual: int | None = PORT) -> Address:
+    """Read `HOST:PORT`, `HOST`, `:PORT` or `PORT`; None = this machine.
+
+    Args:
+        text: what was given.
+        option: for the message.
+        usual: port if none is given; None = one must be given.
 
     Raises:
         InputError: something else.
@@ -68,10 +73,10 @@ def parse_address(text: str | None) -> Address:
     """
     given = text or ""
     match = re.fullmatch(r"(?:(?P<only>\d+)|(?P<host>\[[0-9a-fA-F:.]+\]|[\w.-]*)(?::(?P<port>\d{1,5}))?)", given)
-    port = int((match["only"] or match["port"] or PORT) if match else PORT)
-    if match is None or port > 65535:
-        raise InputError(f"address: found {shorten(given)!r}, expected [HOST:]PORT, such as 127.0.0.1:{PORT}")
-    return Address((match["host"] or THIS_MACHINE).strip("[]"), port)
+    port = (match["only"] or match["port"] or usual) if match else None
+    if match is None or port is None or int(port) > 65535:
+        raise InputError(f"{option}: found {shorten(given)!r}, expected [HOST:]PORT, such as {THIS_MACHINE}:{PORT}")
+    return Address((match["host"] or THIS_MACHINE).strip("[]"), int(port))
 
 
 def is_loopback(host: str) -> bool:

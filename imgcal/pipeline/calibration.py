@@ -180,10 +180,9 @@ class Calibration:
         board, modes = self.obj.board, self.estimate.modes
         if board is None or modes is None:
             return None
-        std, known = board.warp_std, np.sqrt(modes.covariance.diagonal())
+        std, known = board.warp_std, self.estimate.mode_covariance().diagonal().sqrt().numpy()
         (x, y), (dx, dy), (sx, sy) = board.bend, (std * modes.offset).tolist(), (std * known).tolist()
-        factor = self.estimate.mean_inflation
-        return Bend(x + dx, y + dy, min(factor * sx, std), min(factor * sy, std))
+        return Bend(x + dx, y + dy, sx, sy)
 
     @cached_property
     def object(self) -> CalibrationObject:

@@ -19,6 +19,7 @@ from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, estimate
 from imgcal.geometry import RigidTransform
 from imgcal.pipeline.label_counts import LabelCounts
+from imgcal.pipeline.units import require_solvable
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
 
 SLIPS = (-2, -1, 1, 2)
@@ -131,7 +132,8 @@ def find_late_camera(
     own = part.camera == camera
     chosen = torch.linspace(0, obj.num_fiducials - 1, min(obj.num_fiducials, MOST_FIDUCIALS)).long().unique()
     try:
-        used, poses = calibrated(part.select(~own))
+        with require_solvable():
+            used, poses = calibrated(part.select(~own))
         seen_alone = _label_camera(part.select(own), rig.select([camera]), obj, used, poses)
         view = _View(rig.select([camera]), obj.points.double()[chosen], poses, *(x[:, chosen] for x in seen_alone))
         found = _slip(view)

@@ -174,14 +174,15 @@ def _fit_once(
     if latest is None:
         question = ObjectQuestion.SHAPE_OF_TURNS if alike else ObjectQuestion.SHAPE
     found = estimate_variance_components(problem, starts, variance, labels, options, question)
-    fit = replace(make_estimate(found.problem, found.solution, found.solution.state), modes=found.modes)
+    loss = make_loss(options.estimation)
+    fit = replace(make_estimate(found.problem, found.solution, found.solution.state, loss), modes=found.modes)
     if latest is None:
         require_one_size(fit, tuple(labelled.snapshots[s].name for s in labelled.used))
     require_same_residuals(fit, observations, found.seen, obj)
     shape = object_offsets(fit, found.shape, obj)
     scatter = BlockScatter()
     if latest is None:
-        scatter = block_scatter(found.problem, found.solution, make_loss(options.estimation))
+        scatter = block_scatter(found.problem, found.solution, loss)
         fit = replace(fit, inflation=scatter.factor)
     outliers = int(labels.sum() - found.seen.sum())
     require_cameras(found.seen, rig, options)

@@ -31,17 +31,12 @@ from imgcal.estimation import K3, ColdStart, cold_start, ordinary_lens
 from imgcal.messages import list_names, plural
 from imgcal.pipeline.board_turns import require_one_turn
 from imgcal.pipeline.calibration import Calibration
+from imgcal.pipeline.late_cameras import find_late_cameras, require_same_moments
 from imgcal.pipeline.lights_from_scratch import calibrate_lights_from_scratch, place_by_stick
-from imgcal.pipeline.recalibration import (
-    as_unknown_marker,
-    fit_with_timing,
-    label_again,
-    late_cameras,
-    require_same_moments,
-)
+from imgcal.pipeline.recalibration import fit_with_timing, label_again
 from imgcal.pipeline.repeats import drop_repeats, name_repeats
-from imgcal.pipeline.sources import Frames, find_blobs
-from imgcal.pipeline.units import require_solvable, require_units
+from imgcal.pipeline.sources import Frames, as_unknown_marker, find_blobs
+from imgcal.pipeline.units import UNSOLVABLE, require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, ConvexVolume, Detections, RigPrior
 
 ALONE = RigPrior(focal_length=0.05, principal_point=10.0, distortion=0.02, rotation=0.01, position=10.0)
@@ -132,14 +127,15 @@ def calibrate_from_scratch(
             identified = time.perf_counter()
             fit = _fit(labelled, first, cameras, obj, options)
             if is_stick and (again := label_again(fit, detections, obj, options)) is not None:
-                with contextlib.suppress(RefusedError):
+                with contextlib.suppress(RefusedError), require_solvable():
                     fit = _fit(again, first, cameras, obj, options)
     except RefusedError as error:
-        require_units(error, detections, placed, obj, from_scratch=True)
-        if labelled is not None:
-            require_same_moments(error, alone, labelled, placed, obj, options)
+        with contextlib.suppress(*UNSOLVABLE):
+            require_units(error, detections, placed, obj, from_scratch=True)
+            if labelled is not None:
+                require_same_moments(error, alone, labelled, placed, obj, options)
         raise
-    late = late_cameras(alone, fit.tally, placed, obj, options)
+    late = find_late_cameras(alone, fit.tally, placed, obj, options)
     seconds = {
         "detection": found - started,
         "identity": identified - found,

@@ -17,30 +17,21 @@ from torch import Tensor
 from imgcal.association import Associations, PipelineOptions, Progress, Sight, associate
 from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
-from imgcal.geometry import RigidTransform
 from imgcal.pipeline.board_turns import settle_turns
 from imgcal.pipeline.calibration import Calibration
-from imgcal.pipeline.clock_offset import LateCamera, find_late_camera, suspects
 from imgcal.pipeline.conventions import lines_of_sight_miss, require_conventions
-from imgcal.pipeline.fitting import fit_labelled, fit_steady
+from imgcal.pipeline.fitting import fit_steady
 from imgcal.pipeline.initialization import Initializer
-from imgcal.pipeline.label_counts import LabelCounts, count_labels
-from imgcal.pipeline.labelled_capture import arrange_labels
+from imgcal.pipeline.late_cameras import find_late_cameras, require_same_moments
 from imgcal.pipeline.learned_measurer import LearnedMeasurer
 from imgcal.pipeline.learned_proposer import LearnedProposer
 from imgcal.pipeline.lights import add_lights, find_lights
-from imgcal.pipeline.repeats import Repeats, drop_repeats, name_repeats
-from imgcal.pipeline.sources import Detector, Frames, check_frames, find_blobs, make_sight
+from imgcal.pipeline.repeats import Repeats, drop_repeats, hide_repeats, name_repeats
+from imgcal.pipeline.sources import Detector, Frames, as_one, as_unknown_marker, check_frames, find_blobs, make_sight
 from imgcal.pipeline.synchronization import NOTICEABLE, find_unsynchronized
 from imgcal.pipeline.turned_images import require_matching_images
-from imgcal.pipeline.units import require_solvable, require_units
-from imgcal.types import (
-    CalibrationObject,
-    CameraRig,
-    Detections,
-    MovedError,
-    RigPrior,
-)
+from imgcal.pipeline.units import UNSOLVABLE, require_solvable, require_units
+from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 
 LEAST_USED, MOST_USED = 0.5, 0.75
 """Share of the snapshots below which images or rig may follow other conventions, and of those tried for one to fit."""
@@ -101,6 +92,7 @@ def calibrate(
     if obj.unknown_markers and detector != "classical":
         raise InputError(f"detector {detector}: found unknown markers, expected an object with a pattern to look for")
     sight = make_sight(detector, source, detection, measurer)
+    sight = sight and hide_repeats(sight, repeats)
     if obj.unknown_markers:
         return _calibrate_lights(detections, repeats, rig, obj, options, found - started)
     if obj.parts and (sight is not None or initializer is not None):
@@ -111,7 +103,7 @@ def calibrate(
     if may_be_misread and not detections.labelled.any() and lines_of_sight_miss(detections, rig):
         # Identity takes minutes to find nothing in a long capture.
         doubt = RefusedError("identity: the cameras' lines of sight to the object do not meet")
-        _require_conventions(doubt, detections, rig, obj, options)
+        _try_conventions(doubt, detections, rig, obj, options)
         may_be_misread = False
     try:
         with require_solvable():
@@ -121,40 +113,42 @@ def calibrate(
             fit = fit_with_timing(labelled, given, rig, obj, options, initializer)
             has_stick = any(part.pose_rank == 5 for part in obj.each)
             if has_stick and (again := label_again(fit, given, obj, options)) is not None:
-                with contextlib.suppress(RefusedError):
+                with contextlib.suppress(RefusedError), require_solvable():
                     fit = fit_with_timing(again, given, rig, obj, options)
             is_steady = not fit.moved and fit.unsynchronized is None
             if obj.has_lights and is_steady and (lit := add_lights(fit.labelled, fit.estimate.rig, obj)) is not None:
-                with contextlib.suppress(RefusedError):
+                with contextlib.suppress(RefusedError), require_solvable():
                     fit = fit_steady(lit, given, rig, obj, options)
     except RefusedError as error:
         if sight is not None and labelled is not None and (other := _next_sight(sight, labelled)) is not None:
             with contextlib.suppress(RefusedError):
-                return calibrate(
+                fit = calibrate(
                     detections, rig, obj, options, initializer=initializer, progress=progress, detector=other
                 )
-        if is_solid:  # the extent of the view says nothing for a light, and little for a stick
-            if may_be_misread:
-                _require_conventions(error, detections, rig, obj, options)
-            require_units(error, detections, rig, obj)
-        if labelled is not None:
-            require_matching_images(error, detections, labelled, rig, obj)
-            require_same_moments(error, detections, labelled, rig, obj, options)
+                return replace(fit, labelled=name_repeats(fit.labelled, repeats), repeats=repeats)
+        with contextlib.suppress(*UNSOLVABLE):  # what cannot be solved explains nothing
+            if is_solid:  # the extent of the view says nothing for a light, and little for a stick
+                if may_be_misread:
+                    _try_conventions(error, detections, rig, obj, options)
+                require_units(error, detections, rig, obj)
+            if labelled is not None:
+                require_matching_images(error, detections, labelled, rig, obj)
+                require_same_moments(error, detections, labelled, rig, obj, options)
         raise
     used, given_snapshots = len(fit.labelled.used), len(detections.snapshot_names)
     if may_be_misread and used < LEAST_USED * given_snapshots:
         doubt = RefusedError(f"identity: only {used} of {given_snapshots} snapshots could be used")
-        _require_conventions(doubt, detections, rig, obj, options)
+        _try_conventions(doubt, detections, rig, obj, options)
     seconds = {
         "detection": found - started,
         "identity": identified - found,
         "estimation": time.perf_counter() - identified,
     }
-    late = late_cameras(detections, fit.tally, rig, obj, options, labelled=fit.labelled)
+    late = find_late_cameras(detections, fit.tally, rig, obj, options, labelled=fit.labelled)
     return replace(fit, labelled=name_repeats(fit.labelled, repeats), seconds=seconds, late=late, repeats=repeats)
 
 
-def _require_conventions(
+def _try_conventions(
     error: RefusedError, detections: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
 ) -> None:
     """Replace a refusal if images or rig follow other conventions; see `require_conventions`."""
@@ -192,17 +186,6 @@ def _calibrate_lights(
     return replace(fit, lights=lights, seconds=seconds, repeats=repeats)
 
 
-def as_unknown_marker(obj: CalibrationObject, detections: Detections) -> CalibrationObject:
-    """Take an object of one marker for an unknown marker, unless labels say which blobs are it."""
-    is_one = obj.pose_rank == 3 and not obj.parts and not (detections.fiducial >= 0).any()
-    return replace(obj.about_centroid(obj.name), unknown_markers=True) if is_one else obj
-
-
-def as_one(obj: CalibrationObject | Sequence[CalibrationObject]) -> CalibrationObject:
-    """One object, or several combined."""
-    return obj if isinstance(obj, CalibrationObject) else CalibrationObject.of_several(obj)
-
-
 def label_again(
     fit: Calibration, given: Detections, obj: CalibrationObject, options: PipelineOptions
 ) -> Associations | None:
@@ -212,7 +195,7 @@ def label_again(
     """
     if fit.labelled.identity == "coded" or fit.moved or fit.unsynchronized is not None:
         return None
-    with contextlib.suppress(RefusedError):
+    with contextlib.suppress(RefusedError), require_solvable():
         again = associate(given, replace(fit.estimate.rig, prior=FOUND), obj, options)
         if int((again.detections.fiducial >= 0).sum()) > int((fit.labelled.detections.fiducial >= 0).sum()):
             return again
@@ -265,81 +248,6 @@ def _next_sight(sight: Sight, labelled: Associations) -> Sight | None:
     if isinstance(proposer, LearnedProposer) and proposer.finder is not None and proposer.name in made_by:
         return replace(sight, proposer=proposer.finder)
     return None
-
-
-def require_same_moments(
-    error: RefusedError,
-    detections: Detections,
-    labelled: Associations,
-    rig: CameraRig,
-    obj: CalibrationObject,
-    options: PipelineOptions,
-) -> None:
-    """Replace a refusal if its cause is a camera whose frames are of other moments.
-
-    Args:
-        error: the refusal.
-        detections: all blobs, with the labels of the input alone.
-        labelled: the same with all labels.
-        rig: as for `late_cameras`.
-        obj: the calibration object.
-        options: how certain a result must be.
-    """
-    arranged = arrange_labels(labelled, rig, obj)
-    labels = arranged.observations.seen.numpy()
-    counts = count_labels(arranged.labelled, labels, arranged.poses, rig, obj)
-    moves = error.moved if isinstance(error, MovedError) else ()
-    moved = tuple((move.camera, detections.snapshot_names.index(move.snapshot)) for move in moves)
-    for slipped in late_cameras(detections, counts, rig, obj, options, moved, arranged.labelled):
-        raise RefusedError(
-            str(slipped),
-            python="give the frames of each moment, or leave the camera out (rig.select)",
-            command=f"export its frames again, or leave it out: --without {slipped.camera}",
-        ) from error
-
-
-def late_cameras(
-    detections: Detections,
-    counts: LabelCounts,
-    rig: CameraRig,
-    obj: CalibrationObject,
-    options: PipelineOptions,
-    moved: tuple[tuple[str, int], ...] = (),
-    labelled: Associations | None = None,
-) -> tuple[LateCamera, ...]:
-    """Find cameras that disagree with the others because their frames are of other moments.
-
-    Args:
-        detections: all blobs, with the labels of the input alone.
-        counts: how much of them is explained.
-        rig: approximate rig; its prior bounds the labelling of blobs.
-        obj: the calibration object.
-        options: how certain a result must be.
-        moved: cameras reported to have moved, and the number of the snapshot of the move.
-        labelled: rows of `counts` if several objects were in view; the one seen most often is used.
-    """
-    asked = suspects(counts, rig.camera_names, moved)
-    if obj.parts and asked and labelled is not None:
-        where, moments = dict(moved), labelled.moments.tolist()
-        moments += moments[-1:]
-        asked = {c: where.get(rig.camera_names[c], moments[row]) for c, row in asked.items()}
-        counts_of_parts = np.bincount(labelled.part_of_rows, minlength=len(obj.parts))
-        counts_of_parts[len(obj.parts) - obj.has_lights :] = 0
-        detections, obj = _select_part(detections, obj, int(counts_of_parts.argmax()))
-
-    def others(blobs: Detections) -> tuple[list[int], RigidTransform]:
-        fit = fit_labelled(associate(blobs, rig, obj, options), rig, obj, replace(options, blind_cameras=True))
-        return fit.labelled.used, fit.rig_from_object
-
-    found = (find_late_camera(detections, rig, obj, camera, around, others) for camera, around in asked.items())
-    return tuple(late for late in found if late is not None)
-
-
-def _select_part(detections: Detections, obj: CalibrationObject, part: int) -> tuple[Detections, CalibrationObject]:
-    """Keep the labels of one of several objects: the rest is clutter."""
-    first = int(np.searchsorted(obj.part_of, part))
-    own = (detections.fiducial >= 0) & (obj.part_of[detections.fiducial] == part)
-    return replace(detections, fiducial=np.where(own, detections.fiducial - first, -1)), obj.parts[part]
 
 
 def _given_labels(labelled: Associations) -> Detections:

@@ -6,13 +6,15 @@ more certain than it is.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.association import Associations
+from imgcal.association import Associations, Sight
+from imgcal.detection import Frame
 from imgcal.errors import RefusedError
 from imgcal.messages import name_cameras, plural
 from imgcal.types import Detections
@@ -28,8 +30,13 @@ class Repeats:
     """Copies that were left out."""
 
     rows: int = 0  # blobs listed twice in one image
-    images: int = 0  # images with the same blobs as an earlier one of their camera
+    copies: tuple[tuple[int, str], ...] = ()  # images with the blobs of an earlier one: number of the snapshot, camera
     snapshots: tuple[tuple[str, str], ...] = ()  # snapshots of copies only: their names, and those of the originals
+
+    @property
+    def images(self) -> int:
+        """Number of copied images."""
+        return len(self.copies)
 
     @property
     def values(self) -> dict[str, Any]:
@@ -70,7 +77,7 @@ def drop_repeats(detections: Detections) -> tuple[Detections, Repeats]:
     ends = np.append(begins[1:], len(order))
     first: dict[tuple[int, bytes], int] = {}
     originals = dict[int, set[int]]()
-    images = 0
+    copies = list[tuple[int, str]]()
     for number in _find_equal(detections.uv[order], cameras, begins):
         part = order[begins[number] : ends[number]]
         if len(part) < LEAST_BLOBS:
@@ -79,12 +86,12 @@ def drop_repeats(detections: Detections) -> tuple[Detections, Repeats]:
         earlier = first.setdefault((camera, detections.uv[part].tobytes()), snapshot)
         if earlier != snapshot:
             kept[part] = False
-            images += 1
+            copies.append((snapshot, detections.camera_names[camera]))
             originals.setdefault(snapshot, set()).add(earlier)
     own = set(np.unique(detections.snapshot[kept]).tolist()) if originals else set()
     names = detections.snapshot_names
     whole = tuple((names[s], names[min(of)]) for s, of in sorted(originals.items()) if s not in own)
-    repeats = Repeats(rows, images, whole)
+    repeats = Repeats(rows, tuple(sorted(copies)), whole)
     return (detections if kept.all() else detections.select(kept)), repeats
 
 
@@ -158,6 +165,17 @@ def _find_equal(uv: NDArray[np.float64], group: NDArray[np.int64], begins: NDArr
     equal[order[1:]] |= next_equal
     equal[order[:-1]] |= next_equal
     return np.flatnonzero(equal)
+
+
+def hide_repeats(sight: Sight, repeats: Repeats) -> Sight:
+    """Take copies out of the frames that a detector looks at."""
+    hidden = frozenset(repeats.copies)
+
+    def frames(number: int) -> Mapping[str, Frame | None]:
+        shown = sight.frames(number)
+        return {camera: None if (number, camera) in hidden else frame for camera, frame in shown.items()}
+
+    return replace(sight, frames=frames) if hidden else sight
 
 
 def name_repeats(labelled: Associations, repeats: Repeats) -> Associations:

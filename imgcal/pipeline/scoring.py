@@ -21,8 +21,7 @@ from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.pipeline.board_turns import settle_turns
 from imgcal.pipeline.lights import FoundLights, find_lights
-from imgcal.pipeline.recalibration import as_one, as_unknown_marker
-from imgcal.pipeline.sources import Frames, find_blobs
+from imgcal.pipeline.sources import Frames, as_one, as_unknown_marker, find_blobs
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections
 

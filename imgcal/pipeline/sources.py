@@ -31,6 +31,17 @@ frames that are not in memory. Blobs decide if the others cannot."""
 ROWS = tuple(field.name for field in fields(Detections) if not field.name.endswith("_names"))
 
 
+def as_unknown_marker(obj: CalibrationObject, detections: Detections) -> CalibrationObject:
+    """Take an object of one marker for an unknown marker, unless labels say which blobs are it."""
+    is_one = obj.pose_rank == 3 and not obj.parts and not (detections.fiducial >= 0).any()
+    return replace(obj.about_centroid(obj.name), unknown_markers=True) if is_one else obj
+
+
+def as_one(obj: CalibrationObject | Sequence[CalibrationObject]) -> CalibrationObject:
+    """One object, or several combined."""
+    return obj if isinstance(obj, CalibrationObject) else CalibrationObject.of_several(obj)
+
+
 def find_blobs(
     source: Detections | Frames,
     rig: CameraRig,

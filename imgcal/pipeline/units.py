@@ -20,6 +20,8 @@ from imgcal.geometry import vector_from_rotation
 from imgcal.pipeline.lines_of_sight import choose_telling_snapshots, sight_angles
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
+UNSOLVABLE = (np.linalg.LinAlgError, torch.linalg.LinAlgError)
+"""Raised where equations have no solution."""
 LEAST_IMAGE, LARGEST_IMAGE = 3.0, 5.0
 """If an object's image is smaller (pixels) or larger (times the image width) than this, its unit is wrong."""
 LEAST_DISTANCE, LEAST_SIZE = 20.0, 2.0
@@ -132,7 +134,7 @@ def require_solvable() -> Iterator[None]:
     """
     try:
         yield
-    except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:
+    except UNSOLVABLE as error:
         raise RefusedError(
             "estimation: the equations cannot be solved: rig, object and blobs do not belong together, or their units "
             "are not millimetres, radians and pixels"

@@ -63,7 +63,7 @@ class Tally:
 class Metrics:
     """Serves the metrics by HTTP. A context manager: leaving it stops the server."""
 
-    def __init__(self, tally: Tally, intake: SourceReader, hook: Hook | None, address: tuple[str, int]) -> None:
+    def __init__(self, tally: Tally, intake: SourceReader, hook: Hook | None, address: Address) -> None:
         """Prepare to serve; the address should be 127.0.0.1 unless other machines are to read the metrics."""
         self._tally, self._intake, self._hook, self._address = tally, intake, hook, address
 
@@ -77,10 +77,10 @@ class Metrics:
 
         registry = CollectorRegistry()
         registry.register(self)
-        host, port = self._address
+        host, port = self._address.host, self._address.port
         try:
             self._server, self._thread = start_http_server(port, host, registry)
-            self._server.set_app(_guard(make_wsgi_app(registry), Gate(Address(host, port), "")))
+            self._server.set_app(_guard(make_wsgi_app(registry), Gate(self._address, "")))
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise InputError(f"--metrics: {host}:{port} cannot be used: {reason}") from error

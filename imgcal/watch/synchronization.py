@@ -39,9 +39,9 @@ COUNTS = ("received", "missing", "late", "duplicate", "out_of_order", "clock_off
 """Counters of each camera.
 
 `missing`: snapshots without it although it was due. `late`: it came after its snapshot was released. `duplicate`: a
-second exposure for the same snapshot. `clock_off`: its clock is off by more than `LEAP`. `out_of_tolerance`: its time stamps have
-differed from the others' for long. These four are left out. `out_of_order`: earlier than a previous one; used if its
-snapshot has not been released.
+second exposure for the same snapshot. `clock_off`: its clock is off by more than `LEAP`. `out_of_tolerance`: its time
+stamps have differed from the others' for long. These four are left out. `out_of_order`: earlier than a previous one;
+used if its snapshot has not been released.
 """
 
 

@@ -262,13 +262,17 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
     others = result["others"]
     names = list(next(iter(others.values())))
     rows = [[name, *(cell(said[name]["1"]) for said in others.values())] for name in names]
+    turns = [f"{name}, {d} {'degree' if d == 1 else 'degrees'} off" for name in beyond for d in beyond[name]]
     return {
         "infrared levels": by_level("1"),
         "infrared turned": f"{result['turned_deg']:g} degrees:\n\n" + by_level(f"{result['turned_deg']:g}"),
         "infrared accuracy": accuracy(),
         "infrared others": markdown(["right % / wrong %", *others], rows),
         "infrared harder": markdown(
-            ["right % / wrong %", *(f"{name}, {d} {'degree' if d == 1 else 'degrees'} off" for name in beyond for d in beyond[name])],
+            [
+                "right % / wrong %",
+                *turns,
+            ],
             [[level, *(cell(row) for said in by.values() for row in said.values())] for level, by in harder.items()],
         ),
         "infrared lost": markdown(

@@ -13,8 +13,7 @@ import pytest
 import torch
 
 from imgcal.cli.main import main
-from imgcal.cli.watch import _object_difference, metrics_address
-from imgcal.errors import InputError
+from imgcal.cli.watch import _object_difference
 from imgcal.geometry import RigidTransform
 from imgcal.io import load_object, read_rig, save_detections, save_object, save_rig, write_frame
 from imgcal.online import RigKeeper
@@ -180,16 +179,18 @@ def test_a_stick_of_another_length_does_not_go_on_with_what_is_known(tmp_path):
         (["absent.csv", "--rate", "0"], 2, "--rate: found 0"),
         (["-", "--tolerance", "-1"], 2, "tolerance: found -1"),
         (["-", "--hook", "no-such-program"], 2, "--hook: found 'no-such-program'"),
-        (["-", "--metrics", "nowhere"], 2, "found 'nowhere', expected [HOST:]PORT"),
+        (["-", "--metrics", "nowhere", "--poses", "poses.csv"], 2, "--metrics: found 'nowhere', expected [HOST:]PORT"),
+        (["-", "--serve", "1:2:3", "--poses", "poses.csv"], 2, "--serve: found '1:2:3', expected [HOST:]PORT"),
+        (["absent", "--until-idle", "5"], 2, "absent: "),
         (["bag.mcap", "--topic", "cam01"], 2, "--topic: found 'cam01', expected CAMERA=TOPIC"),
         (["bag.mcap", "--topic", "a=/x", "a=/y"], 2, "--topic: found camera a twice, expected one topic per camera"),
         (["empty", "--rate", "0"], 2, "--rate: needs a table of blobs, found a folder of frames (empty)"),
         (["empty", "--topic", "a=b"], 2, "--topic: needs a recording, found a folder of frames (empty)"),
         (["-", "--until-idle", "3"], 2, "--until-idle: needs a folder of frames, found standard input (-)"),
         (
-            ["absent.csv", "--remove"],
+            ["here.csv", "--remove"],
             2,
-            "--remove: needs a folder of frames, found a table of blobs (absent.csv)",
+            "--remove: needs a folder of frames, found a table of blobs (here.csv)",
         ),
         (
             ["tcp://a:1", "--videos-differ"],
@@ -204,12 +205,14 @@ def test_mistakes(arguments, code, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     (tmp_path / "typing" / "frames" / "cam1").mkdir(parents=True)
+    (tmp_path / "here.csv").write_text("")
     (tmp_path / "nothing").write_text("")
     with open(tmp_path / "nothing") as file:
         monkeypatch.setattr(sys, "stdin", file)
         assert watch(arguments[0], "out", *arguments[1:]) == code
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+    assert not (tmp_path / "poses.csv").exists()
 
 
 def test_a_folder_that_has_been_read_to_its_end_is_said_to_be_known(stream, tmp_path, capsys):
@@ -377,14 +380,6 @@ def test_fresh_leaves_nothing_to_go_on_from_even_before_it_has_learnt(blobs, tmp
     assert "restart: started anew from the factory calibration" in capsys.readouterr().out
     assert watch(tmp_path / "blobs.csv", out) == 0
     assert "4 snapshots" in capsys.readouterr().out  # all of them, once more
-
-
-def test_addresses():
-    assert metrics_address("9100") == ("127.0.0.1", 9100) and metrics_address("0.0.0.0:9100") == ("0.0.0.0", 9100)
-    assert metrics_address("[::1]:80") == ("::1", 80)
-    for text in ("", "a:b", "1:70000", "-5", ":"):
-        with pytest.raises(InputError, match=r"expected \[HOST:\]PORT"):
-            metrics_address(text)
 
 
 def test_an_address_of_qtm_is_no_address_of_zeromq(tmp_path, capsys):

@@ -23,6 +23,7 @@ from imgcal.estimation import (
     rig_at,
 )
 from imgcal.estimation.covariance import remaining_variance
+from imgcal.estimation.robust_losses import LOSSES, LossName
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.synthesis import PhysicalDrift
 
@@ -272,10 +273,12 @@ def test_inflation_of_one_camera_leaves_the_others_their_precision(simulate) -> 
     assert (wider[1:, 6:8] < 1.2 * plain[1:, 6:8]).all()
 
 
-def test_a_label_that_the_loss_holds_off_counts_as_little_in_the_inflated_information(simulate) -> None:
+@pytest.mark.parametrize("loss", LOSSES)
+def test_a_label_that_the_loss_holds_off_counts_as_little_in_the_inflated_information(simulate, loss: LossName) -> None:
     """A factor of one on every camera is no factor, outliers or not."""
     case = simulate(snapshots=20, cameras=4)
     case.observations.uv[::3, 1, 2] += 2.0
-    found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std)
+    options = EstimationOptions(loss)
+    found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std, options=options)
     ones = replace(found, inflation=torch.ones(4, dtype=torch.float64))
     torch.testing.assert_close(joint_information(ones), joint_information(found), rtol=1e-6, atol=1e-6)

@@ -30,6 +30,13 @@ def test_what_is_no_address_is_one_line(text):
         parse_address(text)
 
 
+def test_where_no_port_is_usual_one_must_be_given():
+    assert parse_address("9100", "--metrics", None) == Address("127.0.0.1", 9100)
+    for text in ("", "a:b", "1:70000", "-5", ":", "127.0.0.1"):
+        with pytest.raises(InputError, match=r"^--metrics: found .* expected \[HOST:\]PORT"):
+            parse_address(text, "--metrics", None)
+
+
 def test_only_loopback_is_local():
     assert all(is_loopback(host) for host in ("127.0.0.1", "127.9.9.9", "::1", "localhost"))
     assert not any(is_loopback(host) for host in ("0.0.0.0", "::", "10.0.0.1", "localhost.example.org", ""))

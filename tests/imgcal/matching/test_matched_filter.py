@@ -13,6 +13,7 @@ from imgcal.matching import MatchedFilter
 from imgcal.matching.correlation import Scores
 from imgcal.matching.matched_filter import distinct
 from imgcal.matching.poses import Ranked, Scene, turn_object
+from imgcal.pipeline import recalibration
 from renderers import SensorModel
 
 from .scenes import DIM, dim_frames
@@ -62,6 +63,32 @@ def test_calibrates_where_blobs_are_refused_and_says_who_did_it():
 def test_blobs_come_first_where_they_decide():
     rig, obj, _, (frames,) = dim_frames(model=replace(DIM, sensor=SensorModel()))
     assert dict(calibrate(frames, rig, obj, detector="auto").detectors) == {"classical": 1}
+
+
+@pytest.mark.parametrize("detector", ["auto", "matched"])
+def test_copies_of_frames_are_not_looked_at(detector):
+    rig, obj, _, shots = dim_frames(snapshots=3, seed=2, model=replace(DIM, sensor=SensorModel()))
+    stacks = {name: [shot[name] for shot in (*shots, shots[1])] for name in rig.camera_names}
+    result = calibrate(stacks, rig, obj, detector=detector)
+    assert result.labelled.used == [0, 1, 2] and result.repeats.images == rig.num_cameras
+    assert result.labelled.snapshots[3].reason == "a copy of snapshot 1"
+
+
+def test_copies_are_named_where_the_calibration_by_blobs_is_refused(monkeypatch):
+    rig, obj, _, shots = dim_frames(snapshots=3, seed=2, model=replace(DIM, sensor=SensorModel()))
+    stacks = {name: [shot[name] for shot in (*shots, shots[1])] for name in rig.camera_names}
+    fit, asked = recalibration.fit_with_timing, []
+
+    def refuse_first(*given):
+        asked.append(given)
+        if len(asked) == 1:
+            raise RefusedError("estimation: refused for a test")
+        return fit(*given)
+
+    monkeypatch.setattr(recalibration, "fit_with_timing", refuse_first)
+    result = calibrate(stacks, rig, obj, detector="auto")
+    assert result.labelled.used == [0, 1, 2] and result.repeats.images == rig.num_cameras
+    assert result.labelled.snapshots[3].reason == "a copy of snapshot 1"
 
 
 def test_a_running_rig_looks_too():

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import imgcal
+from imgcal.estimation import joint_information
 from imgcal.pipeline import calibrate
 from imgcal.synthesis import PhysicalDrift, simulate_board, true_detections
 from imgcal.types import CalibrationObject
@@ -41,6 +42,22 @@ def test_the_bend_is_part_of_the_uncertainty_of_the_rig():
     without = replace(free.estimate, modes=None).covariance().diagonal()
     wider = free.estimate.covariance().diagonal()[without > 0] / without[without > 0]
     assert float(wider.min()) > 0.999 and float(wider.max()) > 1.02
+
+
+def test_images_that_scatter_leave_the_prior_of_the_bend_alone():
+    rig, generator = imgcal.load_rig("T4"), torch.Generator().manual_seed(6)
+    obj = imgcal.load_object("checkerboard")
+    found = calibrate(labelled(simulate_board(rig, obj, 10, generator, None), 0.05), rig, obj)
+    modes = replace(found.estimate.modes, covariance=np.eye(2))  # the images do not show the bend
+    scattered = replace(found.estimate, modes=modes, inflation=torch.full((4,), 3.0, dtype=torch.float64))
+    std = found.obj.board.warp_std
+    bend = replace(found, estimate=scattered).bend
+    assert bend.x_sigma == pytest.approx(std) and bend.y_sigma == pytest.approx(std)
+    posterior, rigid = (torch.linalg.inv(joint_information(e)) for e in (scattered, replace(scattered, modes=None)))
+    added = (posterior - rigid).diagonal()[: 4 * 15] / scattered.problem.prior_std.flatten().square()
+    expected = scattered.modes.follow.flatten(1).square().sum(0)
+    lenses = torch.arange(60).view(4, 15)[:, 6:].flatten()
+    torch.testing.assert_close(added[lenses], expected[lenses], rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("late", [0.0, 0.05])

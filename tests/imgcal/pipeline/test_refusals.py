@@ -1,14 +1,18 @@
 """Refusals say in plain words what was found and what to do."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+import imgcal
 from imgcal.association import PipelineOptions
 from imgcal.errors import RefusedError
+from imgcal.pipeline import recalibration
 from imgcal.pipeline.refusals import require_fit, require_most_labels, require_near_prior
+from imgcal.synthesis import simulate_truth, true_detections
 from imgcal.types import RigPrior
 
 OPTIONS = PipelineOptions()
@@ -65,3 +69,16 @@ def test_a_camera_or_a_fiducial_most_of_whose_labels_do_not_fit_is_named(o10):
     kept[:3, :, 5] = False
     with pytest.raises(RefusedError, match=r"fiducial 5 .* 30 of 40 labels"):
         require_most_labels(labels, kept, o10)
+
+
+def test_equations_without_a_solution_in_an_explanation_leave_the_refusal_as_it_is(monkeypatch) -> None:
+    def unsolvable(*_: object) -> None:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(recalibration, "require_units", unsolvable)
+    factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    truth = simulate_truth(factory, obj, 4, torch.Generator().manual_seed(1), None)
+    blobs = true_detections(truth)
+    noisy = replace(blobs, uv=blobs.uv + 30 * np.random.default_rng(0).standard_normal(blobs.uv.shape))
+    with pytest.raises(RefusedError, match=r"^estimation"):
+        imgcal.calibrate(noisy, factory, obj)

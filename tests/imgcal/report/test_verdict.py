@@ -26,7 +26,8 @@ def test_the_bumped_camera_is_named_even_if_it_is_the_first(content: ReportConte
     step[0, 1] = 0.01
     rig = content.factory.retract(step)
     bumped = replace(content, recalibrated=rig, gauge=Gauge.from_majority(rig, content.factory))
-    assert "1 of 10 cameras moved since the factory calibration, most of all cam01 (0.57°" in " ".join(judge(bumped).found)
+    told = " ".join(judge(bumped).found)
+    assert "1 of 10 cameras moved since the factory calibration, most of all cam01 (0.57°" in told
     relative = replace(bumped, gauge=Gauge.from_camera(2, 10))
     assert "1 of 9 cameras moved relative to cam03, most of all cam01 (0.57°" in " ".join(judge(relative).found)
 

@@ -4,6 +4,7 @@ import urllib.request
 import pytest
 
 from imgcal.errors import InputError
+from imgcal.live_page import Address
 from imgcal.watch import CameraBlobs, Exposure, Hook, Metrics, SourceReader, Tally, Unreadable, Watch
 from imgcal.watch.metrics import BUCKETS
 from tests.imgcal.watch.states import RIG, KeeperOfStates, event
@@ -35,7 +36,7 @@ def test_what_is_counted_is_served(tmp_path):
     keeper, hook = KeeperOfStates(), Hook("true")
     keeper.events = {1: [event(1), event(1, "camera_lost")]}
     intake = SourceReader(Given(), RIG)
-    with Watch(keeper, tmp_path, hook) as loop, Metrics(loop.tally, intake, hook, ("127.0.0.1", 0)) as metrics:
+    with Watch(keeper, tmp_path, hook) as loop, Metrics(loop.tally, intake, hook, Address(port=0)) as metrics:
         assert scraped(metrics)["imgcal_snapshots_total",] == 0
         with intake:
             while (snapshot := intake.next(1.0)) is not None:
@@ -54,17 +55,17 @@ def test_what_is_counted_is_served(tmp_path):
 
 def test_only_this_machine_may_read_it_and_the_address_may_be_taken(tmp_path):
     intake = SourceReader(Given(), RIG)
-    with Metrics(Tally(), intake, None, ("127.0.0.1", 0)) as metrics:
+    with Metrics(Tally(), intake, None, Address(port=0)) as metrics:
         port = metrics.port
         with pytest.raises(InputError, match=rf"--metrics: 127\.0\.0\.1:{port} cannot"):
-            Metrics(Tally(), intake, None, ("127.0.0.1", port)).__enter__()
+            Metrics(Tally(), intake, None, Address(port=port)).__enter__()
     with pytest.raises(urllib.error.URLError):
         urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=2)
 
 
 def test_who_asks_for_another_name_is_not_served():
     """A page of another site may let its name point to this machine."""
-    with Metrics(Tally(), SourceReader(Given(), RIG), None, ("127.0.0.1", 0)) as metrics:
+    with Metrics(Tally(), SourceReader(Given(), RIG), None, Address(port=0)) as metrics:
         address = f"http://127.0.0.1:{metrics.port}/metrics"
         for host in ("evil.example", "evil.example:9100", "127.0.0.1.evil.example", ""):
             with pytest.raises(urllib.error.HTTPError, match="421") as caught:
