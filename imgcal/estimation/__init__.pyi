@@ -5,10 +5,8 @@ from .correlation import autocorrelation, correlation_time
 from .covariance import (
     camera_covariance,
     camera_std,
-    flat_std,
     joint_information,
     object_covariance,
-    pose_covariance,
     relative_covariance,
     relative_difference,
     relative_jacobian,
@@ -50,6 +48,7 @@ from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ScaleEvidence, Shap
 from .pose_initialization import initial_pose
 from .pose_support import UNPOSED, UndeterminedPosesError, has_poses, require_poses
 from .reference_cameras import Gauge
+from .remaining_variance import flat_std
 from .rig_error import displace, error_between, error_by_step, step_by_error
 from .rig_from_points import PointStart, cold_start_from_points, move_to_pair_frame, prior_of_pair
 from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens, robust_std, single_camera_poses
@@ -132,7 +131,6 @@ __all__ = [
     "pixel_jacobian",
     "points_at",
     "pose_at",
-    "pose_covariance",
     "predicted_error",
     "prepend_lenses",
     "prior_of_pair",

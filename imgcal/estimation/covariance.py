@@ -1,39 +1,29 @@
-"""Posterior covariance of an estimate: of each camera, of the cameras relative to one another, of the poses.
+"""Posterior covariance of an estimate: of each camera, of the cameras relative to one another, of the object.
 
 All start from the Laplace approximation: the inverse of the Gauss-Newton information at the minimum, prior included.
 Those of the cameras and of the object add a second-order term for the curvature of the posterior: `curvature.py`.
 """
 
-# Compiled functions take their types from their arguments.
-# ruff: noqa: ANN001, ANN202
-# mypy: allow-untyped-defs, no-check-untyped-defs
-
 from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import RefusedError
+from imgcal.estimation import schur
 from imgcal.estimation.curvature import curvature_covariance, whitened_curvature
-from imgcal.estimation.levenberg_marquardt import Solution, factorize
-from imgcal.estimation.levenberg_marquardt_cpu import change_precision
+from imgcal.estimation.levenberg_marquardt import Factorization, Solution, factorize
 from imgcal.estimation.linearization import POSE_PARAMETERS, NormalEquations, points_at
 from imgcal.estimation.map_estimate import Estimate, equations_at
 from imgcal.estimation.robust_losses import NamedLoss
-from imgcal.geometry import RigidTransform, cross_matrix, kernels, left_jacobian
+from imgcal.geometry import RigidTransform, cross_matrix, left_jacobian
 from imgcal.types import CameraRig
-from renderers.compiling import njit
-from renderers.interpreting import without_machine_code
 
 UNDETERMINED = "covariance: the observations do not determine the object's pose in every snapshot"
 LEAST_STD = 1e-9
 """Floor of prior standard deviations (rad, mm, pixels, 1) in divisions, for fixed parameters."""
-FEW_POSES = 10
-"""Up to this many, `remaining_variance` eliminates the cameras (exact object only) instead of the poses."""
 
 
 def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
@@ -85,9 +75,7 @@ def _inflated_covariance(solution: Solution, inflation: Tensor) -> Tensor:
     factorization = solution.factorization
     if factorization.cameras_first:
         factorization = factorize(solution.equations, cameras_first=False)
-    reduced = factorization.reduced
-    if bool(reduced.failed.any()):
-        raise RefusedError(UNDETERMINED)
+    reduced = _determined(factorization)
     size = solution.equations.camera_gradient[0].numel()
     with_object = torch.cholesky_inverse(reduced.kept)[:, :size]  # (B, K C, K C + M)
     by_prior, factor = with_object @ with_object.mT, inflation.repeat_interleave(size // len(inflation))
@@ -102,9 +90,7 @@ def whitened_covariance(solution: Solution) -> Tensor:
     """
     equations = solution.equations
     factorization = solution.factorization
-    reduced, cameras = factorization.reduced, equations.camera.shape[1]
-    if bool(reduced.failed.any()):
-        raise RefusedError(UNDETERMINED)
+    reduced, cameras = _determined(factorization), equations.camera.shape[1]
     if not factorization.cameras_first:
         size = equations.camera_gradient[0].numel()
         return torch.cholesky_inverse(reduced.kept)[:, :size, :size]
@@ -115,6 +101,17 @@ def whitened_covariance(solution: Solution) -> Tensor:
     blocks = covariance.unflatten(1, (cameras, -1)).unflatten(-1, (cameras, -1))
     blocks.diagonal(dim1=1, dim2=3).add_(inverse.permute(0, 2, 3, 1))
     return covariance
+
+
+def _determined(factorization: Factorization) -> schur.Reduced:
+    """Return the reduced equations.
+
+    Raises:
+        RefusedError: they are singular.
+    """
+    if bool(factorization.reduced.failed.any()):
+        raise RefusedError(UNDETERMINED)
+    return factorization.reduced
 
 
 def joint_information(estimate: Estimate) -> Tensor:
@@ -134,9 +131,7 @@ def joint_information(estimate: Estimate) -> Tensor:
     problem, equations = estimate.problem, estimate.solution.equations
     if estimate.inflation is not None:
         equations = _weakened_equations(estimate, estimate.inflation)
-    reduced = factorize(equations, cameras_first=False).reduced
-    if bool(reduced.failed.any()):
-        raise RefusedError(UNDETERMINED)
+    reduced = _determined(factorize(equations, cameras_first=False))
     information = (reduced.kept @ reduced.kept.mT)[0]
     if estimate.modes is not None:
         # Woodbury: the uncertainty of the modes reduces the information about the cameras that they affect.
@@ -189,180 +184,6 @@ def camera_std(estimate: Estimate) -> Tensor:
     """
     variance = camera_covariance(estimate).diagonal(dim1=-2, dim2=-1)
     return variance.clamp_min(0).sqrt().unflatten(-1, (estimate.rig.num_cameras, -1))
-
-
-def flat_std(estimate: Estimate) -> Tensor:
-    """Standard deviation of every parameter by the noise alone, a hundred times faster than `camera_std`: (*B, C, K).
-
-    Without inflation, the uncertainty of the object's modes and the second order.
-    """
-    left = torch.from_numpy(remaining_variance(estimate.solution)).to(estimate.problem.prior_std)
-    std = left.clamp_min(0).sqrt() * estimate.problem.prior_std
-    return std.reshape(*estimate.chi2.shape, *std.shape[1:])
-
-
-def remaining_variance(solution: Solution) -> NDArray[np.float64]:
-    """Share of each factory value's prior variance that remains: (B, C, K); 1 = the observations add nothing.
-
-    Equals `flat_std` over the prior's, squared.
-
-    Raises:
-        RefusedError: the information is singular.
-    """
-    equations = solution.equations
-    snapshots = equations.coupling.shape[1]
-    few = snapshots <= FEW_POSES and equations.object is None
-    if equations.cost.device.type != "cpu":
-        variance = _in_tensors(solution)
-    elif missing := without_machine_code(_diagonal if few else _diagonal_without_poses):
-        exact = change_precision(solution, torch.float64)  # the compiled functions convert, too
-        variance = missing.call_twin(_in_tensors, exact)
-    else:
-        variance = _by_poses(equations) if few else _by_cameras(equations)
-    if not np.isfinite(variance).all():
-        raise RefusedError(UNDETERMINED)
-    return variance
-
-
-def _in_tensors(solution: Solution) -> NDArray[np.float64]:
-    """Diagonals (B, C, K) on any device."""
-    diagonal = whitened_covariance(solution).diagonal(dim1=-2, dim2=-1)
-    variance: NDArray[np.float64] = diagonal.unflatten(-1, (solution.state.offset.shape[1], -1)).cpu().numpy()
-    return variance
-
-
-def _by_poses(equations: NormalEquations) -> NDArray[np.float64]:
-    """Diagonals (B, C, K) from the poses' dense information."""
-    camera, coupling, pose = _doubles(equations.camera, equations.coupling, equations.pose)
-    variance = np.empty(camera.shape[:3])
-    for b in range(len(variance)):
-        wide = coupling[b].transpose(1, 2, 0, 3).reshape(*camera.shape[1:3], -1)
-        _diagonal(camera[b].copy(), wide.copy(), pose[b], variance[b])
-    return variance
-
-
-def _by_cameras(equations: NormalEquations) -> NDArray[np.float64]:
-    """Diagonals (B, C, K) from the dense information of the cameras and, after them, of the object."""
-    camera, coupling, pose = _doubles(equations.camera, equations.coupling, equations.pose)
-    batch, cameras = camera.shape[:2]
-    coupling = coupling.transpose(0, 1, 4, 2, 3).reshape(*pose.shape[:3], -1)  # (B, S, 6, K C)
-    wide = coupling.shape[-1]
-    kept = np.zeros((batch, wide, wide))
-    blocks = kept.reshape(*camera.shape[:3], *camera.shape[1:3])
-    blocks[:, range(cameras), :, range(cameras)] = camera.swapaxes(0, 1)
-    if equations.object is not None:
-        own = equations.object
-        across, with_pose, square = _doubles(own.camera.flatten(1, 2), own.pose, own.own)
-        kept = np.concatenate(
-            (np.concatenate((kept, across), 2), np.concatenate((across.swapaxes(1, 2), square), 2)), 1
-        )
-        coupling = np.concatenate((coupling, with_pose), 3)
-    variance = np.empty(camera.shape[:3])
-    for b in range(batch):
-        _diagonal_without_poses(kept[b], np.ascontiguousarray(coupling[b]), pose[b], variance[b].reshape(-1))
-    return variance
-
-
-def _doubles(*tensors: Tensor) -> tuple[NDArray[np.float64], ...]:
-    return tuple(tensor.detach().double().numpy() for tensor in tensors)
-
-
-@njit(cache=True, fastmath=kernels.FAST)
-def _diagonal_without_poses(kept, coupling, poses, result):
-    """First diagonal entries (D,) of the inverse of `kept` (K, K) after eliminating poses (S, 6, 6) with coupling
-    (S, 6, K). Overwrites `kept`; nan where a factorization fails.
-    """
-    count, size, wide = coupling.shape
-    lower, half, row = np.empty((size, size)), np.empty((size, wide)), np.empty(wide)
-    determined = True
-    for s in range(count):
-        for i in range(size):
-            for j in range(size):
-                lower[i, j] = poses[s, i, j]
-        determined = kernels.cholesky(lower) and determined
-        for i in range(size):
-            inverse = 1 / lower[i, i]
-            for j in range(wide):
-                half[i, j] = coupling[s, i, j]
-            for k in range(i):
-                for j in range(wide):
-                    half[i, j] -= lower[i, k] * half[k, j]
-            for j in range(wide):
-                half[i, j] *= inverse
-        kernels.subtract_gram(kept, half)
-    determined = kernels.cholesky(kept) and determined
-    for j in range(len(result)):
-        row[j] = 1 / kept[j, j]
-        total = row[j] ** 2
-        for i in range(j + 1, wide):
-            value = 0.0
-            for k in range(j, i):
-                value -= kept[i, k] * row[k]
-            row[i] = value / kept[i, i]
-            total += row[i] ** 2
-        result[j] = total if determined else np.nan
-
-
-@njit(cache=True)
-def _diagonal(blocks, coupling, poses, result):
-    """Diagonal (C, K) of the inverse of an arrow matrix: blocks (C, K, K), coupling (C, K, 6 S), poses (S, 6, 6).
-
-    Overwrites the first two arrays; nan where a factorization fails.
-    """
-    wide, size = coupling.shape[2], blocks.shape[1]
-    kept, row = np.zeros((wide, wide)), np.empty(wide)
-    for s in range(len(poses)):
-        for i in range(6):
-            for j in range(6):
-                kept[6 * s + i, 6 * s + j] = poses[s, i, j]
-    for c in range(len(blocks)):
-        lower, half = blocks[c], coupling[c]
-        _invert_factor(lower)
-        # half = lower @ coupling, then lower.T @ half = blocks^-1 @ coupling, both in place.
-        for i in range(size - 1, -1, -1):
-            for j in range(wide):
-                value = 0.0
-                for k in range(i + 1):
-                    value += lower[i, k] * half[k, j]
-                half[i, j] = value
-        for i in range(wide):
-            for j in range(i + 1):
-                for k in range(size):
-                    kept[i, j] -= half[k, i] * half[k, j]
-        for i in range(size):
-            result[c, i] = 0.0
-            for k in range(i, size):
-                result[c, i] += lower[k, i] ** 2
-            for j in range(wide):
-                value = 0.0
-                for k in range(i, size):
-                    value += lower[k, i] * half[k, j]
-                half[i, j] = value
-    _invert_factor(kept)
-    for c in range(len(blocks)):
-        for i in range(size):
-            for j in range(wide):
-                row[j] = coupling[c, i, j]
-            for j in range(wide):
-                value = 0.0
-                for k in range(j + 1):
-                    value += kept[j, k] * row[k]
-                result[c, i] += value * value
-
-
-@njit(cache=True)
-def _invert_factor(matrix):
-    """Replace the lower triangle of a symmetric matrix by the inverse of its Cholesky factor; nan where that fails."""
-    if not kernels.cholesky(matrix):
-        for j in range(len(matrix)):
-            matrix[j, j] = np.nan
-    for j in range(len(matrix)):
-        matrix[j, j] = 1 / matrix[j, j]
-        for i in range(j + 1, len(matrix)):
-            value = 0.0
-            for k in range(j, i):
-                value -= matrix[i, k] * matrix[k, j]
-            matrix[i, j] = value / matrix[i, i]
 
 
 def relative_covariance(estimate: Estimate, reference: int = 0) -> Tensor:
@@ -456,36 +277,12 @@ def scale_response(estimate: Estimate) -> Tensor:
     unit[:, -1] = 1.0
     free = replace(problem, points=points, object_prior_std=unit)
     equations = equations_at(free, replace(state, object_offset=torch.zeros_like(unit)), estimate.loss)
-    factorization = factorize(equations, cameras_first=False)
-    if bool(factorization.reduced.failed.any()):
-        raise RefusedError(UNDETERMINED)
-    lower = factorization.reduced.kept[0]
+    lower = _determined(factorize(equations, cameras_first=False)).kept[0]
     # A unit step of the last unknown changes the others by -A^-1 a; with the Cholesky factor, -L^-T l.
     follow = -torch.linalg.solve_triangular(lower[:-1, :-1].mT, lower[-1, :-1, None], upper=True)[:, 0]
     cameras = estimate.rig.num_cameras
     whitened = follow[: problem.prior_std[0].numel()].unflatten(0, (cameras, -1))
     return torch.einsum("cij,cj->ci", _unwhitening(estimate)[0], whitened).flatten()
-
-
-def pose_covariance(estimate: Estimate) -> Tensor:
-    """Covariance of each snapshot's pose: (*B, S, 6, 6), rotation (rad, left, about the centroid) and centroid (mm).
-
-    Raises:
-        RefusedError: the observations do not determine the pose in every snapshot.
-    """
-    equations = estimate.solution.equations
-    snapshots = equations.pose.shape[1]
-    reduced = factorize(equations, cameras_first=True).reduced
-    if bool(reduced.failed.any()):
-        raise RefusedError(UNDETERMINED)
-    size = POSE_PARAMETERS * snapshots
-    full = torch.cholesky_inverse(reduced.kept)[:, :size, :size]
-    blocks = full.unflatten(1, (snapshots, POSE_PARAMETERS)).unflatten(-1, (snapshots, POSE_PARAMETERS))
-    own = blocks.diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
-    unit = estimate.solution.state.centre.norm(dim=-1).clamp_min(1.0)
-    scale = torch.ones_like(own[..., 0])
-    scale[..., 3:] = unit[..., None]
-    return (own * scale[..., None] * scale[..., None, :]).reshape(*estimate.chi2.shape, snapshots, 6, 6)
 
 
 def object_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
@@ -506,9 +303,7 @@ def object_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
     batch = estimate.chi2.shape
     if equations.object is None or problem.object_prior_std is None:
         return problem.points.new_zeros(*batch, 3 * fiducials, 3 * fiducials)
-    reduced = estimate.solution.factorization.reduced
-    if bool(reduced.failed.any()):
-        raise RefusedError(UNDETERMINED)
+    reduced = _determined(estimate.solution.factorization)
     size = 3 * fiducials + 1
     whitened = torch.cholesky_inverse(reduced.kept)[:, -size:, -size:]
     prior_std = problem.object_prior_std

@@ -13,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 
 from imgcal.errors import RefusedError
-from imgcal.estimation.covariance import remaining_variance
 from imgcal.estimation.levenberg_marquardt import Solution
 from imgcal.estimation.linearization import Problem, State, points_at
 from imgcal.estimation.map_estimate import EstimationOptions, descend, make_loss, minimize
@@ -25,6 +24,7 @@ from imgcal.estimation.object_shape import (
     pull_scatter,
 )
 from imgcal.estimation.pose_support import require_poses
+from imgcal.estimation.remaining_variance import remaining_variance
 from imgcal.estimation.shape_modes import ModeEvidence, bend_object, mode_evidence
 from imgcal.types import PARAMETER_KINDS
 

@@ -89,7 +89,7 @@ class Calibration:
     factory: CameraRig
     obj: CalibrationObject  # as given
     shape: tuple[FiducialOffset, ...] = ()  # estimated offset of each fiducial; empty = the object was taken as exact
-    scale_sigma: float | None = None  # relative: a scale error of the object four times as large would be noticed
+    scale_sigma: float | None = None  # of the object's scale, relative, by the factory positions; None = unknown
     bent_sigma: float | None = None  # significance of a deviation from the estimated object; None = not tested
     block_length: int = 0  # snapshots per block whose scatter scales the covariance; 0 = scaled by the noise
     initialization: Initialization | None = None  # a network's first guess, if one was used

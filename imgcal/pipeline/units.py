@@ -228,7 +228,7 @@ def _describe_smaller(ratio: float, least: float) -> str:
 
 
 def _distance(rig: CameraRig) -> float | None:
-    """Distance of the cameras from the object, in the unit of their positions; None = unknown."""
+    """Usual distance of the object, in the unit of the positions: the rig's own, or where the optical axes meet."""
     if rig.working_distance is not None:
         return max(float(rig.working_distance), 1e-9)
     if rig.num_cameras < 2:

@@ -10,12 +10,11 @@ import torch
 from imgcal.estimation import (
     NormalEquations,
     Solution,
-    covariance,
     levenberg_marquardt,
     levenberg_marquardt_cpu,
     linearize,
 )
-from imgcal.estimation.covariance import remaining_variance
+from imgcal.estimation.remaining_variance import _diagonal, _diagonal_without_poses, remaining_variance
 from imgcal.estimation.robust_losses import LOSSES
 from imgcal.geometry import project_arrays
 
@@ -122,8 +121,8 @@ def test_tensors_stand_in_for_missing_machine_code(simulate, monkeypatch) -> Non
         levenberg_marquardt_cpu._minimize_rig,
         levenberg_marquardt_cpu.linearize_rig,
         levenberg_marquardt_cpu.turn_all,
-        covariance._diagonal,
-        covariance._diagonal_without_poses,
+        _diagonal,
+        _diagonal_without_poses,
         project_arrays,
     )
     for function in functions:
