@@ -15,14 +15,17 @@ from torch import Tensor
 from imgcal.estimation.covariance import camera_covariance
 from imgcal.estimation.curvature import curvature_covariance
 from imgcal.estimation.map_estimate import Estimate
-from imgcal.estimation.rig_error import error_between, step_by_error
-from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.estimation.rig_error import step_by_error
+from imgcal.geometry import RigidTransform, rotate, rotation_from_vector, vector_from_rotation
 from imgcal.types import CameraRig
 
 EXTRINSICS = 6
 VOTE_SCALE = (0.01,) * 3 + (10.0,) * 3
 """Radians and millimetres with equal weight when cameras vote: they move an image equally at about arm's length."""
-ROUNDS = 30
+ROUNDS = 15
+"""Most rounds of each of the two kinds of votes."""
+SETTLED = 1e-4
+"""Largest change of a camera's weight (all are one together) in the last round of a kind."""
 ALIGNMENTS = 4
 """Alignment rounds; each squares the remaining error."""
 LEAST_APART = 1e-6
@@ -49,29 +52,34 @@ class Gauge:
             rig: a calibration, without batch axes.
             factory: the calibration to compare with.
         """
+        squares, positions = _error_squares(factory), factory.positions
         weights = torch.ones(rig.num_cameras, dtype=torch.float64)
-        there = cls(weights).align(rig, factory)
-        for round_ in range(ROUNDS):
-            if round_:  # one step is enough from the previous alignment
-                there = cls(weights)._align_once(there, factory)
-            apart = _scale(there.local(factory)).norm(dim=-1).clamp_min(LEAST_APART)
-            # First the geometric median, which is robust up to half of the cameras; then Cauchy weights about it.
-            weights = 1 / apart if round_ < ROUNDS // 2 else 1 / (1 + (apart / apart.median()).square())
-            weights = weights / weights.sum()
+        moved = cls(weights)._align(_motions(rig, factory), squares)
+        # First the geometric median, which is robust up to half of the cameras; then Cauchy weights about it.
+        for vote in (lambda apart: 1 / apart, lambda apart: 1 / (1 + (apart / apart.median()).square())):
+            for _ in range(ROUNDS):
+                errors, before = _errors(moved), weights
+                shifts = errors[:, 3:] + rotate(moved.rotation, positions) - positions
+                apart = _scale(torch.cat((errors[:, :3], shifts), dim=-1)).norm(dim=-1).clamp_min(LEAST_APART)
+                weights = vote(apart)
+                weights = weights / weights.sum()
+                # One step is enough from the previous alignment.
+                moved = _take_out(moved, errors, cls(weights)._averaging(squares))
+                if float((weights - before).abs().max()) < SETTLED:
+                    break
         return cls(weights)
 
     def align(self, rig: CameraRig, factory: CameraRig) -> CameraRig:
         """Align a whole rig (*B) with another one, which may have fewer batch axes."""
-        for _ in range(ALIGNMENTS):
-            rig = self._align_once(rig, factory)
-        return rig
+        moved = self._align(_motions(rig, factory), _error_squares(factory))
+        return replace(rig, cam_from_rig=factory.cam_from_rig @ moved.inverse())
 
-    def _align_once(self, rig: CameraRig, factory: CameraRig) -> CameraRig:
-        """Do one alignment step."""
-        motion = self.averaging_matrix(factory) @ error_between(rig, factory)[..., :EXTRINSICS].flatten(-2)[..., None]
-        turn = rotation_from_vector(motion[..., :3, 0])
-        transform = RigidTransform(turn.unsqueeze(-3), motion[..., 3:, 0].unsqueeze(-2))
-        return replace(rig, cam_from_rig=rig.cam_from_rig @ transform)
+    def _align(self, moved: RigidTransform, squares: Tensor) -> RigidTransform:
+        """Motions (*B, C) without what they have in common."""
+        averaging = self._averaging(squares)
+        for _ in range(ALIGNMENTS):
+            moved = _take_out(moved, _errors(moved), averaging)
+        return moved
 
     def difference(self, rig: CameraRig, factory: CameraRig) -> Tensor:
         """Change of every parameter without the motion of the whole rig: (*B, C, K)."""
@@ -116,9 +124,34 @@ class Gauge:
 
     def averaging_matrix(self, factory: CameraRig) -> Tensor:
         """Matrix from the errors of all cameras (6 C,) to their common motion (6,): (*B, 6, 6 C)."""
-        scaled = _scale(step_by_error(factory)[..., :EXTRINSICS, :EXTRINSICS].mT).mT
-        weighted = scaled.mT @ scaled * self.weights.to(scaled)[:, None, None]
+        return self._averaging(_error_squares(factory))
+
+    def _averaging(self, squares: Tensor) -> Tensor:
+        """As `averaging_matrix`, from the squares of the cameras' errors (*B, C, 6, 6)."""
+        weighted = squares * self.weights.to(squares)[:, None, None]
         return torch.linalg.solve(weighted.sum(-3), weighted.movedim(-3, -2).flatten(-2))
+
+
+def _motions(rig: CameraRig, factory: CameraRig) -> RigidTransform:
+    """Motion of each camera in the rig's frame since the factory: (*B, C)."""
+    return rig.cam_from_rig.inverse() @ factory.cam_from_rig
+
+
+def _errors(moved: RigidTransform) -> Tensor:
+    """Motions of cameras as errors (rad, mm), see `rig_error`: (*B, C, 6)."""
+    return torch.cat((vector_from_rotation(moved.rotation), moved.translation), dim=-1)
+
+
+def _take_out(moved: RigidTransform, errors: Tensor, averaging: Tensor) -> RigidTransform:
+    """Motions (*B, C) without their average, to first order; `errors`: the same motions."""
+    common = (averaging @ errors.flatten(-2)[..., None])[..., 0].unsqueeze(-2)
+    return RigidTransform(rotation_from_vector(common[..., :3]), common[..., 3:]).inverse() @ moved
+
+
+def _error_squares(factory: CameraRig) -> Tensor:
+    """Matrices S of the cameras' votes: an error e (6,) of a camera counts e^T S e; (*B, C, 6, 6)."""
+    scaled = _scale(step_by_error(factory)[..., :EXTRINSICS, :EXTRINSICS].mT).mT
+    return scaled.mT @ scaled
 
 
 def _scale(step: Tensor) -> Tensor:
