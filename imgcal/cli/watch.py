@@ -36,6 +36,7 @@ from imgcal.watch import (
     SUBJECTS,
     Bag,
     BlobTable,
+    FirstRefusals,
     Folder,
     Hook,
     JsonLines,
@@ -149,11 +150,9 @@ class Watch(arguments.Watch):
             if self.metrics is not None:
                 address = parse_address(self.metrics, "--metrics", None)
                 stack.enter_context(Metrics(loop.tally, intake, hook, address))
-            told = 0 if not restored else None if progress is None else progress.logged
-            if not (
-                goes_on or self.fresh or told is None or self._is_another(progress)
-            ):  # what came after will come again
-                forget_after(folder / EVENTS, told)
+            logged = 0 if not restored else None if progress is None else progress.logged
+            if not (goes_on or self.fresh or logged is None or self._is_another(progress)):
+                forget_after(folder / EVENTS, logged)  # what came after will come again
             anew = self.fresh and put_aside(folder)
             stack.enter_context(loop)
             stopped = stack.enter_context(_stop_at_signals())
@@ -163,7 +162,14 @@ class Watch(arguments.Watch):
                 loop.publish_event(Event(time.time(), 0, "restart", message=how))
             if rate is not None and self.rate is None:
                 print(f"note: {rate:g} snapshots a second are assumed; --rate says otherwise", file=sys.stderr)
-            loop.run(intake, stopped, display.draw)
+            refusals = FirstRefusals(rig, obj)
+
+            def looked() -> None:
+                display.draw()
+                if cause := refusals.add(loop.tally.latest, loop.tally.learnt):
+                    display.warn(f"nothing could be learned yet: {cause}")
+
+            loop.run(intake, stopped, looked)
         tally = loop.tally
         said = display.result(self.out / CURRENT)
         if lost := [f"{output.name}: {plural(output.lost, 'pose')}" for output in poses if output.lost]:
@@ -182,7 +188,7 @@ class Watch(arguments.Watch):
             read = f"all {plural(before, 'snapshot')} of {self.input} had been read before"
             said = f"{read}; --fresh starts from the factory rig | {said}"
         elif tally.latest is None or tally.learnt == 0:
-            raise RefusedError(_explain_no_learning(tally, intake))
+            raise RefusedError(_explain_no_learning(tally, intake, refusals))
         elif before:
             said = f"{said} | {before:,} had been read before"
         print(said)
@@ -335,10 +341,11 @@ def _object_difference(obj: CalibrationObject, known: CalibrationObject) -> str 
     return difference
 
 
-def _explain_no_learning(tally: Tally, intake: SourceReader) -> str:
-    """Say why nothing was learnt."""
+def _explain_no_learning(tally: Tally, intake: SourceReader, refusals: FirstRefusals) -> str:
+    """Say why nothing was learned."""
     if tally.latest is not None:
-        return f"watch: nothing could be learned from any snapshot: {tally.latest.refused}"
+        cause = refusals.find_cause() or tally.latest.refused
+        return f"watch: nothing could be learned from any snapshot: {cause}"
     if intake.reasons:
         return f"watch: no snapshot came: {intake.reasons[-1]}"
     return "watch: no snapshot came"

@@ -10,6 +10,7 @@ from .initialization import load_initializer
 from .label_counts import DOUBTFUL, LabelCounts
 from .learned_measurer import LearnedMeasurer
 from .learned_proposer import LearnedProposer, load_proposer
+from .lines_of_sight import choose_telling_snapshots
 from .motion_check import EARLIER
 from .recalibration import calibrate
 from .scoring import RigScore, rms_length, score
@@ -40,6 +41,7 @@ __all__ = [
     "check_detections",
     "check_frames",
     "choose_proposer",
+    "choose_telling_snapshots",
     "detect_capture",
     "fit_labelled",
     "load_initializer",

@@ -85,10 +85,8 @@ def _fit_some(fit: Fit, detections: Detections, rig: CameraRig, snapshots: NDArr
     """Calibrate one snapshot that most cameras see, then these: the RMS in pixels; None = refused."""
     rms = None
     for some in (choose_telling_snapshots(detections, rig.num_cameras, 1), snapshots):
-        kept = detections.select(np.isin(detections.snapshot, some))
-        names = tuple(kept.snapshot_names[snapshot] for snapshot in some)
         try:
-            rms = fit(replace(kept, snapshot=np.searchsorted(some, kept.snapshot), snapshot_names=names), rig)
+            rms = fit(detections.choose_snapshots(some), rig)
         except RefusedError:
             return None
     return rms

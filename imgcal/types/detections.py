@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum, IntFlag
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,3 +99,22 @@ class Detections:
         """Keep snapshots `first` to `last` (excluded), renumbered from zero."""
         kept = self.select((self.snapshot >= first) & (self.snapshot < last))
         return replace(kept, snapshot=kept.snapshot - first, snapshot_names=self.snapshot_names[first:last])
+
+    def choose_snapshots(self, snapshots: NDArray[np.int64]) -> Detections:
+        """Keep some snapshots, given by their numbers in increasing order, renumbered from zero."""
+        kept = self.select(np.isin(self.snapshot, snapshots))
+        names = tuple(self.snapshot_names[snapshot] for snapshot in snapshots)
+        return replace(kept, snapshot=np.searchsorted(snapshots, kept.snapshot), snapshot_names=names)
+
+    @classmethod
+    def join(cls, parts: Sequence[Detections]) -> Detections:
+        """Join tables of the same cameras, the snapshots of each after those of the one before."""
+        first = np.cumsum([0, *(len(part.snapshot_names) for part in parts)])
+        names = ("uv", "sigma", "camera", "fiducial", "radius", "flags")
+        columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        return replace(
+            parts[0],
+            **columns,
+            snapshot=np.concatenate([part.snapshot + start for part, start in zip(parts, first[:-1], strict=True)]),
+            snapshot_names=tuple(name for part in parts for name in part.snapshot_names),
+        )

@@ -1,6 +1,7 @@
 from .bags import Bag
 from .event_log import EventLog, forget_after
 from .exposures import CameraBlobs, Exposure, Item, Source, Unreadable, check_exposure
+from .first_refusals import FirstRefusals
 from .folder import Folder
 from .hook import Hook
 from .json_lines import JsonLines
@@ -55,6 +56,7 @@ __all__ = [
     "CameraBlobs",
     "EventLog",
     "Exposure",
+    "FirstRefusals",
     "Folder",
     "Hook",
     "Item",

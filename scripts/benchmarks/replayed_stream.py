@@ -202,17 +202,6 @@ class ReplayedStream(Stream):
         """Do nothing: `_simulate` moves the rig."""
 
 
-def combined(parts: Sequence[Detections]) -> Detections:
-    """Join snapshots into one capture."""
-    columns = {
-        name: np.concatenate([getattr(part, name) for part in parts])
-        for name in ("uv", "sigma", "camera", "fiducial", "radius", "flags")
-    }
-    snapshot = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    names = tuple(part.snapshot_names[0] for part in parts)
-    return Detections(**columns, snapshot=snapshot, camera_names=parts[0].camera_names, snapshot_names=names)
-
-
 def calibrated_stream(
     name: str, seed: int, count: int, bumps: Sequence[Bump] = (), given: Disturbances = Disturbances()
 ) -> tuple[ReplayedStream, imgcal.Calibration]:
@@ -228,6 +217,6 @@ def calibrated_stream(
     )
     parts = [stream.snapshot(number) for number in range(TEACHING) if number % TEACH_EVERY == 0]
     parts = [part for part in parts if (part.fiducial >= 0).sum() >= 8]
-    calibration = imgcal.calibrate(combined(parts), place.factory, place.obj)
+    calibration = imgcal.calibrate(Detections.join(parts), place.factory, place.obj)
     stream.conditions = REPLAYED
     return stream, calibration

@@ -36,11 +36,7 @@ def blobs(stream):
     """Blobs of all snapshots; the second camera is turned by 0.3 degrees on the way."""
     bumped = stream.bumped([1], turn_deg=0.3)
     parts = [stream.blobs(s, bumped if s >= BUMPED_AT else stream.true)[0] for s in range(SNAPSHOTS)]
-    columns = ("uv", "sigma", "camera", "fiducial", "radius", "flags")
-    whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in columns}
-    snapshot = np.repeat(np.arange(SNAPSHOTS), [len(part) for part in parts])
-    names = tuple(f"{s:03d}" for s in range(SNAPSHOTS))
-    return Detections(**whole, snapshot=snapshot, camera_names=stream.rig.camera_names, snapshot_names=names)
+    return replace(Detections.join(parts), snapshot_names=tuple(f"{s:03d}" for s in range(SNAPSHOTS)))
 
 
 def lines(blobs):
@@ -213,6 +209,18 @@ def test_mistakes(arguments, code, message, tmp_path, monkeypatch, capsys):
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
     assert not (tmp_path / "poses.csv").exists()
+
+
+@pytest.mark.parametrize("snapshots", [40, 12])  # the cause is named on the way, and at the end
+def test_images_in_another_convention_are_named(snapshots, blobs, stream, tmp_path, capsys):
+    height = float(stream.rig.image_size[0, 1])
+    upside_down = replace(blobs, uv=np.stack((blobs.uv[:, 0], height - 1 - blobs.uv[:, 1]), 1))
+    save_detections(upside_down.of_snapshots(0, snapshots), tmp_path / "blobs.csv")
+    assert watch(tmp_path / "blobs.csv", tmp_path / "out") == 3
+    said = capsys.readouterr()
+    cause = "all images seem to be mirrored top to bottom (as if v were counted from the bottom)"
+    assert ("note: nothing could be learned yet: " + cause in said.out) == (snapshots > 30)
+    assert f"nothing could be learned from any snapshot: {cause}" in said.err
 
 
 def test_a_folder_that_has_been_read_to_its_end_is_said_to_be_known(stream, tmp_path, capsys):
