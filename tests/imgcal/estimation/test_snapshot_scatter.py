@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.estimation import BlockScatter, block_scatter, camera_covariance, camera_std, estimate
+from imgcal.estimation import BlockScatter, block_scatter, camera_covariance, camera_std, estimate, snapshot_scatter
 from imgcal.estimation.robust_losses import NamedLoss
 from imgcal.estimation.snapshot_scatter import linearize_blocks
 from imgcal.geometry import RigidTransform
@@ -131,3 +131,26 @@ def test_the_total_information_is_that_of_all_blocks(simulate, tolerance: float)
     each, size = evidence.information(), found.problem.prior_std[0].numel()
     assert each.shape == (3, *2 * (size + (3 * len(obj.points) + 1 if tolerance else 0),))
     torch.testing.assert_close(evidence.total(), each.sum(0), rtol=1e-9, atol=1e-9 * float(each.abs().max()))
+
+
+@pytest.mark.parametrize("size", [0.0, 0.03, 0.06])
+def test_what_the_first_order_test_does_not_measure_has_no_excess(simulate, monkeypatch, size: float) -> None:
+    measured, measure = 0, snapshot_scatter._scatter
+    for seed in range(10):
+        case = simulate(snapshots=40, cameras=4, seed=seed)
+        lasting = torch.zeros(40, 2, dtype=torch.float64)
+        steps = torch.randn(40, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        for s in range(1, 40):
+            lasting[s] = 0.8 * lasting[s - 1] + 0.6 * steps[s]
+        case.observations.uv[:, 1] += size * lasting[:, None]
+        found = estimate(case.observations, case.factory, case.obj, prior_std=case.prior_std)
+        calls = []
+        with monkeypatch.context() as patch:
+            patch.setattr(
+                snapshot_scatter, "_scatter", lambda *given, calls=calls: (calls.append(1), measure(*given))[1]
+            )
+            quick = scatter(found)
+            patch.setattr(snapshot_scatter, "WORTH_MEASURING", -torch.inf)
+            assert (quick.factor is None) == (scatter(found).factor is None)
+        measured += quick.factor is None and len(calls) > 3  # both measured: three lengths each
+    assert size > 0 or measured <= 3  # white noise
