@@ -116,16 +116,18 @@ def count_labels(
 def _count_placed(labelled: Associations, poses: RigidTransform, rig: CameraRig, obj: CalibrationObject) -> Counts:
     """Count unlabelled blobs at the images of unlabelled fiducials, single or merged: (S, C)."""
     detections, used = labelled.detections, labelled.used
-    points = poses.apply(obj.points.to(rig.focal_length))
-    image = rig.expand(len(points)).project_values(points, obj.radius)
-    places, open_ = image.uv.numpy(), image.visible.numpy() & labelled.columns(obj)
+    counts = np.zeros((len(labelled.snapshots), rig.num_cameras), dtype=np.int64)
     row = np.full(len(labelled.snapshots), -1)
     row[used] = np.arange(len(used))
     snapshot = row[detections.snapshot]
+    blobs = np.flatnonzero((detections.fiducial < 0) & (snapshot >= 0) & detections.usable)
+    if not len(blobs):
+        return counts
+    points = poses.apply(obj.points.to(rig.focal_length))
+    image = rig.expand(len(points)).project_values(points, obj.radius)
+    places, open_ = image.uv.numpy(), image.visible.numpy() & labelled.columns(obj)
     labels = np.flatnonzero((detections.fiducial >= 0) & (snapshot >= 0))
     open_[snapshot[labels], detections.camera[labels], detections.fiducial[labels]] = False
-    counts = np.zeros((len(labelled.snapshots), rig.num_cameras), dtype=np.int64)
-    blobs = np.flatnonzero((detections.fiducial < 0) & (snapshot >= 0) & detections.usable)
     blobs = blobs[open_[snapshot[blobs], detections.camera[blobs]].any(-1)]
     for blob, reach in zip(blobs, merging_distance(labelled, blobs), strict=True):
         s, c = snapshot[blob], detections.camera[blob]

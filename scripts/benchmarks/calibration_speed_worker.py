@@ -10,7 +10,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator
-from itertools import count
+from itertools import count, cycle
 from pathlib import Path
 
 import numpy as np
@@ -21,22 +21,25 @@ from imgcal import Detections, PipelineOptions, calibrate, load_object, load_rig
 
 
 class Case:
-    """A repeated calibration, or a live stream that is played forwards and backwards."""
+    """Calibrations of several captures in turn, or a live stream that is played forwards and backwards."""
 
     def __init__(self, folder: Path, name: str) -> None:
         """Read `NAME.json`, rig, object and window (0 = a calibration of all snapshots), and `NAME.npz`, the blobs."""
         given = json.loads((folder / f"{name}.json").read_text())
         rig, obj = load_rig(given["rig"]), load_object(given["object"])
         with np.load(folder / f"{name}.npz") as columns:
-            snapshots = int(columns["snapshot"].max()) + 1
-            names = tuple(f"{s:05d}" for s in range(snapshots))
-            blobs = Detections(**columns, camera_names=rig.camera_names, snapshot_names=names)
+            values = dict(columns)
+        capture = values.pop("capture", np.zeros(len(values["uv"]), dtype=int))
+        snapshots = int(values["snapshot"].max()) + 1
+        names = tuple(f"{s:05d}" for s in range(snapshots))
+        blobs = Detections(**values, camera_names=rig.camera_names, snapshot_names=names)
         self._call: Callable[[], object]
         if given["window"]:
             stream = _there_and_back([blobs.of_snapshots(s, s + 1) for s in range(snapshots)])
             self._call = _follow(rig, obj, given["window"], stream)
         else:
-            self._call = lambda: calibrate(blobs, rig, obj)
+            captures = cycle([blobs.select(capture == number) for number in np.unique(capture)])
+            self._call = lambda: calibrate(next(captures), rig, obj)
         for _ in range(3 + 2 * given["window"]):  # compile, and fill the window
             self._call()
 
