@@ -5,7 +5,9 @@ A single snapshot shows that it does not fit, not why. Several are calibrated, a
 
 from __future__ import annotations
 
+import threading
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -31,35 +33,57 @@ class FirstRefusals:
         self._kept: deque[Detections] = deque(maxlen=KEPT)
         self._latest: RigState | None = None
         self._count = 0
+        self._asking: threading.Thread | None = None
+        self._cause: str | None = None
+        self._told = False
 
     def add(self, state: RigState | None, learned: int) -> str | None:
-        """Take the state after a snapshot.
+        """Take the state after a snapshot; never waits: a thread looks for the cause, which takes seconds.
 
         Args:
             state: the latest state; one that was taken before does not count again.
             learned: number of snapshots that have been learned from.
 
         Returns:
-            The cause of the refusals, once it is found; None = unknown.
+            The cause of the refusals, once, when it has been found; None = unknown.
         """
-        if state is None or state is self._latest or learned:
+        if learned:
             return None
-        self._latest, blobs = state, state.detections
-        per_camera = np.bincount(blobs.camera[blobs.usable], minlength=len(blobs.camera_names))
-        if state.refused is None or (per_camera >= LEAST_BLOBS).sum() < LEAST_CAMERAS:
+        if state is not None and state is not self._latest:
+            self._latest = state
+            self._keep(state)
+        if self._cause is None or self._told:
             return None
-        self._count += 1
-        self._kept.append(blobs)
-        return self.find_cause() if self._count in ASKED_AFTER else None
+        self._told = True
+        return self._cause
 
     def find_cause(self) -> str | None:
-        """Calibrate what was kept; return the cause that the refusal names, None if it names none."""
-        if not self._kept or self._obj.pose_rank < 6 or self._obj.parts:  # of others, images alone tell no convention
-            return None
-        seen = Detections.join(tuple(self._kept))
+        """Wait for the cause of what was kept; None = the images name none."""
+        if self._asking is None:
+            self._ask(tuple(self._kept))
+        else:
+            self._asking.join()
+        return self._cause
+
+    def _keep(self, state: RigState) -> None:
+        blobs = state.detections
+        per_camera = np.bincount(blobs.camera[blobs.usable], minlength=len(blobs.camera_names))
+        if state.refused is None or (per_camera >= LEAST_BLOBS).sum() < LEAST_CAMERAS:
+            return
+        self._count += 1
+        self._kept.append(blobs)
+        if self._count in ASKED_AFTER:
+            self._asking = threading.Thread(target=self._ask, args=(tuple(self._kept),), daemon=True)
+            self._asking.start()
+
+    def _ask(self, parts: Sequence[Detections]) -> None:
+        """Calibrate snapshots, and keep the cause that the refusal names."""
+        if not parts or self._obj.pose_rank < 6 or self._obj.parts:  # of others, images alone tell no convention
+            return
+        seen = Detections.join(parts)
         chosen = choose_telling_snapshots(seen, self._rig.num_cameras)
         try:
             calibrate(seen.choose_snapshots(chosen), self._rig, self._obj)
         except RefusedError as error:
-            return error.reason if isinstance(error.__cause__, RefusedError) else None
-        return None
+            if isinstance(error.__cause__, RefusedError):
+                self._cause = error.reason

@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from imgcal.io import load_object, read_rig, save_detections, save_object, save_
 from imgcal.online import RigKeeper
 from imgcal.synthesis import Truth, simulate_volume, true_detections
 from imgcal.types import CalibrationObject, CameraRig, Detections, DriftRate, RigPrior
-from imgcal.watch import Progress
+from imgcal.watch import FirstRefusals, Progress
 from tests.imgcal.streams import Stream
 from tests.imgcal.watch.test_marker_files import points_of
 
@@ -211,16 +212,31 @@ def test_mistakes(arguments, code, message, tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "poses.csv").exists()
 
 
-@pytest.mark.parametrize("snapshots", [40, 12])  # the cause is named on the way, and at the end
+def upside_down(blobs, rig):
+    height = float(rig.image_size[0, 1])
+    return replace(blobs, uv=np.stack((blobs.uv[:, 0], height - 1 - blobs.uv[:, 1]), 1))
+
+
+UPSIDE_DOWN = "all images seem to be mirrored top to bottom (as if v were counted from the bottom)"
+
+
+@pytest.mark.parametrize("snapshots", [40, 12])  # asked on the way, and at the end
 def test_images_in_another_convention_are_named(snapshots, blobs, stream, tmp_path, capsys):
-    height = float(stream.rig.image_size[0, 1])
-    upside_down = replace(blobs, uv=np.stack((blobs.uv[:, 0], height - 1 - blobs.uv[:, 1]), 1))
-    save_detections(upside_down.of_snapshots(0, snapshots), tmp_path / "blobs.csv")
+    save_detections(upside_down(blobs, stream.rig).of_snapshots(0, snapshots), tmp_path / "blobs.csv")
     assert watch(tmp_path / "blobs.csv", tmp_path / "out") == 3
-    said = capsys.readouterr()
-    cause = "all images seem to be mirrored top to bottom (as if v were counted from the bottom)"
-    assert ("note: nothing could be learned yet: " + cause in said.out) == (snapshots > 30)
-    assert f"nothing could be learned from any snapshot: {cause}" in said.err
+    assert f"nothing could be learned from any snapshot: {UPSIDE_DOWN}" in capsys.readouterr().err
+
+
+def test_the_cause_of_the_first_refusals_is_told_once_and_only_before_anything_is_learned(blobs, stream):
+    refusals, table = FirstRefusals(stream.rig, stream.obj), upside_down(blobs, stream.rig)
+    states = [SimpleNamespace(refused="no", detections=table.of_snapshots(s, s + 1)) for s in range(30)]
+    told = [refusals.add(state, 0) for state in states for _ in range(2)]
+    while (cause := refusals.add(None, 0)) is None:
+        time.sleep(0.01)
+    assert not any(told) and cause.startswith(UPSIDE_DOWN)
+    assert refusals.add(None, 0) is None and refusals.find_cause() == cause
+    learned = FirstRefusals(stream.rig, stream.obj)
+    assert not any(learned.add(state, 1) for state in states) and learned.find_cause() is None
 
 
 def test_a_folder_that_has_been_read_to_its_end_is_said_to_be_known(stream, tmp_path, capsys):
