@@ -23,9 +23,7 @@ EXTRINSICS = 6
 VOTE_SCALE = (0.01,) * 3 + (10.0,) * 3
 """Radians and millimetres with equal weight when cameras vote: they move an image equally at about arm's length."""
 ROUNDS = 15
-"""Most rounds of each of the two kinds of votes."""
-SETTLED = 1e-4
-"""Largest change of a camera's weight (all are one together) in the last round of a kind."""
+"""Rounds of each of the two kinds of votes."""
 ALIGNMENTS = 4
 """Alignment rounds; each squares the remaining error."""
 LEAST_APART = 1e-6
@@ -52,34 +50,33 @@ class Gauge:
             rig: a calibration, without batch axes.
             factory: the calibration to compare with.
         """
-        squares, positions = _error_squares(factory), factory.positions
+        squares, positions, moved = _error_squares(factory), factory.positions, _motions(rig, factory)
         weights = torch.ones(rig.num_cameras, dtype=torch.float64)
-        moved = cls(weights)._align(_motions(rig, factory), squares)
+        moved = cls(weights)._common(moved, squares).inverse() @ moved
         # First the geometric median, which is robust up to half of the cameras; then Cauchy weights about it.
         for vote in (lambda apart: 1 / apart, lambda apart: 1 / (1 + (apart / apart.median()).square())):
             for _ in range(ROUNDS):
-                errors, before = _errors(moved), weights
+                errors = _errors(moved)
                 shifts = errors[:, 3:] + rotate(moved.rotation, positions) - positions
                 apart = _scale(torch.cat((errors[:, :3], shifts), dim=-1)).norm(dim=-1).clamp_min(LEAST_APART)
                 weights = vote(apart)
                 weights = weights / weights.sum()
                 # One step is enough from the previous alignment.
-                moved = _take_out(moved, errors, cls(weights)._averaging(squares))
-                if float((weights - before).abs().max()) < SETTLED:
-                    break
+                moved = _average(errors, cls(weights)._averaging(squares)).inverse() @ moved
         return cls(weights)
 
     def align(self, rig: CameraRig, factory: CameraRig) -> CameraRig:
         """Align a whole rig (*B) with another one, which may have fewer batch axes."""
-        moved = self._align(_motions(rig, factory), _error_squares(factory))
-        return replace(rig, cam_from_rig=factory.cam_from_rig @ moved.inverse())
+        common = self._common(_motions(rig, factory), _error_squares(factory))
+        return replace(rig, cam_from_rig=rig.cam_from_rig @ common)
 
-    def _align(self, moved: RigidTransform, squares: Tensor) -> RigidTransform:
-        """Motions (*B, C) without what they have in common."""
+    def _common(self, moved: RigidTransform, squares: Tensor) -> RigidTransform:
+        """What the motions of the cameras (*B, C) have in common: (*B, 1)."""
         averaging = self._averaging(squares)
-        for _ in range(ALIGNMENTS):
-            moved = _take_out(moved, _errors(moved), averaging)
-        return moved
+        common = _average(_errors(moved), averaging)
+        for _ in range(ALIGNMENTS - 1):
+            common = common @ _average(_errors(common.inverse() @ moved), averaging)
+        return common
 
     def difference(self, rig: CameraRig, factory: CameraRig) -> Tensor:
         """Change of every parameter without the motion of the whole rig: (*B, C, K)."""
@@ -142,10 +139,10 @@ def _errors(moved: RigidTransform) -> Tensor:
     return torch.cat((vector_from_rotation(moved.rotation), moved.translation), dim=-1)
 
 
-def _take_out(moved: RigidTransform, errors: Tensor, averaging: Tensor) -> RigidTransform:
-    """Motions (*B, C) without their average, to first order; `errors`: the same motions."""
+def _average(errors: Tensor, averaging: Tensor) -> RigidTransform:
+    """Average motion of the cameras, to first order, by their errors (*B, C, 6): (*B, 1)."""
     common = (averaging @ errors.flatten(-2)[..., None])[..., 0].unsqueeze(-2)
-    return RigidTransform(rotation_from_vector(common[..., :3]), common[..., 3:]).inverse() @ moved
+    return RigidTransform(rotation_from_vector(common[..., :3]), common[..., 3:])
 
 
 def _error_squares(factory: CameraRig) -> Tensor:

@@ -11,7 +11,6 @@ from imgcal.errors import RefusedError
 from imgcal.pipeline.object_exchange import find_step, measure_sizes
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import Detections, Observations
-from scripts.benchmarks.replayed_stream import combined
 from scripts.benchmarks.rig_streams import Conditions, Stream
 
 EXCHANGED = 12
@@ -24,7 +23,7 @@ def capture(growth: float, seed: int = 1, count: int = 20) -> Detections:
     for number in range(count):
         made.obj = replace(obj, points=obj.points * (1 + growth * (number >= EXCHANGED)))
         parts.append(made.snapshot(number))
-    return combined(parts)
+    return Detections.join(parts)
 
 
 @pytest.mark.parametrize("growth", [0.003, -0.003, 0.01])

@@ -10,7 +10,6 @@ import imgcal
 from imgcal.association import associate
 from imgcal.pipeline.synchronization import LEAST_VIEWS, _verdict, find_unsynchronized
 from imgcal.types import Detections
-from scripts.benchmarks.replayed_stream import combined
 from scripts.benchmarks.rig_streams import Conditions, Stream
 
 COUNT = 24
@@ -41,7 +40,7 @@ def capture(spread: float, seed: int = 2) -> Detections:
         ]
         uv = torch.stack(images).numpy()[now.camera, now.fiducial]
         parts.append(replace(now, uv=uv + 0.1 * rng.standard_normal(uv.shape)))
-    return combined(parts)
+    return Detections.join(parts)
 
 
 def asked(seen: Detections):
