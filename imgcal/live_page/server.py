@@ -16,7 +16,7 @@ from imgcal.live_page.security import HEADERS, Allowance, Gate, Refusal
 MOST_VIEWERS = 64
 MOST_BODY = 1024  # bytes of a command
 BODY_SECONDS = 5.0
-ANSWER_SECONDS = 5.0  # for the loop's process to take a command
+ANSWER_SECONDS = 10.0  # for the loop's process to take a command; a busy machine needs some of them
 MOST_ASKED = 64  # commands that it has not answered
 STUCK_SECONDS = 20.0  # a viewer that takes nothing for so long is sent away
 ALIVE_SECONDS = 10.0  # between signs of life where nothing is new
