@@ -149,6 +149,7 @@ def test_an_interruption_during_start_up_is_one_line(slow, arguments, tmp_path):
         (["export", "m", "--out", "m.onnx", "--to", "onx"],
          "--to: found onx, expected onnx or pt2; did you mean onnx? See imgcal export --help"),
         (["describe", "me"], "found me, expected experiments; see imgcal describe --help"),
+        (["describe", "ir-cnn"], "found ir-cnn, expected experiments; see imgcal describe --help"),
         (["rig", "lookat"], "unknown `imgcal rig lookat`; did you mean `look-at`? See imgcal rig --help"),
         (["rig", "round"], "unknown `imgcal rig round`, expected look-at or cameras; see imgcal rig --help"),
         (["rig"], "expected look-at or cameras after `imgcal rig`; see imgcal rig --help"),

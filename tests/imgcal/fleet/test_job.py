@@ -5,11 +5,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 
+import imgcal
 from imgcal.fleet import Item, Settings
 from imgcal.fleet import job as jobs
-from imgcal.fleet.job import content_key, process
+from imgcal.fleet.job import content_key, process, result_columns
+from imgcal.synthesis import simulate_truth, true_detections
 from tests.imgcal.fleet.small_captures import write_capture
 
 
@@ -113,3 +117,13 @@ def test_a_system_that_can_limit_nothing_still_calibrates(capture: Path, monkeyp
     monkeypatch.delattr(signal, "SIGALRM")
     row = process(item(capture), Settings(seconds=0.0))
     assert row is not None and row["status"] == "ok"
+
+
+def test_where_snapshots_scatter_the_standard_deviations_say_so() -> None:
+    factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    truth = simulate_truth(factory, obj, 4, torch.Generator().manual_seed(1), None)
+    plain = imgcal.calibrate(true_detections(truth), factory, obj)
+    factors = torch.full((4,), 2.0, dtype=torch.float64)
+    scattered = replace(plain, estimate=replace(plain.estimate, inflation=factors))
+    before, after = (np.array(result_columns(result)["std"]) for result in (plain, scattered))
+    assert (after >= before * (1 - 1e-9)).all() and after[6] > 1.9 * before[6]  # a focal length
