@@ -243,7 +243,7 @@ def _shorten(problem: str, arguments: list[str]) -> str:
             named.append(" or ".join(needed))
         return f"missing {', '.join(named)}"
     if choice := re.search(r"[Ii]nvalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*?),?\)", problem):
-        words = {word.strip("' ") for word in choice[3].split(",")} - {"None"}
+        words = {word.strip("' ") for word in choice[3].split(",")} - {"None", ""}
         known = sorted(words, key=lambda word: (word.isdigit() and int(word), word))
         close = difflib.get_close_matches(choice[1], known, 1)
         hint = f"; did you mean {close[0]}?" if close else ""
@@ -268,7 +268,6 @@ def _shorten(problem: str, arguments: list[str]) -> str:
 
 
 def _list_alternatives(words: list[str]) -> str:
-    words = [word for word in words if word]
     return f"{', '.join(words[:-1])} or {words[-1]}" if len(words) > 1 else words[0]
 
 
