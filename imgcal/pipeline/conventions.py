@@ -63,13 +63,13 @@ def require_conventions(error: RefusedError, detections: Detections, rig: Camera
         RefusedError: names the convention.
     """
     asked = choose_telling_snapshots(detections, rig.num_cameras)
-    detections = detections.select(np.isin(detections.snapshot, asked))  # reading all of a long capture takes its time
+    detections = detections.choose_snapshots(asked)  # reading all of a long capture takes its time
     chosen = choose_telling_snapshots(detections, rig.num_cameras, MOST_TRIED)
     if len(chosen) == 0 or _fit_some(fit, detections, rig, chosen) is not None:
         return
     readings = list(other_readings(detections, rig))
-    told = [mean_miss(reading.detections, reading.rig) for reading in readings]
-    misses = [FARTHEST if miss is None else miss for miss in told]
+    known = [mean_miss(reading.detections, reading.rig) for reading in readings]
+    misses = [FARTHEST if miss is None else miss for miss in known]
     likely = max(LIKELY * min(misses), min(misses) + CLOSE)
     fitting = {
         reading.words: rms

@@ -157,8 +157,8 @@ def _focal_doubt(rig: CameraRig) -> str:
 def _doubt_by_poses(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> str:
     """Compare the cameras' relative poses, by the object in each camera alone, with the rig's."""
     labelled = detections.select((detections.fiducial >= 0) & detections.usable)
-    snapshots = choose_telling_snapshots(labelled, rig.num_cameras)
-    seen = to_observations(labelled.select(np.isin(labelled.snapshot, snapshots)), rig, obj)
+    chosen = labelled.choose_snapshots(choose_telling_snapshots(labelled, rig.num_cameras))
+    seen = to_observations(chosen, rig, obj)
     placed, known = single_camera_poses(seen, rig, obj)
     lengths, turns = [], []
     for first in range(rig.num_cameras):
