@@ -148,7 +148,8 @@ class Tracker:
     ) -> tuple[SnapshotIdentity, NDArray[np.int64], Detections]:
         """Label one snapshot by a proposer's view of its frames; also return the blobs that the labels refer to.
 
-        If it sees nothing, and blobs have not been tried yet, they give a pose to try, or decide themselves.
+        If it sees nothing, and blobs have not been tried yet, they give a pose to try, or decide themselves. Without a
+        frame, blobs decide.
         """
         frames = sight.frames(number)
         if all(frame is None for frame in frames.values()):

@@ -76,7 +76,7 @@ class Estimate:
     points_object: Tensor  # (*B, N, 3) mm, the fiducials as estimated; as given where the object is exact
     problem: Problem  # (B,) flattened, as solved
     solution: levenberg_marquardt.Solution  # (B,) flattened: state and normal equations at the minimum
-    loss: NamedLoss = field(default=NamedLoss("huber"), kw_only=True)  # of the observations
+    loss: NamedLoss  # of the observations
     inflation: Tensor | None = field(default=None, kw_only=True)
     """(C,) factors on the noise part of each camera's standard deviations, where blocks of snapshots scatter more than
     the noise: `block_scatter`; None = they do not."""

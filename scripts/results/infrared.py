@@ -269,10 +269,7 @@ def tables(result: dict[str, Any]) -> dict[str, str]:
         "infrared accuracy": accuracy(),
         "infrared others": markdown(["right % / wrong %", *others], rows),
         "infrared harder": markdown(
-            [
-                "right % / wrong %",
-                *turns,
-            ],
+            ["right % / wrong %", *turns],
             [[level, *(cell(row) for said in by.values() for row in said.values())] for level, by in harder.items()],
         ),
         "infrared lost": markdown(
