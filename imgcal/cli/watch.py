@@ -93,10 +93,6 @@ class Watch(arguments.Watch):
         rig, given = open_rig(self.rig), load_objects(self.object)
         self._check_out()
         _check_poses(self.poses, given.as_unknown(), self.out)
-        if self.serve is not None:
-            parse_address(self.serve)
-        if self.metrics is not None:
-            parse_address(self.metrics, "--metrics", None)
         if self.learn:
             self._check_learning(given)
         detector = self._detector()
@@ -105,6 +101,8 @@ class Watch(arguments.Watch):
 
     def _watch(self, rig: CameraRig, given: CalibrationObject, detector: DetectorName | Proposer, folder: Path) -> None:
         obj = given.as_unknown()
+        page_at = None if self.serve is None else parse_address(self.serve)
+        metrics_at = None if self.metrics is None else parse_address(self.metrics, "--metrics", None)
         with _explain_unusable_state():
             progress = None if self.fresh else Progress.load(folder)
         source, origin = self._source(rig, given.rows, progress), self._origin()
@@ -137,19 +135,18 @@ class Watch(arguments.Watch):
                     keeper.use_proposer(run_networks(running))
                 print(f"learning from the frames of this rig: {folder / LEARNING}")
             page = None
-            if self.serve is not None:
+            if page_at is not None:
                 from imgcal.live_page import LivePage  # brings a server along, which is not in the core
 
-                page = stack.enter_context(LivePage(rig, obj, parse_address(self.serve), problem=display.warn))
+                page = stack.enter_context(LivePage(rig, obj, page_at, problem=display.warn))
                 print(page.notice)
             loop = Loop(
                 keeper, folder, hook, page, display.show_event, display.warn, _make_remover(source), source=origin,
                 rate=rate,
                 poses=poses, learning=learning,
             )  # fmt: skip
-            if self.metrics is not None:
-                address = parse_address(self.metrics, "--metrics", None)
-                stack.enter_context(Metrics(loop.tally, intake, hook, address))
+            if metrics_at is not None:
+                stack.enter_context(Metrics(loop.tally, intake, hook, metrics_at))
             logged = 0 if not restored else None if progress is None else progress.logged
             if not (goes_on or self.fresh or logged is None or self._is_another(progress)):
                 forget_after(folder / EVENTS, logged)  # what came after will come again
@@ -166,7 +163,7 @@ class Watch(arguments.Watch):
 
             def looked() -> None:
                 display.draw()
-                if cause := refusals.add(loop.tally.latest, loop.tally.learnt):
+                if cause := refusals.add(loop.tally.latest, restored or loop.tally.learnt > 0):
                     display.warn(f"nothing could be learned yet: {cause}")
 
             loop.run(intake, stopped, looked)

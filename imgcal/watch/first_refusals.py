@@ -9,8 +9,6 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 
-import numpy as np
-
 from imgcal.errors import RefusedError
 from imgcal.online import RigState
 from imgcal.pipeline import calibrate, choose_telling_snapshots
@@ -18,8 +16,6 @@ from imgcal.types import CalibrationObject, CameraRig, Detections
 
 ASKED_AFTER = (30, 300)
 """Numbers of refused snapshots with blobs after which a cause is looked for: the object may come late."""
-LEAST_BLOBS, LEAST_CAMERAS = 3, 2
-"""Blobs of a camera, and such cameras, of a snapshot that counts."""
 KEPT = 30
 """Latest snapshots that are kept for this."""
 
@@ -37,12 +33,12 @@ class FirstRefusals:
         self._cause: str | None = None
         self._told = False
 
-    def add(self, state: RigState | None, learned: int) -> str | None:
+    def add(self, state: RigState | None, learned: bool) -> str | None:
         """Take the state after a snapshot; never waits: a thread looks for the cause, which takes seconds.
 
         Args:
             state: the latest state; one that was taken before does not count again.
-            learned: number of snapshots that have been learned from.
+            learned: whether any snapshot has been learned from, in an earlier run included.
 
         Returns:
             The cause of the refusals, once, when it has been found; None = unknown.
@@ -66,12 +62,10 @@ class FirstRefusals:
         return self._cause
 
     def _keep(self, state: RigState) -> None:
-        blobs = state.detections
-        per_camera = np.bincount(blobs.camera[blobs.usable], minlength=len(blobs.camera_names))
-        if state.refused is None or (per_camera >= LEAST_BLOBS).sum() < LEAST_CAMERAS:
+        if state.refused is None or not len(choose_telling_snapshots(state.detections, self._rig.num_cameras)):
             return
         self._count += 1
-        self._kept.append(blobs)
+        self._kept.append(state.detections)
         if self._count in ASKED_AFTER:
             self._asking = threading.Thread(target=self._ask, args=(tuple(self._kept),), daemon=True)
             self._asking.start()

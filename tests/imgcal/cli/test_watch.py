@@ -229,13 +229,13 @@ def test_images_in_another_convention_are_named(blobs, stream, tmp_path, capsys)
 def test_the_cause_of_the_first_refusals_is_told_once_and_only_before_anything_is_learned(blobs, stream):
     refusals, table = FirstRefusals(stream.rig, stream.obj), upside_down(blobs, stream.rig)
     states = [SimpleNamespace(refused="no", detections=table.of_snapshots(s, s + 1)) for s in range(30)]
-    told = [refusals.add(state, 0) for state in states for _ in range(2)]
-    while (cause := refusals.add(None, 0)) is None:
+    told = [refusals.add(state, learned=False) for state in states for _ in range(2)]
+    while (cause := refusals.add(None, learned=False)) is None:
         time.sleep(0.01)
     assert not any(told) and cause.startswith(UPSIDE_DOWN)
-    assert refusals.add(None, 0) is None and refusals.find_cause() == cause
+    assert refusals.add(None, learned=False) is None and refusals.find_cause() == cause
     learned = FirstRefusals(stream.rig, stream.obj)
-    assert not any(learned.add(state, 1) for state in states) and learned.find_cause() is None
+    assert not any(learned.add(state, learned=True) for state in states) and learned.find_cause() is None
 
 
 def test_a_folder_that_has_been_read_to_its_end_is_said_to_be_known(stream, tmp_path, capsys):
