@@ -126,12 +126,7 @@ class Recording:
 
     def chosen(self, frames: range | NDArray[np.int64] | list[int]) -> Detections:
         """Blobs of some frames, as one capture."""
-        kept = np.flatnonzero(np.isin(self.frames, frames))
-        row = np.full(len(self.frames), -1)
-        row[kept] = np.arange(len(kept))
-        blobs = self.detections.select(row[self.detections.snapshot] >= 0)
-        names = tuple(self.detections.snapshot_names[k] for k in kept)
-        return replace(blobs, snapshot=row[blobs.snapshot], snapshot_names=names)
+        return self.detections.choose_snapshots(np.flatnonzero(np.isin(self.frames, frames)))
 
 
 @dataclass(frozen=True)
