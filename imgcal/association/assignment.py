@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from imgcal.medians import median
 from renderers.compiling import njit
 
 
@@ -58,7 +59,7 @@ def first_beyond(blobs, u):
 
 def spacing(places: NDArray[np.float64]) -> float:
     """Median distance (px) from a fiducial's image to the nearest other one in its camera; places (C, N, 2)."""
-    return float(np.median(distances_to_nearest(np.ascontiguousarray(places))))
+    return median(distances_to_nearest(np.ascontiguousarray(places)))
 
 
 @njit(cache=True)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.geometry import lens_codes, lens_kernels
+from imgcal.medians import median
 from imgcal.types import CameraRig, Detections
 from renderers.compiling import njit
 
@@ -38,7 +39,7 @@ class PaddedBlobs:
     def noise(self) -> tuple[NDArray[np.float64], float]:
         """Variance of each blob's place (C, M) px^2, and the typical one."""
         variance, valid = self.sigma**2, self.row >= 0
-        return variance, float(np.median(variance[valid])) if valid.any() else 0.0
+        return variance, median(variance[valid]) if valid.any() else 0.0
 
     @cached_property
     def left_to_right(self) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
@@ -126,6 +127,31 @@ class PatternPrior:
     shape: float  # relative: one standard deviation of distances within a pattern
 
 
+@dataclass(frozen=True)
+class PriorSpread:
+    """Variances that the factory prior gives the place of an object at any distance; see `at`."""
+
+    focal: NDArray[np.float64]  # (C,) px
+    image: NDArray[np.float64]  # (C,) px^2, principal point and rotation: a pattern's shift
+    travel: NDArray[np.float64]  # (C,) mm^2, position
+    deformation: NDArray[np.float64]  # (C,) relative: focal length, rotation and principal point
+
+    @classmethod
+    def of(cls, std: Tensor, rig: CameraRig) -> PriorSpread:
+        """Reduce standard deviations (C, K) of a rig's parameters."""
+        variance, focal = std.numpy() ** 2, rig.focal_length.numpy().mean(-1)
+        turn, travel, scale, principal = (
+            variance[:, part].mean(1) for part in (slice(3), slice(3, 6), slice(6, 8), slice(8, 10))
+        )
+        return cls(focal, principal + focal**2 * turn, travel, (scale + principal) / focal**2 + turn)
+
+    def at(self, distance: float) -> PatternPrior:
+        """The prior of a pattern at this distance (mm) from the cameras."""
+        travel = self.travel / distance**2
+        shift, shape = np.sqrt(self.image + self.focal**2 * travel), np.sqrt((self.deformation + travel).max())
+        return PatternPrior(shift, float(shape))
+
+
 def pattern_prior(std: Tensor, rig: CameraRig, distance: float) -> PatternPrior:
     """Reduce the prior to these two numbers.
 
@@ -134,9 +160,4 @@ def pattern_prior(std: Tensor, rig: CameraRig, distance: float) -> PatternPrior:
         rig: factory rig.
         distance: mm, approximate distance from the cameras to the object.
     """
-    s, focal = std.numpy(), rig.focal_length.numpy().mean(-1)
-    turn, travel = np.sqrt((s[:, :3] ** 2).mean(1)), np.sqrt((s[:, 3:6] ** 2).mean(1)) / distance
-    principal, scale = np.sqrt((s[:, 8:10] ** 2).mean(1)), np.sqrt((s[:, 6:8] ** 2).mean(1)) / focal
-    shift = np.sqrt(principal**2 + (focal * turn) ** 2 + (focal * travel) ** 2)
-    shape = np.sqrt(scale**2 + turn**2 + travel**2 + (principal / focal) ** 2)
-    return PatternPrior(shift, float(shape.max()))
+    return PriorSpread.of(std, rig).at(distance)

@@ -19,7 +19,7 @@ from imgcal.association.ambiguities import (
     relabel,
 )
 from imgcal.association.assignment import spacing
-from imgcal.association.blobs import PatternPrior, gather, pattern_prior
+from imgcal.association.blobs import gather
 from imgcal.association.hypotheses import (
     Poses,
     has_many_triples,
@@ -32,6 +32,7 @@ from imgcal.association.stick_poses import fit_sticks
 from imgcal.association.verification import (
     STAGES,
     Fits,
+    Known,
     Scene,
     drop_uncertain_labels,
     evidence,
@@ -49,6 +50,7 @@ from imgcal.association.verification import (
 )
 from imgcal.association.voting import predict_ideal, vote
 from imgcal.geometry import RigidTransform
+from imgcal.medians import median
 from imgcal.types import CalibrationObject, CameraRig, Detections
 
 FIRST_HYPOTHESES = 8_000  # in the first round: large objects get fewer triples of blobs; then twice as many each time
@@ -98,9 +100,22 @@ def identify(
     Raises:
         InputError: blobs of several snapshots, or cameras that are not the rig's.
     """
-    scene, partial = Scene(gather(detections, rig), obj, rig, std), None
-    for pose, known in [*((pose, True) for pose in candidates), *((pose, False) for pose in guesses)]:
-        found = _track(scene, pose, options, known)
+    return identify_with(Known(obj, rig, std), detections, candidates, options, guesses, search=search)
+
+
+def identify_with(
+    known: Known,
+    detections: Detections,
+    candidates: Sequence[RigidTransform] = (),
+    options: IdentityOptions = IdentityOptions(),
+    guesses: Sequence[RigidTransform] = (),
+    *,
+    search: bool = True,
+) -> Identity:
+    """Do the work of `identify`; what snapshots have in common is computed once for all calls with `known`."""
+    scene, partial = Scene(gather(detections, known.rig), known), None
+    for pose, is_known in [*((pose, True) for pose in candidates), *((pose, False) for pose in guesses)]:
+        found = _track(scene, pose, options, is_known)
         if found.accepted and found.explained >= CONVINCING:
             return found
         partial = found if partial is None and found.accepted else partial
@@ -134,7 +149,7 @@ def track(
     Raises:
         InputError: see `identify`.
     """
-    return _track(Scene(gather(detections, rig), obj, rig, std), rig_from_object, options, pose_known)
+    return _track(Scene(gather(detections, rig), Known(obj, rig, std)), rig_from_object, options, pose_known)
 
 
 def _track(scene: Scene, rig_from_object: RigidTransform, options: IdentityOptions, pose_known: bool) -> Identity:
@@ -144,8 +159,8 @@ def _track(scene: Scene, rig_from_object: RigidTransform, options: IdentityOptio
     if scene.blobs.uv[..., 0].size * obj.num_fiducials > MOST_PAIRS:
         return _refuse(scene, _explain_too_many_blobs(scene))
     poses = _one_snapshot(rig_from_object)
-    predicted = predict_ideal(rig, obj.points.numpy(), poses)
-    distance = float(np.median(_distances(rig, poses, obj)))
+    predicted = predict_ideal(rig, scene.known.points, poses)
+    distance = _usual_distance(scene.known, poses)
     tolerance, gate = _bounds(scene, distance, pose_known=True)
     # If the fiducials are dense, a wide tolerance pairs them with anything: also try a narrow one.
     gap = spacing(predicted[0])
@@ -173,7 +188,7 @@ def relocalize(
     options: IdentityOptions = IdentityOptions(),
 ) -> Identity:
     """Label the blobs of one snapshot without a known pose; arguments and errors as for `identify`, std (C, K)."""
-    return _relocalize(Scene(gather(detections, rig), obj, rig, std), options)
+    return _relocalize(Scene(gather(detections, rig), Known(obj, rig, std)), options)
 
 
 def _relocalize(scene: Scene, options: IdentityOptions) -> Identity:
@@ -339,8 +354,8 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
     """
     shifts = lattice_shifts(scene.obj)
     pose = select_pose(scene, best, 0)
-    distance = scene.rig.working_distance or float(np.median(_distances(scene.rig, _one_snapshot(pose), scene.obj)))
-    pattern = pattern_prior(scene.std, scene.rig, distance)
+    distance = scene.rig.working_distance or _usual_distance(scene.known, _one_snapshot(pose))
+    pattern = scene.known.spread.at(distance)
     turns = [] if known_pose else near_symmetries(scene.obj, 2 * pattern.shape * scene.obj.size)
     if not shifts and not turns:
         return best, np.inf
@@ -462,11 +477,8 @@ def _bounds(scene: Scene, distance: float, pose_known: bool) -> tuple[float, flo
     Both follow from the prior. A pose from one camera inherits the camera's error, and its depth that of the focal
     length, which shifts the images of cameras elsewhere.
     """
-    pattern: PatternPrior = pattern_prior(scene.std, scene.rig, distance)
-    focal = float(scene.rig.focal_length.numpy().mean())
-    positions = scene.rig.positions.numpy()
-    baseline = float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
-    parallax = 2 * pattern.shape * focal * baseline / distance
+    pattern, focal = scene.known.spread.at(distance), scene.known.focal_length
+    parallax = 2 * pattern.shape * focal * scene.known.baseline / distance
     shift = float(np.hypot(pattern.shift.max() * (1.0 if pose_known else np.sqrt(2)), 0.0 if pose_known else parallax))
     bend = 2.5 * pattern.shape if pose_known else float(np.hypot(2.5 * pattern.shape, APPROXIMATE))
     return max(3.0, bend * focal * scene.obj.size / distance), max(10.0, 4 * shift)
@@ -484,6 +496,7 @@ def _guess_distance(scene: Scene) -> float:
     return float(np.median(guesses))
 
 
-def _distances(rig: CameraRig, poses: Poses, obj: CalibrationObject) -> NDArray[np.float64]:
-    centre = poses.rotation[0] @ obj.points.numpy().mean(0) + poses.translation[0]
-    return np.linalg.norm(rig.positions.numpy() - centre, axis=1)
+def _usual_distance(known: Known, poses: Poses) -> float:
+    """Median distance (mm) of the cameras from the object at the first of some poses."""
+    centre = poses.rotation[0] @ known.points.mean(0) + poses.translation[0]
+    return median(np.linalg.norm(known.shared.position - centre, axis=1))

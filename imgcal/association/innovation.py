@@ -6,13 +6,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.association.blobs import PaddedBlobs
-from imgcal.estimation import Problem, Solution, levenberg_marquardt_cpu
+from imgcal.estimation import Problem, levenberg_marquardt_cpu
+from imgcal.estimation.levenberg_marquardt_cpu import SnapshotFit
 from imgcal.geometry import NEAREST_DEPTH, kernels, lens_codes, lens_kernels
 from renderers.compiling import njit
 
@@ -43,8 +46,46 @@ def one_or_some(rows: NDArray[np.int64]) -> slice | NDArray[np.int64]:
     return slice(rows[0], rows[0] + 1) if len(rows) == 1 else rows
 
 
+@dataclass(frozen=True)
+class SharedValues:
+    """What the predictions of all fits share: the factory rig, its prior and the object."""
+
+    rotation: NDArray[np.float64]  # (C, 3, 3) cam_from_rig
+    position: NDArray[np.float64]  # (C, 3) mm
+    focal_length: NDArray[np.float64]  # (C, 2) px
+    principal_point: NDArray[np.float64]  # (C, 2) px
+    distortion: NDArray[np.float64]  # (C, D)
+    prior_std: NDArray[np.float64]  # (C, K)
+    points: NDArray[np.float64]  # (N, 3) mm, fiducials relative to their centroid
+    radius_squared: NDArray[np.float64]  # (N,) mm^2
+    lenses: NDArray[np.int64]  # (C,) see `lens_codes`
+
+    @classmethod
+    def of(cls, problem: Problem) -> SharedValues:
+        """Take the values of a problem whose rigs are all the same."""
+        factory, points, squared = problem.factory, problem.points, problem.radius_squared
+        lens = (factory.focal_length, factory.principal_point, factory.distortion)
+        rig = (factory.cam_from_rig.rotation, levenberg_marquardt_cpu.camera_positions(factory), *lens)
+        return cls(
+            *(np.ascontiguousarray(tensor[0].numpy()) for tensor in (*rig, problem.prior_std)),
+            np.ascontiguousarray(points.numpy()),
+            np.zeros(len(points)) if squared is None else squared.numpy(),
+            lens_codes(factory.lens_model, *factory.distortion.shape[-2:]),
+        )
+
+    @cached_property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """All but the object's, in the order of `_compare`."""
+        rig = (self.rotation, self.position, self.focal_length, self.principal_point, self.distortion)
+        return (*rig, self.prior_std, self.radius_squared, self.lenses)
+
+
 def innovations(
-    blobs: PaddedBlobs, labels: NDArray[np.int64], sigma: NDArray[np.float64], problem: Problem, solution: Solution
+    blobs: PaddedBlobs,
+    labels: NDArray[np.int64],
+    sigma: NDArray[np.float64],
+    shared: SharedValues,
+    fitted: Sequence[SnapshotFit],
 ) -> Innovations:
     """Compare predictions with blobs.
 
@@ -52,11 +93,10 @@ def innovations(
         blobs: the snapshot.
         labels: (K, C, N) labels of the fit: blob of each fiducial, -1 = none.
         sigma: (K,) px, noise of blob centres beyond their own sigmas.
-        problem: the problem of the fit.
-        solution: the fit.
+        shared: of the problem of the fits.
+        fitted: K fits.
     """
     count, cameras, fiducials = labels.shape
-    radius_squared = np.zeros(fiducials) if problem.radius_squared is None else problem.radius_squared.numpy()
     noise, typical = blobs.noise
     labels = np.ascontiguousarray(labels)
     shape = (count, cameras, fiducials)
@@ -64,37 +104,18 @@ def innovations(
     squared, log_det, own = np.empty((*shape, blobs.uv.shape[1])), np.zeros(shape), np.full(shape, np.inf)
     residual, freedom, uv = np.zeros(shape), np.zeros(shape), np.zeros((*shape, 2))
     complexity = np.full(count, np.inf)
-    equations, state = solution.equations, solution.state
-    factory, prior_std = problem.factory, problem.prior_std.numpy()
-    step = state.offset.numpy() * prior_std
-    lenses = lens_codes(factory.lens_model, *factory.distortion.shape[-2:])
-    given = [
-        np.ascontiguousarray(array)
-        for array in (
-            factory.cam_from_rig.rotation.numpy(),
-            step[..., :3],
-            levenberg_marquardt_cpu.camera_positions(factory).numpy() + step[..., 3:6],
-            factory.focal_length.numpy() + step[..., 6:8],
-            factory.principal_point.numpy() + step[..., 8:10],
-            factory.distortion.numpy() + step[..., 10:],
-            prior_std,
-            problem.points.numpy() @ state.rotation.numpy()[:, 0].swapaxes(-1, -2),
-            state.centre.numpy()[:, 0],
-        )
-    ]
-    for k, fitted in enumerate(np.isfinite(equations.cost.numpy())):
-        if not fitted:
+    for k, one in enumerate(fitted):
+        if not np.isfinite(one.cost):
             squared[k] = np.inf
             continue
         # Lower factors of the blocks of the cameras, the couplings and the pose: see schur.reduce.
-        eliminated = equations.camera[k].numpy().copy()
-        whitened = equations.coupling[k, 0].numpy().copy()
-        kept = equations.pose[k, 0].numpy().copy()
-        complexity[k] = _factorize(eliminated, whitened, kept)
+        factors = one.camera.copy(), one.coupling.copy(), one.pose.copy()
+        complexity[k] = _factorize(*factors)
         if np.isfinite(complexity[k]):
             _compare(
-                (*(array[k] for array in given), radius_squared, lenses),
-                (eliminated, whitened, kept),
+                (one.offset * shared.prior_std, np.ascontiguousarray(shared.points @ one.rotation.T), one.centre),
+                shared.arrays,
+                factors,
                 (blobs.uv, noise, typical, blobs.count, labels[k], sigma[k] ** 2),
                 (squared[k], log_det[k], own[k], residual[k], freedom[k], uv[k]),
             )
@@ -159,30 +180,34 @@ def _factorize(blocks, coupling, kept):
 
 
 @njit(cache=True, fastmath=kernels.FAST)
-def _compare(given, factors, blobs, outputs):
+def _compare(fitted, shared, factors, blobs, outputs):
     """Fill in the outputs for one labelling.
 
     Args:
-        given: the factory's rotations; the other values of the fitted cameras; the prior; the object and its position.
+        fitted: the cameras' steps from the factory rig, the object, turned, and its position.
+        shared: see `SharedValues.arrays`.
         factors: factors of the arrow matrix; see `_factorize`.
         blobs: their places, noise, typical noise, number, labels, and noise beyond their own.
         outputs: as in `Innovations`.
     """
-    rotation0, turn, position, focal, principal, distortion, prior_std, rotated, centre, radius_squared, lenses = given
+    step, rotated, centre = fitted
+    rotation0, positions, focal_lengths, principal_points, coefficients, prior_std, radius_squared, lenses = shared
     eliminated, whitened, kept = factors
     blob_uv, blob_noise, typical_noise, blob_count, labels, extra = blobs
     squared, log_det, own, residual, freedom, uv = outputs
-    free = 10 + lens_kernels.width_of(lenses, distortion)
+    free = 10 + lens_kernels.width_of(lenses, coefficients)
     rows, parts = np.empty((2, free + 6)), np.empty((2, free + 6))
     rotation, exponential, left = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     unit = max(1.0, np.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2))
     for c in range(len(rotation0)):
-        kernels.exponential(turn[c], exponential, left)
+        position, focal = positions[c] + step[c, 3:6], focal_lengths[c] + step[c, 6:8]
+        principal, distortion = principal_points[c] + step[c, 8:10], coefficients[c] + step[c, 10:]
+        kernels.exponential(step[c, :3], exponential, left)
         kernels.multiply(exponential, rotation0[c], rotation)
         for n in range(len(rotated)):
             _rows(
-                rotated[n], rotation, left, centre, position[c],
-                focal[c], principal[c], lenses, c, distortion[c], prior_std[c], radius_squared[n], unit, rows, uv[c, n],
+                rotated[n], rotation, left, centre, position,
+                focal, principal, lenses, c, distortion, prior_std[c], radius_squared[n], unit, rows, uv[c, n],
             )  # fmt: skip
             uu, uv_, vv = _whiten(rows, eliminated[c], whitened[c], kept, parts)
             label = labels[c, n]

@@ -14,7 +14,7 @@ from scipy.special import gammaincinv, logsumexp
 from imgcal.association.hypotheses import Poses
 from imgcal.association.identity import Identity, IdentityOptions, Status
 from imgcal.association.verification import Fits, Scene, evidence, fit, make_problem, rig_and_pose, start
-from imgcal.estimation import State, initial_pose, levenberg_marquardt_cpu
+from imgcal.estimation import initial_pose, levenberg_marquardt_cpu
 from imgcal.types import Observations
 
 MOST_LABELLINGS = 400
@@ -95,9 +95,9 @@ def _compare(scene: Scene) -> _Compared:
     fitted = _compare_alone(scene.select_camera(camera))
     fits, cameras = fitted.fits, scene.rig.num_cameras
     labels = np.full((len(fits.labels), cameras, scene.obj.num_fiducials), -1, dtype=np.int64)
-    offset = fits.state.offset.new_zeros(len(labels), *scene.std.shape)
-    labels[:, camera], offset[:, camera] = fits.labels[:, 0], fits.state.offset[:, 0]
-    return replace(fitted, fits=replace(fits, labels=labels, state=replace(fits.state, offset=offset)))
+    offset = np.zeros((len(labels), *scene.std.shape))
+    labels[:, camera], offset[:, camera] = fits.labels[:, 0], fits.offset[:, 0]
+    return replace(fitted, fits=replace(fits, labels=labels, offset=offset))
 
 
 def _compare_alone(scene: Scene) -> _Compared:
@@ -123,26 +123,25 @@ def _compare_alone(scene: Scene) -> _Compared:
 def _choose_better(first: _Compared, second: _Compared) -> _Compared:
     """The better of two fits of each labelling."""
     other = second.cost < first.cost
-    a, b, take = first.fits.state, second.fits.state, torch.from_numpy(other)
-    state = State(
-        torch.where(take[:, None, None], b.offset, a.offset),
-        torch.where(take[:, None, None, None], b.rotation, a.rotation),
-        torch.where(take[:, None, None], b.centre, a.centre),
-    )
+    a, b = first.fits, second.fits
+    offset = np.where(other[:, None, None], b.offset, a.offset)
+    rotation = np.where(other[:, None, None], b.rotation, a.rotation)
+    centre = np.where(other[:, None], b.centre, a.centre)
     cost, off = np.where(other, second.cost, first.cost), np.where(other, second.off, first.off)
-    return _Compared(replace(first.fits, state=state, cost=cost), cost, off)
+    return _Compared(replace(a, offset=offset, rotation=rotation, centre=centre, cost=cost), cost, off)
 
 
 def _minimize(scene: Scene, fits: Fits) -> _Compared:
     """Fit each labelling with squared errors: errors must count in full."""
     problem = make_problem(scene, fits)
     solution = levenberg_marquardt_cpu.minimize(problem, fits.state, "squared", 1.0, 30, 1e-4)
-    cost = solution.equations.cost.numpy()
+    state, cost = solution.state, solution.equations.cost.numpy()
     seen = (fits.labels >= 0)[:, None]
     squares = np.where(seen[:, :, :, None], solution.equations.residual.numpy() ** 2, 0.0).sum((1, 2, 3, 4))
     off = np.sqrt(squares / seen.sum((1, 2, 3)))
     cost = np.where(np.isfinite(cost), cost, np.inf)
-    return _Compared(replace(fits, state=solution.state, cost=cost), cost, off)
+    offset, rotation, centre = (part.numpy() for part in (state.offset, state.rotation[:, 0], state.centre[:, 0]))
+    return _Compared(replace(fits, offset=offset, rotation=rotation, centre=centre, cost=cost), cost, off)
 
 
 def _mirror(scene: Scene, poses: Poses) -> Poses:

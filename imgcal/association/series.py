@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from imgcal.association.identity import PipelineOptions
 from imgcal.association.proposals import Sight
@@ -30,6 +30,7 @@ PATTERN = 3
 """Blobs of one camera that are likely to show the object, not only stray lights."""
 LEAST_CERTAIN_FIRST = ("ambiguous", "by_prior", "unique", "coded", "by_tracking")
 
+Pose = tuple[NDArray[np.float64], NDArray[np.float64]]  # rotation (3, 3), translation (3,) mm: quicker than tensors
 Progress = Callable[[Iterable[int], int], Iterable[int]]
 
 
@@ -235,12 +236,15 @@ class _Series:
         first, second, third = (None if result is None else result[0].rig_from_object for result in before)
         if first is None or second is None or third is None or self.tracker.obj.pose_rank < 6:
             return None
-        points = self.tracker.obj.points.to(third.rotation)
-
-        def off(pose: RigidTransform) -> float:
-            return float((pose.apply(points) - third.apply(points)).norm(dim=-1).mean())
-
-        return _continue(second, third, points) if off(_continue(first, second, points)) < off(second) else None
+        points = self.tracker.obj.points.double().numpy()
+        poses = [(pose.rotation.double().numpy(), pose.translation.double().numpy()) for pose in (first, second, third)]
+        moved = [_continue(*poses[:2], points), poses[1]]
+        shown = [points @ rotation.T + translation for rotation, translation in (*moved, poses[2])]
+        by_motion, by_rest = (np.linalg.norm(one - shown[-1], axis=1).mean() for one in shown[:2])
+        if by_motion >= by_rest:
+            return None
+        there = _continue(*poses[1:], points)
+        return RigidTransform(*(torch.from_numpy(part).to(third.rotation) for part in there))
 
     def _nearest_pose(self, s: int, accepted: NDArray[np.int64]) -> RigidTransform | None:
         """Pose of the nearest of the accepted snapshots, which may be the snapshot itself."""
@@ -329,12 +333,11 @@ def refuse_snapshots(labelled: Associations, rows: Sequence[int], reason: str) -
     return replace(labelled, detections=replace(detections, fiducial=fiducial), snapshots=tuple(snapshots))
 
 
-def _continue(before: RigidTransform, last: RigidTransform, points: Tensor) -> RigidTransform:
+def _continue(before: Pose, last: Pose, points: NDArray[np.float64]) -> Pose:
     """Pose after the motion between two snapshots has happened once more, about the centroid of points (N, 3)."""
-    centre = points.mean(0, keepdim=True)
-    rotation = last.rotation @ before.rotation.mT @ last.rotation
-    there = 2 * last.apply(centre)[0] - before.apply(centre)[0]
-    return RigidTransform(rotation, there - rotation @ centre[0])
+    centre, rotation = points.mean(0), last[0] @ before[0].T @ last[0]
+    there = 2 * (last[0] @ centre + last[1]) - (before[0] @ centre + before[1])
+    return rotation, there - rotation @ centre
 
 
 def _gap(snapshot: int, accepted: NDArray[np.int64]) -> int:

@@ -12,7 +12,6 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from imgcal.association.blobs import pattern_prior
 from imgcal.association.hypotheses import Poses
 from imgcal.association.search import distinct
 from imgcal.association.verification import Fits, Scene, refine, start
@@ -72,7 +71,7 @@ def fit_sticks(scene: Scene, seed: int) -> Fits | None:
     poses, away = _candidates(scene, eyes, distance, np.random.default_rng(seed))
     if not len(poses):
         return None
-    pattern = pattern_prior(scene.std, scene.rig, away)
+    pattern = scene.known.spread.at(away)
     focal, points = float(scene.rig.focal_length.mean()), scene.obj.points.double().numpy()
     tolerance = max(3.0, float(np.hypot(2.5 * pattern.shape, BEND)) * focal * scene.obj.size / away)
     gate = max(10.0, REACH * 2**0.5 * float(pattern.shift.max()))
@@ -99,7 +98,7 @@ def _eyes(scene: Scene) -> tuple[_Eyes, float]:
     xy = blobs.ideal.astype(np.float64) / focal[:, None]
     rays = np.concatenate((xy, np.ones((*xy.shape[:2], 1))), -1) @ rig.cam_from_rig.rotation.double().numpy()
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    shift = pattern_prior(scene.std, rig, float(distance)).shift
+    shift = scene.known.spread.at(float(distance)).shift
     return _Eyes(rays, position, shift / focal.mean(1), blobs.count), float(distance)
 
 

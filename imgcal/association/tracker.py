@@ -9,9 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imgcal.association.identification import identify
+from imgcal.association.identification import identify_with
 from imgcal.association.identity import Identity, PipelineOptions, Status, orient
 from imgcal.association.proposals import Sight, Snapshot, judge
+from imgcal.association.verification import Known
 from imgcal.errors import InputError
 from imgcal.estimation import estimate, flat_std, has_poses
 from imgcal.geometry import RigidTransform, geodesic_angle
@@ -100,6 +101,7 @@ class Tracker:
         self.obj, self.options, self.first = obj, options, first
         self.learnt = learnt or LearntRig(rig, obj, options, remembered)
         self.pose = None if options.start_pose is None else _check_pose(options.start_pose, rig)
+        self._known: Known | None = None
         self.alternatives = 0  # left by the accepted snapshots, 0 = none accepted yet
         self.in_vain = 0  # number of hypotheses since the last success
         self.looks_in_vain = 0  # snapshots without a proposal, less those with one
@@ -224,15 +226,21 @@ class Tracker:
         """
         error = np.hypot(self.options.identity_error, self._tolerance_px(blobs))
         blobs = replace(blobs, sigma=np.hypot(blobs.sigma, error))
-        known = [pose for pose in (expected, self.pose) if pose is not None]
+        poses = [pose for pose in (expected, self.pose) if pose is not None]
         # In many captures the object is at the origin of the rig's frame; this is cheap to try first.
-        guesses = [] if known else [RigidTransform.identity(dtype=self.rig.focal_length.dtype)]
-        options = self.options.identity
-        return identify(blobs, self.rig, self.obj, self.prior_std, known, options, guesses, search=search)
+        guesses = [] if poses else [RigidTransform.identity(dtype=self.rig.focal_length.dtype)]
+        return identify_with(self._know(), blobs, poses, self.options.identity, guesses, search=search)
 
     def conclude(self, proposed: Identity, blobs: Detections, name: str) -> tuple[SnapshotIdentity, NDArray[np.int64]]:
         """Update the state with the result of `propose` for these M blobs; return the decision and the labels (M,)."""
         return self._conclude(self._adopt(proposed), blobs, name)
+
+    def _know(self) -> Known:
+        """Return what the accepted snapshots tell about the rig, the same until they tell more."""
+        known = self._known
+        if known is None or known.rig is not self.rig or known.std is not self.prior_std:
+            known = self._known = Known(self.obj, self.rig, self.prior_std)
+        return known
 
     def _adopt(self, found: Identity) -> Identity:
         """Interpret a decision given the earlier ones."""

@@ -3,6 +3,10 @@
 A label can be judged only after such a fit: the factory rig alone is off by tens of pixels.
 """
 
+# Compiled functions take their types from their arguments.
+# ruff: noqa: ANN001, ANN202
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -17,12 +21,21 @@ from torch import Tensor
 
 from imgcal.association.ambiguities import lattice_shifts
 from imgcal.association.assignment import assign
-from imgcal.association.blobs import PaddedBlobs
+from imgcal.association.blobs import PaddedBlobs, PriorSpread
 from imgcal.association.hypotheses import Poses
-from imgcal.association.innovation import THRESHOLD, Innovations, find_contested, innovations, one_or_some
-from imgcal.estimation import Problem, Solution, State, cauchy, levenberg_marquardt_cpu, pose_at
+from imgcal.association.innovation import (
+    THRESHOLD,
+    Innovations,
+    SharedValues,
+    find_contested,
+    innovations,
+    one_or_some,
+)
+from imgcal.estimation import Problem, State, cauchy, levenberg_marquardt_cpu
 from imgcal.geometry import RigidTransform
+from imgcal.medians import median
 from imgcal.types import CalibrationObject, CameraRig
+from renderers.compiling import njit
 
 STAGES = (3.0, 0.7)
 """Standard deviations (px), beyond the blobs' own, in the first fits; the last ones use the residuals' level."""
@@ -39,10 +52,12 @@ UNDECIDED = 2 * np.log(1e3)
 
 
 @dataclass(frozen=True)
-class Scene:
-    """Input of a fit: the blobs, the object, the factory rig and its prior."""
+class Known:
+    """What is known before a snapshot: the object, the factory rig and its prior.
 
-    blobs: PaddedBlobs
+    All snapshots share it, and so do the values computed from it here.
+    """
+
     obj: CalibrationObject
     rig: CameraRig
     std: Tensor  # (C, K)
@@ -67,9 +82,67 @@ class Scene:
         """Fits of one labelling after the other."""
         return levenberg_marquardt_cpu.RigSolver(self.problem)
 
+    @cached_property
+    def shared(self) -> SharedValues:
+        """The same for predictions."""
+        return SharedValues.of(self.problem)
+
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        """Fiducials: (N, 3) mm."""
+        return self.obj.points.double().numpy()
+
+    @cached_property
+    def image_size(self) -> NDArray[np.int64]:
+        """Width and height: (C, 2) px."""
+        return self.rig.image_size.numpy()
+
+    @cached_property
+    def focal_length(self) -> float:
+        """Mean over all cameras: px."""
+        return float(self.rig.focal_length.numpy().mean())
+
+    @cached_property
+    def baseline(self) -> float:
+        """Distance of the outermost camera from the middle of the rig: mm."""
+        positions = self.shared.position
+        return float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
+
+    @cached_property
+    def spread(self) -> PriorSpread:
+        """The prior's effect on the images of an object at any distance."""
+        return PriorSpread.of(self.std, self.rig)
+
+    def select_camera(self, camera: int) -> Known:
+        """Keep one camera."""
+        return Known(self.obj, self.rig.select([camera]), self.std[[camera]])
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Input of a fit: the blobs of a snapshot, and what is known beside them."""
+
+    blobs: PaddedBlobs
+    known: Known
+
+    @property
+    def obj(self) -> CalibrationObject:
+        """The calibration object."""
+        return self.known.obj
+
+    @property
+    def rig(self) -> CameraRig:
+        """The factory rig."""
+        return self.known.rig
+
+    @property
+    def std(self) -> Tensor:
+        """Standard deviations of its prior: (C, K)."""
+        return self.known.std
+
     def select_camera(self, camera: int) -> Scene:
         """Keep one camera."""
-        return Scene(self.blobs.select_camera(camera), self.obj, self.rig.select([camera]), self.std[[camera]])
+        return Scene(self.blobs.select_camera(camera), self.known.select_camera(camera))
 
 
 @dataclass(frozen=True)
@@ -77,43 +150,47 @@ class Fits:
     """K labellings, each with the rig and pose that fit it best."""
 
     labels: NDArray[np.int64]  # (K, C, N) blob of each fiducial, -1 = none
-    state: State
+    offset: NDArray[np.float64]  # (K, C, P) step from the factory rig in prior standard deviations
+    rotation: NDArray[np.float64]  # (K, 3, 3) of the object
+    centre: NDArray[np.float64]  # (K, 3) mm, where its centroid is
     sigma: NDArray[np.float64]  # (K,) px, error of blob centres beyond their own sigmas
     cost: NDArray[np.float64]  # (K,) half of chi2, data and prior
-    innovations: Innovations | None = None  # of these labels at this state
+    innovations: Innovations | None = None  # of these labels with this rig and pose
+
+    @property
+    def state(self) -> State:
+        """Rigs and poses as the solver's state."""
+        offset, rotation, centre = map(torch.from_numpy, (self.offset, self.rotation, self.centre))
+        return State(offset, rotation[:, None], centre[:, None])
 
     def select(self, rows: NDArray[np.int64]) -> Fits:
         """Keep the given labellings, without a copy if it is a single one."""
         chosen = one_or_some(rows)
-        state = State(self.state.offset[chosen], self.state.rotation[chosen], self.state.centre[chosen])
         found = None if self.innovations is None else self.innovations.select(rows)
-        return Fits(self.labels[chosen], state, self.sigma[chosen], self.cost[chosen], found)
+        given = (self.labels, self.offset, self.rotation, self.centre, self.sigma, self.cost)
+        return Fits(*(column[chosen] for column in given), found)
 
 
 def join(parts: Sequence[Fits]) -> Fits:
     """Concatenate fitted labellings of one snapshot."""
     if len(parts) == 1:
         return parts[0]
-    states, found = [part.state for part in parts], [_require_innovations(part) for part in parts]
-    columns = ("offset", "rotation", "centre")
-    state = State(*(torch.cat([getattr(state, name) for state in states]) for name in columns))
-    innovations = Innovations(
-        *(np.concatenate([getattr(one, field.name) for one in found]) for field in fields(Innovations))
-    )
-    labels, sigma, cost = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("labels", "sigma", "cost")
-    )
-    return Fits(labels, state, sigma, cost, innovations)
+    found = [_require_innovations(part) for part in parts]
+
+    def cat(records: Sequence[Any], kind: type[Fits | Innovations]) -> list[NDArray[Any]]:
+        names = [field.name for field in fields(kind) if field.name != "innovations"]
+        return [np.concatenate([getattr(record, name) for record in records]) for name in names]
+
+    return Fits(*cat(parts, Fits), Innovations(*cat(found, Innovations)))
 
 
 def start(scene: Scene, poses: Poses, labels: NDArray[np.int64]) -> Fits:
     """Start with the factory rig at poses (K,) with rough labels (K, C, N)."""
+    count = len(poses)
     u, _, vh = np.linalg.svd(poses.rotation)
-    rotation = torch.from_numpy(u @ vh)
-    centroid = scene.problem.centroid.to(rotation)
-    centre = torch.from_numpy(np.ascontiguousarray(poses.translation)) + rotation @ centroid
-    offset = rotation.new_zeros(len(poses), *scene.std.shape)
-    return Fits(labels, State(offset, rotation[:, None], centre[:, None]), np.zeros(len(poses)), np.zeros(len(poses)))
+    rotation = u @ vh
+    centre = poses.translation + rotation @ scene.known.problem.centroid.numpy()
+    return Fits(labels, np.zeros((count, *scene.std.shape)), rotation, centre, np.zeros(count), np.zeros(count))
 
 
 def refine(scene: Scene, fits: Fits, stages: tuple[float, ...] = STAGES) -> Fits:
@@ -161,7 +238,8 @@ def drop_uncertain_labels(scene: Scene, fits: Fits, odds: float, least_odds: flo
     # Estimate the density of false blobs once: a dropped label must not count as a false blob against the others.
     surroundings = _label_gain(scene, fits, (fits.labels >= 0).sum((1, 2)))[:, None, None]
     log_odds = _log_density(_require_innovations(fits)) + surroundings
-    usual = np.median(log_odds[np.isfinite(log_odds)]) if np.isfinite(log_odds).any() else 0.0
+    finite = np.isfinite(log_odds)
+    usual = median(log_odds[finite]) if finite.any() else 0.0
     demanded = np.clip(usual - np.log(100), np.log(least_odds), np.log(odds))
     # Two or three labels of one camera can support each other in the wrong place: most of its view must fit.
     # In a lattice, half of them can, one step away.
@@ -209,17 +287,17 @@ def part_of_camera(scene: Scene, fits: Fits, camera: int) -> Fits:
     A fit of that camera alone costs at most as much.
     """
     one = slice(camera, camera + 1)
-    found, labels, offset = _require_innovations(fits), fits.labels[:, one], fits.state.offset[:, one]
+    found, labels, offset = _require_innovations(fits), fits.labels[:, one], fits.offset[:, one]
     parts = (getattr(found, field.name) for field in fields(Innovations))
     variance = (_blob_noise(scene, fits) + fits.sigma[:, None, None] ** 2)[:, one]
     squared = np.where(labels >= 0, found.residual[:, one] / variance, 0)
-    loss = cauchy(torch.from_numpy(squared), THRESHOLD)[0].sum((1, 2))
-    return Fits(
-        labels,
-        replace(fits.state, offset=offset),
-        fits.sigma,
-        0.5 * (loss + offset.square().sum((1, 2))).numpy(),
-        Innovations(*(part if part.ndim == 1 else part[:, one] for part in parts)),
+    loss = cauchy(torch.from_numpy(squared), THRESHOLD)[0].sum((1, 2)).numpy()
+    return replace(
+        fits,
+        labels=labels,
+        offset=offset,
+        cost=0.5 * (loss + (offset**2).sum((1, 2))),
+        innovations=Innovations(*(part if part.ndim == 1 else part[:, one] for part in parts)),
     )
 
 
@@ -230,14 +308,15 @@ def predictions(fits: Fits) -> NDArray[np.float64]:
 
 def rig_and_pose(scene: Scene, fits: Fits, row: int) -> tuple[CameraRig, RigidTransform]:
     """Return the rig and rig_from_object of one labelling, without batch axes."""
-    return levenberg_marquardt_cpu.rig_at(scene.problem, fits.state.offset[row : row + 1])[0], select_pose(
-        scene, fits, row
-    )
+    offset = torch.from_numpy(fits.offset[row : row + 1])
+    return levenberg_marquardt_cpu.rig_at(scene.known.problem, offset)[0], select_pose(scene, fits, row)
 
 
 def select_pose(scene: Scene, fits: Fits, row: int) -> RigidTransform:
     """Return rig_from_object of one labelling, without batch axes."""
-    return pose_at(scene.problem, fits.state)[row, 0]
+    rotation = fits.rotation[row]
+    translation = fits.centre[row] - rotation @ scene.known.problem.centroid.numpy()
+    return RigidTransform(torch.from_numpy(rotation), torch.from_numpy(translation))
 
 
 def _require_innovations(fits: Fits) -> Innovations:
@@ -257,50 +336,36 @@ def _blob_noise(scene: Scene, fits: Fits) -> NDArray[np.float64]:
 
 def make_problem(scene: Scene, fits: Fits) -> Problem:
     """Convert labellings into an estimation problem."""
-    count, cameras, _ = fits.labels.shape
-    seen = fits.labels >= 0
-    uv = np.where(seen[..., None], scene.blobs.uv[np.arange(cameras)[:, None], np.maximum(fits.labels, 0)], 0.0)
+    count = len(fits.labels)
+    uv, root_weight = (torch.from_numpy(array)[:, None] for array in _observe(scene, fits))
+    rigs = {"factory": scene.rig.expand(count), "prior_std": scene.std.expand(count, -1, -1)}
+    return replace(scene.known.problem, uv=uv, root_weight=root_weight, **rigs)
+
+
+def _observe(scene: Scene, fits: Fits) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels (K, C, 2, N) of the labels, and their inverse standard deviations (K, C, N), 0 = no label."""
+    seen, cameras = fits.labels >= 0, np.arange(fits.labels.shape[1])[:, None]
+    uv = np.where(seen[..., None], scene.blobs.uv[cameras, np.maximum(fits.labels, 0)], 0.0)
     sigma = np.sqrt(_blob_noise(scene, fits) + fits.sigma[:, None, None] ** 2)
-    problem = replace(
-        scene.problem,
-        uv=torch.from_numpy(np.ascontiguousarray(uv.swapaxes(-1, -2)))[:, None],
-        root_weight=torch.from_numpy(seen / sigma)[:, None],
-    )
-    if count == 1:
-        return problem
-    return replace(problem, factory=scene.rig.expand(count), prior_std=scene.std.expand(count, -1, -1))
+    return np.ascontiguousarray(uv.swapaxes(-1, -2)), seen / sigma
 
 
 def fit(scene: Scene, fits: Fits) -> Fits:
     """Fit labellings without relabelling."""
     # Sequentially: on a busy machine, starting threads takes longer than a few small fits.
-    problem = make_problem(scene, fits)
-    if len(fits.labels) == 1:
-        solution = _minimize(scene, problem, fits.state)
-    else:
-        bare = replace(fits, innovations=None)
-        each = (bare.select(np.array([k])) for k in range(len(fits.labels)))
-        solution = _stack_solutions([_minimize(scene, make_problem(scene, one), one.state) for one in each])
-    found = innovations(scene.blobs, fits.labels, fits.sigma, problem, solution)
-    return replace(fits, state=solution.state, cost=solution.equations.cost.numpy(), innovations=found)
-
-
-def _minimize(scene: Scene, problem: Problem, state: State) -> Solution:
-    return scene.solver.minimize(problem, state, "cauchy", THRESHOLD, 8, 1e-3)
-
-
-def _stack_solutions(solutions: Sequence[Solution]) -> Solution:
-    """Stack the solutions of several labellings along a batch axis."""
-
-    def cat(parts: Sequence[Any]) -> Any:
-        """Concatenate records of tensors, field by field."""
-        names = [field.name for field in fields(parts[0])]
-        columns = {name: [getattr(part, name) for part in parts] for name in names}
-        return type(parts[0])(**{k: None if v[0] is None else torch.cat(v) for k, v in columns.items()})
-
-    converged = torch.cat([solution.converged for solution in solutions])
-    state, equations = (cat([getattr(solution, name) for solution in solutions]) for name in ("state", "equations"))
-    return Solution(state, equations, converged, max(solution.iterations for solution in solutions))
+    columns = (*_observe(scene, fits), fits.offset, fits.rotation, fits.centre)
+    solver = scene.known.solver
+    fitted = [
+        solver.fit_snapshot(uv, weight, tuple(first), "cauchy", THRESHOLD, 8, 1e-3)
+        for uv, weight, *first in zip(*columns, strict=True)
+    ]
+    offset, rotation, centre = (
+        np.stack([getattr(one, name) for one in fitted]) for name in ("offset", "rotation", "centre")
+    )
+    return Fits(
+        fits.labels, offset, rotation, centre, fits.sigma, np.array([one.cost for one in fitted]),
+        innovations(scene.blobs, fits.labels, fits.sigma, scene.known.shared, fitted),
+    )  # fmt: skip
 
 
 def _residual_sigma(scene: Scene, fits: Fits) -> NDArray[np.float64]:
@@ -329,20 +394,33 @@ def _size_misfit(scene: Scene, fits: Fits) -> NDArray[np.float64]:
 
 def _label_gain(scene: Scene, fits: Fits, labelled: NDArray[np.int64]) -> NDArray[np.float64]:
     """Log odds (K,) that a label adds to the evidence, without its blob's density, if there are `labelled` (K,)."""
-    uv, size = _require_innovations(fits).uv, scene.rig.image_size.numpy()[:, None]
-    in_view = ((uv > 0) & (uv < size)).all(-1).sum((1, 2))
+    uv, size = _require_innovations(fits).uv, scene.known.image_size
+    in_view, near, area = np.empty(len(uv)), np.empty(len(uv)), np.empty(len(uv))
+    _survey(uv, size, scene.blobs.uv, (in_view, near, area))
     detected = np.clip((labelled + 1) / (in_view + 2), 0.05, 0.95)  # share of the visible fiducials
-    return np.log(detected / (1 - detected)) - np.log(_clutter(scene, uv, labelled))
+    # False blobs per square pixel, near the object's image or overall, whichever is larger.
+    nearby = (np.maximum(near - labelled, 0) + 1) / area
+    overall = (scene.blobs.count.sum() - labelled + 1) / size.prod(1).sum()
+    return np.log(detected / (1 - detected)) - np.log(np.maximum(nearby, overall))
 
 
-def _clutter(scene: Scene, uv: NDArray[np.float64], labelled: NDArray[np.int64]) -> NDArray[np.float64]:
-    """False blobs per square pixel, near the object's image (K, C, N, 2) or overall, whichever is larger: (K,)."""
-    low, high = uv.min(2), uv.max(2)
-    middle, half = (low + high) / 2, 0.75 * (high - low) + 10
-    inside = (np.abs(scene.blobs.uv[None] - middle[:, :, None]) < half[:, :, None]).all(-1).sum((1, 2))
-    local = (np.maximum(inside - labelled, 0) + 1) / (4 * half.prod(-1)).sum(1)
-    overall = (scene.blobs.count.sum() - labelled + 1) / scene.rig.image_size.numpy().prod(1).sum()
-    return np.maximum(local, overall)
+@njit(cache=True)
+def _survey(uv, size, blobs, found):
+    """Fill in the number of fiducials (K, C, N, 2) in view, and number of blobs and area near the object's image."""
+    in_view, near, area = found
+    for k in range(len(uv)):
+        in_view[k], near[k], area[k] = 0, 0, 0
+        for c in range(len(size)):
+            left, top, right, bottom = np.inf, np.inf, -np.inf, -np.inf
+            for n in range(uv.shape[2]):
+                u, v = uv[k, c, n, 0], uv[k, c, n, 1]
+                in_view[k] += u > 0 and v > 0 and u < size[c, 0] and v < size[c, 1]
+                left, top, right, bottom = min(left, u), min(top, v), max(right, u), max(bottom, v)
+            wide, high = 0.75 * (right - left) + 10, 0.75 * (bottom - top) + 10
+            area[k] += 4 * wide * high
+            for m in range(blobs.shape[1]):
+                off_u, off_v = blobs[c, m, 0] - (left + right) / 2, blobs[c, m, 1] - (top + bottom) / 2
+                near[k] += abs(off_u) < wide and abs(off_v) < high
 
 
 def _log_density(found: Innovations) -> NDArray[np.float64]:

@@ -85,6 +85,28 @@ def minimize(
     return Solution(state, blocks.equations(), torch.from_numpy(converged), int(iterations.max()))
 
 
+@dataclass(frozen=True)
+class SnapshotFit:
+    """A rig fitted to one snapshot: the best state, and the normal equations there as in `NormalEquations`."""
+
+    offset: np.ndarray  # (C, K) whitened
+    rotation: np.ndarray  # (3, 3) of the object
+    centre: np.ndarray  # (3,) mm
+    cost: float
+    camera: np.ndarray  # (C, K, K)
+    coupling: np.ndarray  # (C, K, 6)
+    pose: np.ndarray  # (6, 6)
+
+    @classmethod
+    def of(cls, solution: Solution) -> SnapshotFit:
+        """Take the values of a solution with one rig and one snapshot."""
+        state, found = solution.state, solution.equations
+        parts = (found.camera[0], found.coupling[0, 0], found.pose[0, 0])
+        camera, coupling, pose = (part.contiguous().numpy() for part in parts)
+        given = (part[0].numpy() for part in (state.offset, state.rotation[:, 0], state.centre[:, 0]))
+        return cls(*given, float(found.cost[0]), camera, coupling, pose)
+
+
 class RigSolver:
     """Fits of a single rig to many sets of observations: what these share is converted for compiled code once."""
 
@@ -93,8 +115,9 @@ class RigSolver:
         given = _arrays(_problem_arrays(problem)[2:])
         own = problem.object_prior_std
         own_std = np.empty(0, given[0].dtype) if own is None else own.detach().contiguous().numpy()[0]
-        self._shared = shared_arrays(problem)
+        self._problem, self._shared = problem, shared_arrays(problem)
         self._given = (*(array[0] for array in given), own_std)
+        self._blocks = _sizes_of_blocks(problem)
 
     def minimize(
         self, problem: Problem, start: State, loss: LossName, threshold: float, max_iterations: int, tolerance: float
@@ -106,23 +129,66 @@ class RigSolver:
         offset = start.object_offset
         own = np.zeros_like(self._given[-1]) if offset is None else offset.detach().numpy()[0]
         first = (*(part.detach().numpy()[0] for part in (start.offset, start.rotation, start.centre)), own)
-        states = tuple(np.empty((2, *part.shape), uv.dtype) for part in first)
-        for state, part in zip(states, first, strict=True):
-            state[0] = part
-        cameras_first, sizes = _sizes_of_blocks(problem)
-        *parts, cost = (np.empty((2, *size), uv.dtype) for size in sizes)
-        converged, iterations = np.zeros(1, np.bool_), np.zeros(1, np.int64)
-        rounding = (4 * np.finfo(uv.dtype).eps) ** 2 * np.square(uv * root_weight[..., None, :]).sum()
-        best = _minimize_rig(
-            (*self._shared, uv, root_weight, *self._given), states, tuple(parts), cost, converged, iterations,
-            (cameras_first, LOSS_CODES[loss], threshold, max_iterations), uv.dtype.type(tolerance + rounding),
-        )  # fmt: skip
-        one = slice(best, best + 1)
-        blocks = _Blocks(cameras_first, *(torch.from_numpy(part) for part in (*(p[one] for p in parts), cost[:1])))
-        found = State(*(torch.from_numpy(state[one]) for state in states))
+        layout, limits = _sizes_of_blocks(problem), (loss, threshold, max_iterations, tolerance)
+        states, parts, converged, iterations = self._run(uv, root_weight, first, layout, limits)
+        blocks = _Blocks(layout[0], *(torch.from_numpy(part) for part in parts))
+        found = State(*(torch.from_numpy(state) for state in states))
         if not len(own):
             found = replace(found, object_offset=None)
         return Solution(found, blocks.equations(), torch.from_numpy(converged), int(iterations[0]))
+
+    def fit_snapshot(
+        self, uv: np.ndarray, root_weight: np.ndarray, start: tuple[np.ndarray, np.ndarray, np.ndarray],
+        loss: LossName, threshold: float, max_iterations: int, tolerance: float,
+    ) -> SnapshotFit:  # fmt: skip
+        """Do the same for one snapshot of a rigid object in arrays, which saves the conversion to tensors and back.
+
+        Args:
+            uv: (C, 2, N) pixels.
+            root_weight: (C, N) inverse standard deviations, 0 = not seen.
+            start: offset (C, K), rotation (3, 3) and centre (3,).
+            loss: as for `minimize`.
+            threshold: as for `minimize`.
+            max_iterations: as for `minimize`.
+            tolerance: as for `minimize`.
+        """
+        if without_machine_code(_minimize_rig):
+            values = (torch.from_numpy(array)[None, None] for array in (uv, root_weight, *start[1:]))
+            uv_, root_weight_, rotation, centre = values
+            problem = replace(self._problem, uv=uv_, root_weight=root_weight_)
+            state = State(torch.from_numpy(start[0])[None], rotation, centre)
+            return SnapshotFit.of(minimize(problem, state, loss, threshold, max_iterations, tolerance))
+        offset, rotation, centre = start
+        first = (offset, rotation[None], centre[None], np.zeros_like(self._given[-1]))
+        limits = (loss, threshold, max_iterations, tolerance)
+        states, parts, _, _ = self._run(uv[None], root_weight[None], first, self._blocks, limits)
+        (offset, rotation, centre, _), (camera, coupling, pose, *_, cost) = states, parts
+        return SnapshotFit(offset[0], rotation[0, 0], centre[0, 0], float(cost[0]), camera[0], coupling[0], pose[0, 0])
+
+    def _run(
+        self,
+        uv: np.ndarray,
+        root_weight: np.ndarray,
+        first: tuple[np.ndarray, ...],
+        layout: tuple[bool, tuple[tuple[int, ...], ...]],
+        limits: tuple[LossName, float, int, float],
+    ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
+        """Run the compiled loop; return the best state, its blocks, the cost last, converged (1,), iterations (1,)."""
+        states = tuple(np.empty((2, *part.shape), uv.dtype) for part in first)
+        for state, part in zip(states, first, strict=True):
+            state[0] = part
+        cameras_first, sizes = layout
+        *parts, cost = (np.empty((2, *size), uv.dtype) for size in sizes)
+        converged, iterations = np.zeros(1, np.bool_), np.zeros(1, np.int64)
+        loss, threshold, most, tolerance = limits
+        rounding = (4 * np.finfo(uv.dtype).eps) ** 2 * np.square(uv * root_weight[..., None, :]).sum()
+        best = _minimize_rig(
+            (*self._shared, uv, root_weight, *self._given), states, tuple(parts), cost, converged, iterations,
+            (cameras_first, LOSS_CODES[loss], threshold, most), uv.dtype.type(tolerance + rounding),
+        )  # fmt: skip
+        one = slice(best, best + 1)
+        blocks = (*(part[one] for part in parts), cost[:1])
+        return tuple(state[one] for state in states), blocks, converged, iterations
 
 
 @contextmanager

@@ -7,7 +7,7 @@ import torch
 
 from imgcal.association.blobs import PaddedBlobs, gather
 from imgcal.association.hypotheses import Poses
-from imgcal.association.verification import Scene
+from imgcal.association.verification import Known, Scene
 from imgcal.geometry import RigidTransform
 from imgcal.synthesis import RelativeDrift, synthesize
 from imgcal.types import CalibrationObject, CameraRig, Detections
@@ -63,7 +63,7 @@ def take(rig, obj, seed=0, *, drift=DRIFT, noise=0.1, false=0, missing=0) -> Sna
 
 def scene_of(snapshot: Snapshot, rig: CameraRig, obj: CalibrationObject, std=None) -> Scene:
     """What verification is given; `std` is that of the drift if none is said."""
-    return Scene(gather(snapshot.detections, rig), obj, rig, DRIFT.std(rig) if std is None else std)
+    return Scene(gather(snapshot.detections, rig), Known(obj, rig, DRIFT.std(rig) if std is None else std))
 
 
 def make_object(points: np.ndarray) -> CalibrationObject:

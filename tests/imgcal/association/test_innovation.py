@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from imgcal.association.blobs import gather
-from imgcal.association.innovation import THRESHOLD, find_contested, innovations
+from imgcal.association.innovation import THRESHOLD, SharedValues, find_contested, innovations
 from imgcal.association.verification import fit, make_problem, rig_and_pose, start
 from imgcal.estimation import Problem, Solution, State, levenberg_marquardt_cpu, linearize, pose_at, retract, rig_at
+from imgcal.estimation.levenberg_marquardt_cpu import SnapshotFit
 from imgcal.io import data_path, load_object, read_rig
 from imgcal.synthesis import synthesize
 from imgcal.types import Detections, RigPrior
@@ -46,7 +47,7 @@ def test_covariance_of_an_unlabelled_fiducial_matches_the_dense_one() -> None:
     )  # fmt: skip
     labels = np.tile(np.arange(8), (1, 2, 1))
     labels[0, 0, 3] = -1
-    found = innovations(blobs, labels, np.array([0.4]), problem, solution)
+    found = innovations(blobs, labels, np.array([0.4]), SharedValues.of(problem), [SnapshotFit.of(solution)])
 
     # Dense: the posterior covariance is the inverse of the whole arrow; the Jacobian of the missing fiducial comes from
     # its own normal equations, J^T J = products, which for one point have rank two.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.association import associate, identification, identify, match_to_rig, series, to_observations, tracker
+from imgcal.association import associate, identification, match_to_rig, series, to_observations, tracker
 from imgcal.errors import InputError, RefusedError
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
@@ -105,11 +105,11 @@ def test_a_wrong_object_is_refused_with_an_effort_that_does_not_grow_with_the_ca
     spent = []
 
     def counted(*arguments, **options):
-        spent.append(identify(*arguments, **options))
+        spent.append(identification.identify_with(*arguments, **options))
         return spent[-1]
 
     monkeypatch.setattr(series, "MOST_IN_VAIN", 250_000)
-    monkeypatch.setattr(tracker, "identify", counted)
+    monkeypatch.setattr(tracker, "identify_with", counted)
     rows = np.concatenate([np.flatnonzero(seen.snapshot == s % 4) for s in range(count)])
     names = tuple(map(str, range(count)))
     long = replace(seen.select(rows), snapshot=np.repeat(np.arange(count), len(seen) // 4), snapshot_names=names)

@@ -6,7 +6,7 @@ import torch
 from imgcal.association import PipelineOptions, Tracker, identify
 from imgcal.association.blobs import gather
 from imgcal.association.stick_poses import fit_sticks
-from imgcal.association.verification import Scene, rig_and_pose
+from imgcal.association.verification import Known, Scene, rig_and_pose
 from imgcal.pipeline import calibrate
 from imgcal.types import CalibrationObject, RigPrior
 from tests.imgcal.association.stick_scenes import PAIR, TRIPLE, capture, one_snapshot
@@ -56,7 +56,7 @@ def test_one_camera_alone_knows_no_stick():
 
 def test_the_stick_is_where_its_markers_are():
     rig, obj, blobs, true = capture(TRIPLE, 1, false=0)
-    scene = Scene(gather(one_snapshot(blobs, 0), rig), obj, rig, RigPrior().std(rig))
+    scene = Scene(gather(one_snapshot(blobs, 0), rig), Known(obj, rig, RigPrior().std(rig)))
     fits = fit_sticks(scene, seed=0)
     assert fits is not None
     assert (scene.blobs.to_rows(fits.labels[0]) == true).mean() > 0.9

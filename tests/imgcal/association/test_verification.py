@@ -11,6 +11,7 @@ from imgcal.association.blobs import PaddedBlobs
 from imgcal.association.hypotheses import Poses
 from imgcal.association.verification import (
     STAGES,
+    Known,
     Scene,
     drop_uncertain_labels,
     evidence,
@@ -200,7 +201,7 @@ def test_evidence_does_not_care_about_the_order_of_cameras_and_fiducials(scene, 
     blobs = PaddedBlobs(*parts, scene.blobs.row[cameras], scene.blobs.count[cameras], scene.blobs.rows)
     radius = None if asymmetric8.radius is None else asymmetric8.radius[order]
     obj = replace(asymmetric8, points=asymmetric8.points[order], colours=asymmetric8.colours[order], radius=radius)
-    other = Scene(blobs, obj, rig.select(cameras), scene.std[cameras])
+    other = Scene(blobs, Known(obj, rig.select(cameras), scene.std[cameras]))
     mixed = fit(other, started(other, snapshot, truth[cameras][:, order]))
     np.testing.assert_allclose(mixed.cost, fits.cost, rtol=1e-3)
     np.testing.assert_allclose(evidence(other, mixed), evidence(scene, fits), rtol=1e-3)
@@ -270,7 +271,7 @@ def test_radii_count_where_they_differ(rig) -> None:
     poses.translation[1] += snapshot.pose.rotation.numpy() @ turn.translation
     gaps = []
     for radii in (np.full_like(radius, np.nan), radius):
-        scene = replace(made, blobs=replace(made.blobs, radius=radii), std=DRIFT.std(rig))
+        scene = replace(made, blobs=replace(made.blobs, radius=radii))
         fits = fit(scene, start(scene, poses, np.stack((truth, swapped))))
         weights = evidence(scene, fits)
         gaps.append(weights[0] - weights[1])
