@@ -36,7 +36,7 @@ def schema() -> Any:
         ("seconds", pa.float64()), ("cpu_seconds", pa.float64()), ("written", pa.timestamp("us", "UTC")),
         ("cameras", pa.list_(text)), ("lenses", pa.list_(text)), ("parameters", pa.list_(text)), ("identity", text),
         ("offset", numbers), ("std", numbers), ("prior_std", numbers), ("unit", numbers),
-        ("whitened_offset", numbers), ("information_factor", pa.list_(pa.float32())), ("inflation", pa.float64()),
+        ("whitened_offset", numbers), ("information_factor", pa.list_(pa.float64())), ("inflation", pa.float64()),
         ("rms_px", pa.float64()), ("chi2_per_dof", pa.float64()), ("snapshots", pa.int32()), ("labels", pa.int32()),
         ("outliers", pa.int32()), ("moved", pa.list_(text)), ("rig_file", text),
     ])  # fmt: skip
@@ -117,30 +117,46 @@ class Dataset:
                 lock.release()
 
     def write_rigs(self, folder: Path) -> None:
-        """Write the rig file of every recalibrated capture that kept one: FOLDER/<device>-<item>.yaml."""
+        """Write the rig file of every recalibrated capture that kept one: FOLDER/<device>-<item>.yaml.
+
+        The file of a capture that no longer has one is deleted.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         columns = self.latest(("device", "status", "rig_file")).to_pydict()
         for item, device, text in zip(columns["item"], columns["device"], columns["rig_file"], strict=True):
-            if text is not None:
-                name = "".join(c if c.isalnum() or c in "-_" else "_" for c in device)[:60]
-                write_text(folder / f"{name}-{item[:8]}.yaml", text)
+            name = "".join(c if c.isalnum() or c in "-_" else "_" for c in device)[:60]
+            path = folder / f"{name}-{item[:8]}.yaml"
+            if text is None:
+                path.unlink(missing_ok=True)
+            else:
+                write_text(path, text)
 
     def files(self) -> list[Path]:
         """All files, oldest first."""
         return sorted(self.folder.glob("day=*/*.parquet"), key=lambda path: path.name)
 
-    def keys(self, *, again: bool = False) -> Keys:
-        """Read which captures are done.
+    def keys(self, *, again: bool = False, rigs: bool = False) -> Keys:
+        """Read which captures are done: those whose latest result belongs to their content.
 
         Args:
             again: those that failed for a reason which may be gone are not.
+            rigs: those without their rig file are not.
         """
-        keys = Keys()
+        items, keys, done = [np.empty(0, np.uint64)], [np.empty(0, np.uint64)], [np.empty(0, np.bool_)]
         for path in self.files():
-            columns = self._read(path, ["key", "status"]).to_pydict()
-            pairs = zip(columns["key"], columns["status"], strict=True)
-            keys.add([key for key, status in pairs if not (again and status in TRANSIENT)])
-        return keys
+            columns = self._read(path, ["item", "key", "status", *(["rig_file"] if rigs else [])])
+            key, status = columns["key"].to_pylist(), columns["status"].to_pylist()
+            items.append(np.array([_short(item) for item in columns["item"].to_pylist()], np.uint64))
+            keys.append(np.array([_short(one) if one else 0 for one in key], np.uint64))
+            left = [not one or (again and what in TRANSIENT) for one, what in zip(key, status, strict=True)]
+            if rigs:
+                without = columns["rig_file"].is_null().to_pylist()
+                left = [some or (lost and what == "ok") for some, lost, what in zip(left, without, status, strict=True)]
+            done.append(~np.array(left, np.bool_))
+        # A capture that has changed back is done again: its latest result counts, whatever came before.
+        item, key, is_done = (np.concatenate(parts)[::-1] for parts in (items, keys, done))
+        _, latest = np.unique(item, return_index=True)
+        return Keys(np.unique(key[latest][is_done[latest]]))
 
     def latest(self, columns: Sequence[str] | None = None) -> Any:
         """Read the latest result of each row of the manifest as an Arrow table; `columns`: only these.
@@ -154,7 +170,8 @@ class Dataset:
         tables = [self._read(path, wanted) for path in self.files()]
         if not tables:
             raise InputError(f"{self.folder}: found no results, expected those of a run of `imgcal fleet`")
-        table = pa.concat_tables(tables, promote_options="default")  # older files may lack a column
+        # Older files may lack a column, or be less precise.
+        table = pa.concat_tables(tables, promote_options="permissive")
         last: dict[str, int] = {item: row for row, item in enumerate(table["item"].to_pylist())}
         return table.take(sorted(last.values()))
 

@@ -27,9 +27,10 @@ from imgcal.association import PipelineOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import camera_covariance, whitened_covariance
 from imgcal.fleet.drift_information import parameter_units
-from imgcal.fleet.manifest import Item, open_file, short_reason
+from imgcal.fleet.manifest import Item, is_shipped, open_file, short_reason
 from imgcal.formats import load_rig
-from imgcal.io import Capture, load_object, open_input, rig_text, shipped_names
+from imgcal.formats.source import Source
+from imgcal.io import Capture, load_object, open_input, rig_text
 from imgcal.messages import one_line
 from imgcal.pipeline import Calibration, Detector, DetectorName, calibrate, capture_sight, detect_capture
 from imgcal.types import CalibrationObject, CameraRig
@@ -71,7 +72,7 @@ class TooLongError(BaseException):
 
 def item_id(item: Item) -> str:
     """Identify a row of the manifest by its cells, whatever its files hold: 32 hexadecimal digits."""
-    said = json.dumps([item.capture, item.rig, item.object, item.device, item.time])
+    said = json.dumps([item.capture, item.rig, item.object, item.device, item.time, item.given])
     return hashlib.blake2b(said.encode(), digest_size=16).hexdigest()
 
 
@@ -115,6 +116,13 @@ def process(item: Item, settings: Settings, known: frozenset[str] | Any = frozen
 def failed_row(item: Item, status: Status, reason: str) -> dict[str, Any]:
     """Row of a capture whose process died."""
     return _capture_row(item) | {"status": status, "reason": reason, "seconds": 0.0, "cpu_seconds": 0.0}
+
+
+def current_key(item: Item, settings: Settings) -> str:
+    """Digest of what a result of this row depends on now; empty where its files cannot be read."""
+    with contextlib.suppress(InputError, _Unreachable), tempfile.TemporaryDirectory(prefix="imgcal-fleet-") as folder:
+        return content_key(fetch(item.capture, Path(folder)), item, settings)
+    return ""
 
 
 def _capture_row(item: Item) -> dict[str, Any]:
@@ -170,19 +178,18 @@ def content_key(path: Path, item: Item, settings: Settings) -> str:
 
 
 def _read_content(url: str) -> bytes:
-    """Bytes of a rig or object file; the name itself of a shipped one."""
-    return url.encode() if _is_shipped(url) else _small_file(url, _stamp(url))
-
-
-def _is_shipped(name: str) -> bool:
-    return name in (*shipped_names("rigs", ".yaml"), *shipped_names("objects", ".csv"))
-
-
-def _stamp(url: str) -> str:
-    """A value that changes when a file does, without reading it if possible."""
+    """Bytes of all files that a rig or an object is read from; the name itself of a shipped one."""
+    if is_shipped(url):
+        return url.encode()
     if "://" in url:
-        return str(int(time.time()) // 60)  # asked for again every minute
-    found = _stat(url, "a file")
+        return _small_file(url, str(int(time.time()) // 60))  # asked for again every minute
+    _stat(url, "a file or the folder of a calibration", folder=True)
+    return b"".join(_small_file(str(path), _stamp(path)) for path in Source([Path(url)]).files)
+
+
+def _stamp(path: Path) -> str:
+    """A value that changes when a file does, without reading it."""
+    found = _stat(str(path), "a file")
     return f"{found.st_mtime_ns} {found.st_size} {found.st_ino}"
 
 
@@ -253,7 +260,9 @@ def result_columns(result: Calibration) -> dict[str, Any]:
         "prior_std": estimate.problem.prior_std.flatten().tolist(),
         "unit": parameter_units(result.factory).flatten().tolist(),
         "whitened_offset": solution.state.offset.flatten().tolist(),
-        "information_factor": factor[upper[0], upper[1]].float().numpy(),  # thousands: no list of Python's
+        # Thousands: no list of Python's. In double precision, without which directions that images do not show
+        # seem to have negative information.
+        "information_factor": factor[upper[0], upper[1]].numpy(),
         "inflation": estimate.mean_inflation,
         "rms_px": float(result.rms),
         "chi2_per_dof": float(result.chi2_per_dof),

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from imgcal.errors import InputError
+from imgcal.io.names import SAMPLE, shipped_names
 from imgcal.messages import list_names, quote
 
 REQUIRED = ("capture",)
@@ -113,7 +114,9 @@ class Manifest:
                 batches = pa.csv.open_csv(
                     file,
                     read_options=pa.csv.ReadOptions(use_threads=False),
-                    convert_options=pa.csv.ConvertOptions(column_types=as_text, strings_can_be_null=True),
+                    convert_options=pa.csv.ConvertOptions(
+                        column_types=as_text, null_values=[""], strings_can_be_null=True
+                    ),
                 )
             yield from batches
 
@@ -141,7 +144,7 @@ class Manifest:
             for name in KNOWN[:-1]
             if not isinstance(values.get(name), str | int | float | None)
         ]
-        text = {name: str(values[name]) if values.get(name) else None for name in KNOWN[:-1]}
+        text = {name: str(values[name]) if values.get(name) not in (None, "") else None for name in KNOWN[:-1]}
         named = {
             "capture": text["capture"] and _base_folder(self.url, text["capture"]),
             "rig": _base_folder(self.url, text["rig"]) if text["rig"] else self.rig,
@@ -168,13 +171,19 @@ def _base_folder(url: str, path: str) -> str:
     if "://" in path or posixpath.isabs(path):
         return path
     if "://" in url:
-        return posixpath.join(posixpath.dirname(url), path)
+        return path if is_shipped(path) else posixpath.join(posixpath.dirname(url), path)
     found = Path(url).parent / path
     try:
         is_file = "/" in path or "." in path or found.exists()
     except (OSError, ValueError):  # too long for a name, or no text: opening it reports the error
         is_file = True
     return str(found) if is_file else path
+
+
+def is_shipped(name: str) -> bool:
+    """Tell whether this is the name of a shipped rig, object or sample."""
+    shipped = (*shipped_names("rigs", ".yaml"), *shipped_names("objects", ".csv"))
+    return name in shipped or name.startswith(f"{SAMPLE}:")
 
 
 def open_file(url: str) -> Any:

@@ -12,7 +12,7 @@ import torch
 
 from imgcal.fleet.dataset import ROWS, SECONDS, Dataset, Keys
 from imgcal.fleet.engine import Engine, Lost
-from imgcal.fleet.job import Settings, Status, failed_row, process
+from imgcal.fleet.job import Settings, Status, current_key, failed_row, process
 from imgcal.fleet.manifest import Item, Manifest
 
 BATCH = 32
@@ -54,14 +54,15 @@ def recalibrate_fleet(
         InputError: the manifest cannot be read, or the dataset not be written. What was written stays.
     """
     count = FleetCount(manifest.count())
-    known = dataset.keys(again=again)
+    known = dataset.keys(again=again, rigs=settings.keep_rig)
     with dataset.open_writer() as writer:
         flushed = time.monotonic()
         outcomes = engine.run(_process, manifest.batches(batch), settings, known.freeze(), seconds=settings.seconds)
         for outcome in outcomes:
             if isinstance(outcome, Lost):
                 status: Status = "timed_out" if outcome.timed_out else "crashed"
-                rows: Sequence[dict[str, Any] | None] = [failed_row(outcome.item, status, outcome.reason)]
+                row = failed_row(outcome.item, status, outcome.reason)  # its process took the key along
+                rows: Sequence[dict[str, Any] | None] = [row | {"key": current_key(outcome.item, settings)}]
             else:
                 rows = outcome.results
             fresh = list(_new_rows(rows, known))

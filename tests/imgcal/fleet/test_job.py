@@ -13,6 +13,9 @@ import imgcal
 from imgcal.fleet import Item, Settings
 from imgcal.fleet import job as jobs
 from imgcal.fleet.job import content_key, process, result_columns
+from imgcal.formats.conversion import from_camera_rig
+from imgcal.formats.writing import convert_rig
+from imgcal.io import data_path
 from imgcal.synthesis import simulate_truth, true_detections
 from tests.imgcal.fleet.small_captures import write_capture
 
@@ -46,6 +49,23 @@ def test_the_key_says_what_a_result_depends_on(capture: Path, tmp_path: Path) ->
     assert before == content_key(capture, item(capture), Settings(seconds=1.0))
     capture.write_text(capture.read_text() + "\n")
     assert key() != before
+
+
+def test_the_key_covers_every_file_of_a_rig(capture: Path, tmp_path: Path) -> None:
+    """EasyMocap keeps a rig in two files: naming one is enough to read both."""
+    (tmp_path / "em").mkdir()
+    for name, content in convert_rig(from_camera_rig(imgcal.load_rig("T4")), "easymocap", "T4").files.items():
+        (tmp_path / "em" / name).write_bytes(content)
+    named = item(capture, rig=str(tmp_path / "em" / "intri.yml"))
+    before = content_key(capture, named, Settings())
+    (tmp_path / "em" / "extri.yml").write_text((tmp_path / "em" / "extri.yml").read_text() + "\n")
+    assert content_key(capture, named, Settings()) != before
+    assert process(item(capture, rig=str(tmp_path / "em")), Settings())["status"] != "fault"
+
+
+def test_shipped_samples_go_by_their_names() -> None:
+    row = process(item(data_path("samples", "O10"), rig="sample:O10", object="sample:O10"), Settings())
+    assert row is not None and row["status"] == "ok", row
 
 
 @pytest.mark.parametrize(

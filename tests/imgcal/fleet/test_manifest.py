@@ -8,6 +8,7 @@ import pytest
 import imgcal
 from imgcal.fleet import Manifest, Settings, write_manifest
 from imgcal.fleet.job import process
+from imgcal.fleet.manifest import _base_folder
 
 
 def items(path: Path, **kwargs: str) -> list[object]:
@@ -31,6 +32,19 @@ def test_paths_times_and_numbers(tmp_path: Path) -> None:
     assert (two.time, two.given) == (86400.0, ())
     assert (three.capture, three.rig, three.device, three.time) == ("s3://bucket/c", "O10", "", None)
     assert [one.row, two.row, three.row] == [0, 1, 2]
+
+
+def test_a_device_may_be_any_text_or_number(tmp_path: Path) -> None:
+    (tmp_path / "m.csv").write_text("capture,device\na,NA\nb,null\nc,0\nd,\n")
+    assert [item.device for item in items(tmp_path / "m.csv")] == ["NA", "null", "0", ""]
+    pyarrow.parquet.write_table(pa.table({"capture": ["a", "b"], "device": [0, None]}), tmp_path / "m.parquet")
+    assert [item.device for item in items(tmp_path / "m.parquet")] == ["0", ""]
+
+
+def test_names_of_shipped_files_beside_a_table_at_an_address() -> None:
+    for name in ("T4", "asymmetric8", "sample:O10"):
+        assert _base_folder("s3://bucket/fleet/m.csv", name) == name
+    assert _base_folder("s3://bucket/fleet/m.csv", "frames") == "s3://bucket/fleet/frames"
 
 
 def test_parquet_with_time_stamps(tmp_path: Path) -> None:

@@ -2,11 +2,24 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
 import imgcal
-from imgcal.fleet import Dataset, Engine, Manifest, recalibrate_fleet, refusals, rig_kinds, write_manifest
+from imgcal.fleet import (
+    Dataset,
+    Done,
+    Engine,
+    Lost,
+    Manifest,
+    Settings,
+    recalibrate_fleet,
+    refusals,
+    rig_kinds,
+    write_manifest,
+)
+from imgcal.fleet.job import current_key
 from tests.imgcal.fleet.small_captures import write_capture
 
 
@@ -75,6 +88,68 @@ def test_captures_in_a_bucket(fleet: Path, engine: Engine, monkeypatch: pytest.M
         assert not_there is not None and not_there["status"] == "unreachable"
     finally:
         server.stop()
+
+
+def test_what_comes_back_counts_again(fleet: Path, engine: Engine) -> None:
+    """The latest result of a capture is that of its present content, also where that was seen before."""
+    dataset, content = Dataset(fleet / "out"), (fleet / "1.csv").read_text()
+    recalibrate_fleet(manifest(fleet), dataset, engine)
+    (fleet / "1.csv").rename(fleet / "away")
+    recalibrate_fleet(manifest(fleet), dataset, engine)
+    (fleet / "away").rename(fleet / "1.csv")
+    back = recalibrate_fleet(manifest(fleet), dataset, engine)
+    assert (back.known, dict(back.status)) == (5, {"ok": 1})
+    write_capture(fleet / "1.csv", 11)
+    recalibrate_fleet(manifest(fleet), dataset, engine)
+    (fleet / "1.csv").write_text(content)
+    assert dict(recalibrate_fleet(manifest(fleet), dataset, engine).status) == {"ok": 1}
+    assert recalibrate_fleet(manifest(fleet), dataset, engine).known == 6
+    assert len(rig_kinds(dataset)[0].devices) == 6
+
+
+def test_a_corrected_number_is_learned_from(fleet: Path, engine: Engine) -> None:
+    dataset = Dataset(fleet / "out")
+    recalibrate_fleet(manifest(fleet), dataset, engine)
+    table = (fleet / "manifest.csv").read_text()
+    (fleet / "manifest.csv").write_text(table.replace("23", "43"))
+    assert "43" in (fleet / "manifest.csv").read_text()
+    recalibrate_fleet(manifest(fleet), dataset, engine)
+    (kind,) = rig_kinds(dataset)
+    assert sorted(kind.given["temperature"]) == [20.0, 21.0, 22.0, 24.0, 25.0, 43.0]
+
+
+def test_rig_files_are_made_when_they_are_asked_for_and_go_with_their_capture(fleet: Path, engine: Engine) -> None:
+    dataset, rigs = Dataset(fleet / "out"), fleet / "rigs"
+    recalibrate_fleet(manifest(fleet), dataset, engine)
+    keep = Settings(keep_rig=True)
+    assert dict(recalibrate_fleet(manifest(fleet), dataset, engine, keep).status) == {"ok": 6}
+    assert recalibrate_fleet(manifest(fleet), dataset, engine, keep).known == 6
+    assert recalibrate_fleet(manifest(fleet), dataset, engine).known == 6
+    dataset.write_rigs(rigs)
+    assert len(list(rigs.iterdir())) == 6
+    (fleet / "2.csv").write_text("snapshot,camera,u,v\n0,cam01,1,2\n")
+    recalibrate_fleet(manifest(fleet), dataset, engine, keep)
+    dataset.write_rigs(rigs)
+    assert len(list(rigs.iterdir())) == 5
+
+
+def test_what_crashes_its_process_is_tried_once_more_only_if_asked(fleet: Path) -> None:
+    class Crashing:
+        def run(self, function: Any, batches: Any, *arguments: Any, seconds: float) -> Any:
+            yield from (
+                Lost(item, timed_out=False, reason="signal: 9")
+                if item.row == 0
+                else Done([item], function([item], *arguments))
+                for batch in batches
+                for item in batch
+            )
+
+    dataset, engine = Dataset(fleet / "out"), cast(Engine, Crashing())
+    first = recalibrate_fleet(manifest(fleet), dataset, engine)
+    assert dict(first.status) == {"ok": 5, "crashed": 1}
+    known = dataset.keys()
+    assert current_key(next(manifest(fleet).batches(1))[0], Settings()) in known
+    assert len(known) == 6 and len(dataset.keys(again=True)) == 5
 
 
 KILLED = """
