@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -18,8 +19,9 @@ from imgcal.cli.common import EVERY, check_folder, open_rig
 from imgcal.cli.interruption import unwind_at_termination
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice, missing
-from imgcal.fleet import Dataset, Engine, FleetCount, KindOfRig, LearntPrior, Manifest, Settings, rig_kinds
+from imgcal.fleet import Dataset, Engine, FleetCount, KindOfRig, LearntPrior, Manifest, Settings, Spread, rig_kinds
 from imgcal.fleet import recalibrate_fleet as recalibrate
+from imgcal.fleet.fleet_summary import HOURS
 from imgcal.io import load_object, write_text, yaml_text
 from imgcal.messages import plural
 from imgcal.types import RigPrior
@@ -59,18 +61,26 @@ class Fleet(arguments.Fleet):
     def _learn(self, dataset: Dataset, before: RigPrior) -> None:
         """Write the prior and the page."""
         taught: list[tuple[KindOfRig, LearntPrior | None, str]] = []
-        for kind in rig_kinds(dataset):
+        kinds = rig_kinds(dataset)
+        for name in self.covariates if kinds else ():
+            if not any(name in (*kind.given, *kind.lacking) for kind in kinds):
+                kinds[0].learn((name,))  # says which there are
+        for kind in kinds:
             try:
                 taught.append((kind, kind.learn(self.covariates, by_camera=self.by_camera), ""))
-            except RefusedError as error:
+            except (InputError, RefusedError) as error:
                 taught.append((kind, None, str(error)))
         if taught and (learnt := taught[0][1]) is not None:
-            write_text(self.out / "prior.yaml", yaml_text({"prior": _round(asdict(learnt.prior()))}))
+            learned = {"prior": learnt.prior(), "drift_rate": learnt.drift_rate()}
+            blocks = {name: _round(asdict(values)) for name, values in learned.items() if values is not None}
+            write_text(self.out / "prior.yaml", yaml_text(blocks))
             write_text(self.out / "lessons.json", json.dumps(_summary(taught[0][0], learnt), indent=2) + "\n")
             for spread in learnt.spreads:
-                camera = "" if spread.camera is None else f" of {spread.camera}"
-                print(f"{spread.kind}{camera}: spread {spread.value:.4g} +- {spread.sigma:.1g}")
+                print(_describe(spread, learnt.hours))
             print(f"{plural(len(learnt.outliers), 'outlier camera')}; prior {self.out / 'prior.yaml'}")
+        for kind in kinds:
+            if HOURS in kind.lacking:
+                print(f"note: {HOURS}: {kind.explain_lacking(HOURS)}; no rates were learned", file=sys.stderr)
         for _, _, reason in taught:
             if reason:
                 print(f"note: no prior: {reason}", file=sys.stderr)
@@ -83,8 +93,24 @@ class Fleet(arguments.Fleet):
         print(f"report {self.out / 'report.html'}")
 
 
+def _describe(spread: Spread, hours: float | None) -> str:
+    camera = "" if spread.camera is None else f" of {spread.camera}"
+    if not math.isfinite(spread.sigma):
+        return f"{spread.kind}{camera}: no capture shows it; the prior keeps {spread.value:.4g}"
+    shown = f"{spread.kind}{camera}: spread {spread.value:.4g} +- {spread.sigma:.1g}"
+    if hours is None:
+        return shown
+    growth = f"{spread.rate:.4g} +- {spread.rate_sigma:.1g} in an hour"
+    return f"{shown}, {growth}; {spread.variance(hours) ** 0.5:.4g} after {hours:.4g} h, the mean age"
+
+
 def _round(values: dict[str, float]) -> dict[str, float]:
     return {name: float(f"{value:.6g}") for name, value in values.items()}
+
+
+def _without_infinity(values: dict[str, Any]) -> dict[str, Any]:
+    """Values that JSON can hold: None for a standard deviation of what was not seen."""
+    return {name: None if value == math.inf else value for name, value in values.items()}
 
 
 def _summary(kind: KindOfRig, learnt: LearntPrior) -> dict[str, Any]:
@@ -94,7 +120,8 @@ def _summary(kind: KindOfRig, learnt: LearntPrior) -> dict[str, Any]:
         "cameras": list(kind.cameras),
         "lenses": list(kind.lenses),
         "devices": len(kind.devices),
-        "spreads": [asdict(spread) for spread in learnt.spreads],
+        "hours": learnt.hours,
+        "spreads": [_without_infinity(asdict(spread)) for spread in learnt.spreads],
         "outliers": outliers,
         "trends": [
             asdict(trend) | {"name": name} for trend in learnt.trends if (name := kind.parameter_name(trend)) != "-"

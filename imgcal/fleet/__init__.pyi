@@ -3,7 +3,7 @@ from .drift_information import KINDS, DriftInformation, parameter_units
 from .engine import Done, Engine, Lost
 from .fleet_summary import KindOfRig, refusals, rig_kinds
 from .job import Settings
-from .learnt_prior import LearntPrior, OutlierCamera, Spread, Trend, learn_prior, outlier_cameras, standardized_offsets
+from .learnt_prior import LearntPrior, OutlierCamera, Spread, Trend, learn_prior, outlier_cameras
 from .manifest import Item, Manifest, write_manifest
 from .run import FleetCount, recalibrate_fleet
 from .work_items import Mapper, StoredResults, workers
@@ -32,7 +32,6 @@ __all__ = [
     "recalibrate_fleet",
     "refusals",
     "rig_kinds",
-    "standardized_offsets",
     "workers",
     "write_manifest",
 ]

@@ -16,6 +16,10 @@ KINDS = tuple(PARAMETER_KINDS)
 """Kinds of value as a rig file's `prior:` names them, and in the order in which a camera's parameters stand."""
 
 
+HELD = 1e-3
+"""Width of a prior, over the default one, up to which it holds a value where it is: the rest is rounding."""
+
+
 def parameter_units(rig: CameraRig) -> Tensor:
     """What a spread of one means for each parameter: (C, K) rad, mm, the focal length in pixels, pixels, one.
 
@@ -80,12 +84,16 @@ class DriftInformation:
             camera_names: C of them.
             precision: (D, P, P) inverse covariance, the prior's part the identity.
             offset: (D, P) estimated.
-            prior_std: (D, P) standard deviations of the prior; what it holds fixed, at zero, tells nothing.
+            prior_std: (D, P) standard deviations of the prior; what it holds fixed, at zero or nearly, tells nothing.
             unit: (D, P) of `parameter_units`.
             inflation: (D) factor on what noise adds to standard deviations.
         """
-        scale = torch.where(prior_std > 0, unit / prior_std.clamp_min(1e-300), 0.0) / inflation[:, None]
         data = precision - torch.eye(precision.shape[-1], dtype=precision.dtype)
+        usual = torch.zeros(unit.shape[1] // len(camera_names), dtype=unit.dtype)
+        for kind, part in PARAMETER_KINDS.items():
+            usual[part] = getattr(RigPrior(), kind)
+        free = prior_std > HELD * usual.repeat(len(camera_names)) * unit
+        scale = torch.where(free, unit / prior_std.clamp_min(1e-300), 0.0) / inflation[:, None]
         information = scale[:, :, None] * data * scale[:, None, :]
         asked = scale * (precision @ offset[..., None])[..., 0] / inflation[:, None]
         return cls(camera_names, 0.5 * (information + information.mT), asked)

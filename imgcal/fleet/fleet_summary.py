@@ -16,13 +16,13 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.fleet.dataset import Dataset
 from imgcal.fleet.drift_information import DriftInformation
 from imgcal.fleet.learnt_prior import LearntPrior, Trend, learn_prior
-from imgcal.messages import list_names
+from imgcal.messages import list_names, plural
 from imgcal.types import PINHOLE, parameter_names
 
 HOURS = "hours"
 """Column of the manifest: since the factory calibration. With it, rates of drift are learnt."""
 COLUMNS = (
-    "device", "time", "status", "given", "cameras", "lenses", "prior_std", "unit", "whitened_offset",
+    "device", "capture", "time", "status", "given", "cameras", "lenses", "prior_std", "unit", "whitened_offset",
     "information_factor", "inflation",
 )  # fmt: skip
 LENS = "brown_conrady"
@@ -38,6 +38,7 @@ class KindOfRig:
     devices: tuple[str, ...]  # D
     drift: DriftInformation  # (D)
     given: Mapping[str, NDArray[np.float64]]  # (D) numbers that every device has
+    lacking: Mapping[str, tuple[str, ...]]  # of numbers that only some have: the devices without
 
     def parameter_name(self, trend: Trend) -> str:
         """Name of the value that a trend is of; "-" where the camera's lens has none."""
@@ -51,13 +52,20 @@ class KindOfRig:
             InputError: a covariate that not every device has.
             RefusedError: too few devices.
         """
-        lacking = [name for name in covariates if name not in self.given]
-        if lacking:
-            raise InputError(
-                f"--covariates: found {lacking[0]}, expected numbers that every row has: {list_names(self.given)}"
-            )
+        for name in covariates:
+            if name in self.lacking:
+                raise InputError(f"--covariates {name}: {self.explain_lacking(name)}")
+            if name not in self.given:
+                known = list_names(self.given) or "there are none"
+                raise InputError(f"--covariates: found {name}, expected numbers that every row has: {known}")
         chosen = {name: self.given[name] for name in covariates}
         return learn_prior(self.drift, hours=self.given.get(HOURS), covariates=chosen, by_camera=by_camera)
+
+    def explain_lacking(self, name: str) -> str:
+        """Say which devices lack a number that others have."""
+        without = self.lacking[name]
+        others = plural(len(self.devices) - len(without), "other device")
+        return f"found none for {list_names(without)}, but one for {others}"
 
 
 def rig_kinds(dataset: Dataset) -> list[KindOfRig]:
@@ -68,12 +76,12 @@ def rig_kinds(dataset: Dataset) -> list[KindOfRig]:
     """
     table = dataset.latest(COLUMNS)
     rows: dict[tuple[tuple[str, str], ...], dict[str, dict[str, Any]]] = {}
-    for number, row in enumerate(table.to_pylist()):
+    for row in table.to_pylist():
         if row["status"] != "ok":
             continue
         lenses = row.get("lenses") or [LENS] * len(row["cameras"])
         devices = rows.setdefault(tuple(zip(row["cameras"], lenses, strict=True)), {})
-        name = row["device"] or f"row {number}"
+        name = row["device"] or row["capture"]
         before = devices.get(name)
         if before is None or _moment(before) <= _moment(row):
             devices[name] = row
@@ -97,10 +105,14 @@ def _moment(row: Mapping[str, Any]) -> datetime.datetime:
 def _kind(named: Sequence[tuple[str, str]], devices: Mapping[str, Mapping[str, Any]]) -> KindOfRig:
     cameras, lenses = tuple(name for name, _ in named), tuple(lens for _, lens in named)
     rows = list(devices.values())
-    names = set.intersection(*({name for name, _ in row["given"] or ()} for row in rows))
-    given = {name: np.array([dict(row["given"])[name] for row in rows]) for name in sorted(names)}
+    columns = [dict(row["given"] or ()) for row in rows]
+    names = sorted({name for column in columns for name in column})
+    pairs = [*zip(devices, columns, strict=True)]
+    lacking = {name: tuple(device for device, column in pairs if name not in column) for name in names}
+    given = {name: np.array([column[name] for column in columns]) for name in names if not lacking[name]}
     parts = [_information(cameras, rows[first : first + 256]) for first in range(0, len(rows), 256)]
-    return KindOfRig(cameras, lenses, tuple(devices), DriftInformation.concatenate(parts), given)
+    drift = DriftInformation.concatenate(parts)
+    return KindOfRig(cameras, lenses, tuple(devices), drift, given, {n: some for n, some in lacking.items() if some})
 
 
 def _information(cameras: tuple[str, ...], rows: Sequence[Mapping[str, Any]]) -> DriftInformation:

@@ -10,7 +10,7 @@ out. Estimates of the devices themselves would be shrunk towards the old prior; 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,12 +21,14 @@ from torch import Tensor
 
 from imgcal.errors import InputError, RefusedError
 from imgcal.fleet.drift_information import KINDS, DriftInformation
-from imgcal.types import PARAMETER_KINDS, RigPrior
+from imgcal.types import PARAMETER_KINDS, DriftRate, RigPrior
 
 SIGMAS = 5.0
 """Standard deviations (two-sided) outside the fleet's spread from which a camera is an outlier."""
 LEAST_KNOWN = 0.01
 """Part of a direction's prior variance that the images must take away for the direction to be tested."""
+LEAST_INFORMATION = 1e-4
+"""Fisher information of a variance, relative to its size: with less, even its order of magnitude is not known."""
 LEAST_DEVICES = 8
 ROUNDS = 4
 """Of leaving outliers out and learning again."""
@@ -45,10 +47,14 @@ class Spread:
 
     kind: str
     camera: str | None  # None = all cameras alike
-    value: float  # rad, mm, relative, pixels, or one
-    sigma: float  # one standard deviation of it
+    value: float  # rad, mm, relative, pixels, or one; where the images say nothing of it, what the search began with
+    sigma: float  # one standard deviation of it, inf where the images say nothing
     rate: float = 0.0  # of a random walk, in the same unit after an hour; 0 where no times were given
     rate_sigma: float = 0.0
+
+    def variance(self, hours: float) -> float:
+        """Variance of a device of this age."""
+        return self.value**2 + self.rate**2 * hours
 
 
 @dataclass(frozen=True)
@@ -78,13 +84,20 @@ class LearntPrior:
 
     spreads: tuple[Spread, ...]
     outliers: tuple[OutlierCamera, ...]
-    trends: tuple[Trend, ...] = ()
-    devices: int = 0
+    trends: tuple[Trend, ...]
+    standardized: Tensor  # (D, P) offsets over what they scatter by, unit normal if all this is right; nan = not seen
+    hours: float | None = None  # mean age of the devices; None = not given
 
     def prior(self) -> RigPrior:
-        """The prior for a rig file; if spreads were learned camera by camera, their mean square."""
-        mean = {kind: [s.value for s in self.spreads if s.kind == kind] for kind in KINDS}
-        return RigPrior(**{kind: float(np.sqrt(np.mean(np.square(values)))) for kind, values in mean.items()})
+        """The prior of a device of the fleet's mean age; if spreads were learned by camera, their mean square."""
+        return RigPrior(**self._mean_square(lambda spread: spread.variance(self.hours or 0.0)))
+
+    def drift_rate(self) -> DriftRate | None:
+        """The rates for a rig file; None where no times were given."""
+        return None if self.hours is None else DriftRate(**self._mean_square(lambda spread: spread.rate**2))
+
+    def _mean_square(self, square: Callable[[Spread], float]) -> dict[str, float]:
+        return {kind: float(np.mean([square(s) for s in self.spreads if s.kind == kind])) ** 0.5 for kind in KINDS}
 
 
 @dataclass(frozen=True)
@@ -121,7 +134,8 @@ def learn_prior(
     Args:
         drift: D devices, each seen by its own images.
         start: where the search begins; it has no other influence.
-        hours: (D,) since the factory calibration; then the variance grows with them, and rates are learnt, too.
+        hours: (D,) since the factory calibration; where they differ, the variance grows with them, and rates are
+            learnt, too.
         covariates: (D,) each, temperature for example: every parameter gets a mean and a slope, taken out before the
             spread.
         by_camera: learn a spread for each camera, not one for all.
@@ -137,18 +151,22 @@ def learn_prior(
         raise RefusedError(
             f"fleet: found {len(drift)} devices, expected at least {LEAST_DEVICES} to learn a prior from"
         )
-    model = _model(drift, _column("hours", hours, len(drift)), by_camera)
+    age = _column("hours", hours, len(drift))
+    if age is not None and bool((age <= age.min() + 1e-6 * age.abs().max()).all()):
+        age = None  # nothing shows what has grown
+    model = _model(drift, age, by_camera)
     given = {name: _column(name, values, len(drift)) for name, values in (covariates or {}).items()}
     centred = {name: values - values.mean() for name, values in given.items() if values is not None}
     if centred:  # where nothing has drifted, the covariate need not be at its mean
         centred = {MEAN: torch.ones(len(drift), dtype=torch.float64)} | centred
     theta = torch.tensor([getattr(start, kind) ** 2 for kind, _, _ in model.names], dtype=torch.float64)
     theta[torch.tensor([grows for *_, grows in model.names])] *= 0.1 / max(1e-9, float(model.features.amax()))
+    begun = theta
     freed = torch.zeros(len(drift), len(drift.camera_names), dtype=torch.bool)
     for _ in range(ROUNDS):
         slopes, slope_sigma = _slopes(drift, model, theta, freed, centred)
         level = _remove_slopes(drift, centred, slopes)
-        theta, sigma = _score_variances(level, model, theta, freed)
+        theta, fisher = _score_variances(level, model, theta, freed)
         found = _outliers(level, model, theta)
         now = torch.zeros_like(freed)
         for outlier in found:
@@ -156,9 +174,10 @@ def learn_prior(
         if bool((now == freed).all()):
             break
         freed = now
-    spreads = _spreads(model, theta, theta * sigma)
+    spreads = _spreads(model, theta, _deviations(torch.maximum(theta, begun), fisher))
     trends = _trends(drift, centred, slopes, slope_sigma)
-    return LearntPrior(spreads, tuple(found), trends, len(drift))
+    standardized = torch.cat([standardize(level[rows], model.variance(theta, rows)) for rows in _batches(len(drift))])
+    return LearntPrior(spreads, tuple(found), trends, standardized, None if age is None else float(age.mean()))
 
 
 def outlier_cameras(drift: DriftInformation, prior: RigPrior) -> tuple[OutlierCamera, ...]:
@@ -176,23 +195,16 @@ def outlier_cameras(drift: DriftInformation, prior: RigPrior) -> tuple[OutlierCa
     return tuple(_outliers(drift, model, theta))
 
 
-def standardized_offsets(drift: DriftInformation, learnt: LearntPrior) -> Tensor:
-    """Each device's most probable offsets by the learnt prior, over what they scatter by if it is right: (D, P).
+def standardize(drift: DriftInformation, variance: Tensor) -> Tensor:
+    """Divide each device's most probable offsets by what they scatter by if the prior's variances (D, P) are right.
 
-    Standard normal over the fleet; nan where the images say next to nothing.
+    Returns:
+        (D, P), standard normal over the fleet; nan where the images say next to nothing.
     """
-    variance = torch.zeros(len(drift.camera_names), drift.parameters, dtype=torch.float64)
-    for kind, part in PARAMETER_KINDS.items():
-        for spread in (spread for spread in learnt.spreads if spread.kind == kind):
-            rows = slice(None) if spread.camera is None else drift.camera_names.index(spread.camera)
-            variance[rows, part] = spread.value**2
-    parts = []
-    for rows in _batches(len(drift)):
-        seen = _look(drift[rows], variance.flatten().expand(len(drift[rows]), -1))
-        known = variance.flatten() * seen.precision.diagonal(dim1=-2, dim2=-1)
-        scaled = variance.flatten().sqrt() * seen.place / known.clamp_min(1e-12).sqrt()
-        parts.append(torch.where(known > LEAST_KNOWN, scaled, torch.nan))
-    return torch.cat(parts)
+    seen = _look(drift, variance)
+    known = variance * seen.precision.diagonal(dim1=-2, dim2=-1)
+    scaled = variance.sqrt() * seen.place / known.clamp_min(1e-12).sqrt()
+    return torch.where(known > LEAST_KNOWN, scaled, torch.nan)
 
 
 def _column(name: str, values: Sequence[float] | NDArray[np.float64] | None, count: int) -> Tensor | None:
@@ -240,16 +252,28 @@ def _look(drift: DriftInformation, variance: Tensor) -> _Seen:
 
 
 def _score_variances(drift: DriftInformation, model: _Model, theta: Tensor, freed: Tensor) -> tuple[Tensor, Tensor]:
-    """Find the most probable variances (K,), and the standard deviation of each relative to itself (K,)."""
+    """Find the most probable variances (K,), and their Fisher information (K, K)."""
     for _ in range(STEPS):
         score, fisher = _score_and_fisher(drift, model, theta, freed)
-        inverse = torch.linalg.pinv(theta[:, None] * fisher * theta, hermitian=True)  # of relative changes
-        step, sigma = inverse @ (theta * score), inverse.diagonal().clamp_min(0).sqrt()
-        settled = (step.abs() <= torch.clamp(0.01 * sigma, min=1e-6)) | ((theta <= BOUNDS[0]) & (step < 0))
-        if bool(settled.all()):
-            return theta, sigma
-        theta = (theta * (1 + step).clamp(0.1, 1e3)).clamp(*BOUNDS)
+        movable = (theta > BOUNDS[0]) | (score > 0)  # the others are as small as they may be, and would be smaller
+        inverse = _invert(fisher, movable & (fisher.diagonal() > 0))
+        step, sigma = inverse @ score, inverse.diagonal().clamp_min(0).sqrt()
+        if bool((~movable | (step.abs() <= torch.maximum(0.01 * sigma, 1e-6 * theta))).all()):
+            return theta, fisher
+        theta = torch.clamp(theta + step, 0.1 * theta, 1e3 * theta).clamp(*BOUNDS)
     raise RefusedError(f"fleet: the spreads did not converge in {STEPS} steps; found {theta.sqrt().tolist()}")
+
+
+def _invert(fisher: Tensor, used: Tensor) -> Tensor:
+    """Inverse of an information matrix (K, K) of some values; zero for the others. Their units may be far apart."""
+    whiten = torch.where(used, fisher.diagonal().clamp_min(1e-300).rsqrt(), 0.0)
+    return whiten[:, None] * torch.linalg.pinv(whiten[:, None] * fisher * whiten, hermitian=True) * whiten
+
+
+def _deviations(scale: Tensor, fisher: Tensor) -> Tensor:
+    """Standard deviation of each variance (K,), inf where there is no information at its `scale` (K,)."""
+    known = fisher.diagonal() * scale.square() > LEAST_INFORMATION
+    return torch.where(known, _invert(fisher, known).diagonal().clamp_min(0).sqrt(), torch.inf)
 
 
 def _score_and_fisher(drift: DriftInformation, model: _Model, theta: Tensor, freed: Tensor) -> tuple[Tensor, Tensor]:

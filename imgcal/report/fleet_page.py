@@ -13,7 +13,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from imgcal.fleet import Dataset, KindOfRig, LearntPrior, standardized_offsets
+from imgcal.fleet import Dataset, KindOfRig, LearntPrior
 from imgcal.fleet import refusals as reasons_of
 from imgcal.io import write_text
 from imgcal.live_page import read_asset, render_page
@@ -79,9 +79,12 @@ def write_fleet_report(dataset: Dataset, taught: Sequence[Taught], before: RigPr
 def _sentence(table: Mapping[str, Sequence[Any]], taught: Sequence[Taught]) -> str:
     total, ok = len(table["status"]), table["status"].count("ok")
     devices = sum(len(one.kind.devices) for one in taught)
-    outliers = sum(len(one.learnt.outliers) for one in taught if one.learnt)
-    out = "no camera is" if not outliers else f"{plural(outliers, 'camera')} {'is' if outliers == 1 else 'are'}"
     found = f"{ok} of {total} captures recalibrated, of {plural(devices, 'device')}"
+    learnt = [one.learnt for one in taught if one.learnt]
+    if not learnt:
+        return f"{found}; no drift was learned, so no camera was tested against it."
+    outliers = sum(len(one.outliers) for one in learnt)
+    out = "no camera is" if not outliers else f"{plural(outliers, 'camera')} {'is' if outliers == 1 else 'are'}"
     return f"{found}; {out} farther off than the fleet's drift explains."
 
 
@@ -92,14 +95,16 @@ def _kind(one: Taught, before: RigPrior) -> dict[str, Any]:
         return shown | {"spreads": [], "outliers": [], "trends": [], "charts": []}
     parameters = one.kind.drift.parameters
     kind_of = np.array([kind for kind, part in PARAMETER_KINDS.items() for _ in range(*part.indices(parameters))])
-    offsets = standardized_offsets(one.kind.drift, learnt).reshape(len(one.kind.devices), -1, parameters)
+    offsets = learnt.standardized.reshape(len(one.kind.devices), -1, parameters)
     return shown | {
+        "hours": learnt.hours,
         "spreads": [
             {
                 "kind": spread.kind.replace("_", " "), "camera": spread.camera or "all", "unit": unit,
-                "value": f"{factor * spread.value:.4g}", "sigma": f"{factor * spread.sigma:.1g}",
                 "before": f"{factor * getattr(before, spread.kind):.4g}",
-                "rate": f"{factor * spread.rate:.2g}" if spread.rate else "",
+                "learnt": _show_deviation(factor * spread.value, factor * spread.sigma),
+                "rate": _show_deviation(factor * spread.rate, factor * spread.rate_sigma),
+                "aged": f"{factor * spread.variance(learnt.hours or 0.0) ** 0.5:.4g}",
             }
             for spread in learnt.spreads
             for unit, factor in [UNITS[spread.kind]]
@@ -123,6 +128,10 @@ def _kind(one: Taught, before: RigPrior) -> dict[str, Any]:
             for part in [kind == kind_of]
         ],
     }  # fmt: skip
+
+
+def _show_deviation(value: float, sigma: float) -> str:
+    return f"{value:.4g} ± {sigma:.1g}" if math.isfinite(sigma) else "not seen"
 
 
 def _finite(values: Sequence[float | None]) -> NDArray[np.float64]:

@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from imgcal import load_rig
 from imgcal.cli.main import main
 from imgcal.fleet import Dataset, Engine, write_manifest
 from tests.imgcal.fleet.conftest import engine  # noqa: F401  one Ray for all tests
@@ -36,6 +37,32 @@ def test_a_fleet_teaches_its_prior(tmp_path: Path, capsys: pytest.CaptureFixture
     (tmp_path / "rig.yaml").write_text(factory.partition("prior:")[0] + (out / "prior.yaml").read_text())
     capture = ["calibrate", str(tmp_path / "3.csv"), "--rig", str(tmp_path / "rig.yaml"), "--object", "asymmetric8"]
     assert main([*capture, "--out", str(tmp_path / "one"), "--no-report"]) == 0
+
+
+@pytest.mark.usefixtures("engine")
+def test_each_kind_of_rig_teaches_what_it_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = []
+    for number in range(8):
+        write_capture(tmp_path / f"{number}.csv", number)
+        rows.append(f"{number}.csv,T4,d{number},{20 + number},{100 * number if number else ''}")
+    write_capture(tmp_path / "other.csv", 9, load_rig("U7"))
+    table = tmp_path / "captures.csv"
+    table.write_text("\n".join(["capture,rig,device,temperature,hours", *rows, "other.csv,U7,u,,", ""]))
+    command = ["fleet", str(table), "--object", "asymmetric8", "--out", str(tmp_path / "fleet")]
+    assert main([*command, "--covariates", "pressure"]) == 2
+    assert "found pressure, expected numbers that every row has: temperature" in capsys.readouterr().err
+    assert main([*command, "--covariates", "temperature"]) == 0
+    said = capsys.readouterr()
+    assert "note: hours: found none for d0, but one for 7 other devices; no rates were learned" in said.err
+    assert "no prior: --covariates: found temperature, expected numbers that every row has: there are none" in said.err
+    assert list(yaml.safe_load((tmp_path / "fleet" / "prior.yaml").read_text())) == ["prior"]
+    table.write_text(table.read_text().replace("d0,20,", "d0,20,50"))
+    assert main(command) == 0
+    said = capsys.readouterr()
+    assert "8 done before" in said.out and "in an hour; " in said.out and "after 356.2 h, the mean age" in said.out
+    assert list(yaml.safe_load((tmp_path / "fleet" / "prior.yaml").read_text())) == ["prior", "drift_rate"]
+    assert json.loads((tmp_path / "fleet" / "lessons.json").read_text())["hours"] == 356.25
+    assert "growth in an hour" in (tmp_path / "fleet" / "report.html").read_text()
 
 
 def test_hurried_input(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,3 +1,5 @@
+import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +10,7 @@ import torch
 import imgcal
 from imgcal.fleet import Dataset, DriftInformation, Item, Settings, Trend, parameter_units, refusals, rig_kinds
 from imgcal.fleet.job import failed_row, process
+from imgcal.formats.writing import HELD_DISTORTION
 from tests.imgcal.fleet.small_captures import write_capture
 from tests.imgcal.lensed import lensed
 
@@ -79,6 +82,25 @@ def test_rigs_of_other_lenses_are_another_kind_and_their_values_have_their_own_n
     assert all(0 <= spread.value < 100 for spread in learnt.spreads)
     names = [first.parameter_name(Trend("t", camera, 12, 0.0, 0.0)) for camera in first.cameras]
     assert names == ["k3", "p1", "p1", "k3"]
+
+
+def test_values_that_the_prior_holds_are_not_learned(tmp_path: Path) -> None:
+    rig = imgcal.load_rig("T4")
+    assert rig.prior is not None
+    held = replace(rig, prior=replace(rig.prior, distortion=HELD_DISTORTION))
+    imgcal.save_rig(held, tmp_path / "held.yaml")
+    dataset, rows = Dataset(tmp_path / "out"), list[dict[str, Any] | None]()
+    for number in range(8):
+        path = tmp_path / f"{number}.csv"
+        write_capture(path, number)
+        rows.append(process(Item(number, str(path), str(tmp_path / "held.yaml"), "asymmetric8", "", None), Settings()))
+    with dataset.open_writer() as writer:
+        writer.add([row for row in rows if row is not None])
+    (kind,) = rig_kinds(dataset)
+    assert kind.devices == tuple(str(tmp_path / f"{number}.csv") for number in range(8))  # captures stand for devices
+    found = {spread.kind: spread for spread in kind.learn().spreads}
+    assert found["distortion"].sigma == math.inf
+    assert 0.001 < found["rotation"].value < 0.01 and found["rotation"].sigma < 0.001
 
 
 def test_results_from_before_lenses_were_written_are_of_the_usual_ones(dataset: Dataset, monkeypatch: Any) -> None:

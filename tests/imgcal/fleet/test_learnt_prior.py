@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 import imgcal
-from imgcal.fleet import DriftInformation, learn_prior, outlier_cameras, standardized_offsets
+from imgcal.fleet import DriftInformation, learn_prior, outlier_cameras
+from imgcal.fleet.learnt_prior import standardize
 from imgcal.types import RigPrior
 
 TRUE = RigPrior(focal_length=0.004, principal_point=3.0, distortion=0.01, rotation=0.003, position=1.5)
@@ -75,6 +76,39 @@ def test_rates_and_spreads_are_told_apart() -> None:
         assert abs(spread.rate - true * 0.02**0.5) < 4 * spread.rate_sigma
 
 
+def test_the_prior_is_that_of_a_device_of_mean_age_and_the_offsets_are_judged_by_their_own() -> None:
+    """A pure random walk: hardly any spread when new."""
+    hours = torch.linspace(100, 1000, 250, dtype=torch.float64)
+    drift = seen_through(offsets(250) * (hours / 550).sqrt()[:, None], 8)
+    learnt = learn_prior(drift, hours=hours.numpy())
+    rate = learnt.drift_rate()
+    assert learnt.hours == pytest.approx(550) and rate is not None
+    for kind, true in vars(TRUE).items():
+        assert getattr(learnt.prior(), kind) == pytest.approx(true, rel=0.15)
+        assert getattr(rate, kind) == pytest.approx(true / 550**0.5, rel=0.3)
+    seen = learnt.standardized
+    for part in (seen[:60], seen[-60:]):
+        assert abs(float(part[part.isfinite()].std()) - 1) < 0.08
+
+
+def test_ages_that_are_all_the_same_tell_no_rate() -> None:
+    drift = seen_through(offsets(50), 9)
+    learnt = learn_prior(drift, hours=[300.0] * 50)
+    assert learnt.hours is None and learnt.drift_rate() is None
+    assert learnt.spreads == learn_prior(drift).spreads
+
+
+def test_what_no_image_shows_is_not_said_to_be_known() -> None:
+    drift = seen_through(offsets(50), 10)
+    shown = torch.ones(3, 15, dtype=torch.float64)
+    shown[:, 10:] = 0  # nothing of distortion
+    shown = shown.flatten()
+    blind = replace(drift, information=shown[:, None] * drift.information * shown, score=shown * drift.score)
+    found = {spread.kind: spread for spread in learn_prior(blind).spreads}
+    assert found["distortion"].sigma == np.inf and found["distortion"].value == pytest.approx(RigPrior().distortion)
+    assert all(0 < found[kind].sigma < 1 for kind in ("rotation", "position", "focal_length", "principal_point"))
+
+
 def test_what_follows_the_temperature_is_taken_out() -> None:
     temperature = np.linspace(15.0, 35.0, 200)
     offset = offsets(200)
@@ -104,10 +138,9 @@ def test_a_camera_of_its_own_gets_its_own_spread() -> None:
 def test_offsets_by_the_right_prior_are_standard_normal() -> None:
     drift = seen_through(offsets(200), 6)
     learnt = learn_prior(drift)
-    found = standardized_offsets(drift, learnt)
+    found = learnt.standardized
     assert abs(float(found[found.isfinite()].std()) - 1) < 0.03
-    wrong = replace(learnt, spreads=tuple(replace(s, value=s.value / 2) for s in learnt.spreads))
-    found = standardized_offsets(drift, wrong)
+    found = standardize(drift, (SPREAD / 2).square().expand(200, -1))
     assert float(found[found.isfinite()].std()) > 1.5
 
 

@@ -30,7 +30,7 @@ def kind(bump: float) -> KindOfRig:
     score = (information @ offset[..., None])[..., 0]
     names = tuple(f"<device {number}>" for number in range(40))
     return KindOfRig(
-        ("cam",), ("brown_conrady",), names, DriftInformation(("cam",), information, score), {"t": np.arange(40.0)}
+        ("cam",), ("brown_conrady",), names, DriftInformation(("cam",), information, score), {"t": np.arange(40.0)}, {}
     )
 
 
