@@ -112,6 +112,8 @@ def _place(uv: Array, sizes: Array, visible: Flags, longest: int, edges: Array, 
             for axis in range(2):
                 # Clamp positions far outside the image to just out of reach, which fits into an integer.
                 start = round(min(max(uv[b, n, axis], -half - 1.0), longest + half + 1.0)) - half
+                if half == longest:  # reaches as far or farther: cover the whole image from wherever the splat is
+                    start = min(max(start, -longest - 1), 0)
                 starts[b, n, axis] = start
                 first = start - 0.5 - uv[b, n, axis]
                 for j in range(edges.shape[3]):

@@ -71,6 +71,16 @@ def test_windows_are_no_larger_than_the_image_asks_for() -> None:
     )
 
 
+@pytest.mark.parametrize("place", [(-10.0, 8.0), (-40.0, 30.0), (33.0, -12.0), (300.0, 9.0)])
+@pytest.mark.parametrize("size", [6.0, 20.0, 100.0])
+def test_wide_splats_reach_into_the_image_from_outside(place: tuple[float, float], size: float) -> None:
+    given = splats(2, 3)
+    given.visible[:], given.sizes[:, 1:] = True, size
+    given.uv[0, 1], given.uv[1, 2] = torch.tensor(place).double(), torch.tensor(place[::-1]).double()
+    expected = additive_splatting.splat_additively(given, SIZE)
+    torch.testing.assert_close(draw_new(given, SIZE)[0], expected, rtol=0, atol=1e-13)
+
+
 def test_no_splats_leave_images_black() -> None:
     assert not draw_new(splats(2, 0), SIZE)[0].any()
     assert additive_splatting_cpu.draw_new(splats(0), SIZE)[0].shape == (0, 3, *SIZE)
