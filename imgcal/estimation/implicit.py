@@ -28,8 +28,15 @@ def attach_gradient(problem: Problem, solution: Solution, loss: RobustKernel) ->
     )  # fmt: skip
     if not (torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in inputs)):
         return solution.state
-    gradient = _gradient(problem, solution.state, loss, create_graph=True)
-    step = _NewtonStep.apply(_inverse_hessian(_detach(problem), solution, loss), *gradient)
+    # The solver stops where another step would hardly lower the cost. By the prior's widths, the gradient is
+    # proportional to the offsets, small ones included: it is taken where Newton's next step would lead.
+    constant = _detach(problem)
+    next_step = _inverse_hessian(constant, solution, loss)(
+        _gradient(constant, solution.state, loss, create_graph=False)
+    )
+    nearer = replace(solution, state=retract(constant, solution.state, *next_step.map(torch.neg)))
+    gradient = _gradient(problem, nearer.state, loss, create_graph=True)
+    step = _NewtonStep.apply(_inverse_hessian(constant, nearer, loss), *gradient)
     return retract(problem, solution.state, *step)
 
 
