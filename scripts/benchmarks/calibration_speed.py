@@ -78,7 +78,7 @@ def _columns(table: Detections) -> dict[str, np.ndarray]:
     return {name: getattr(table, name) for name in names}
 
 
-def carried(rig_name: str, object_name: str) -> dict[str, np.ndarray]:
+def carried(rig_name: str, object_name: str, snapshots: int = STREAM) -> dict[str, np.ndarray]:
     """Move an object smoothly in front of a drifted rig: unlabelled blobs, as columns."""
     rig, obj, draw = load_rig(rig_name), load_object(object_name), np.random.default_rng(3)
     rig = rig.to(torch.float64)
@@ -91,11 +91,11 @@ def carried(rig_name: str, object_name: str) -> dict[str, np.ndarray]:
     turn = [2.0, 2.0, 3.0] if in_room else [0.25, 0.25, 0.4]
     middle = torch.tensor([0.0, 0.0, 1150.0 if in_room else float(rig.working_distance or 0.0)], dtype=torch.float64)
     phase, pace = draw.uniform(0, 6.28, 6), (0.02 if in_room else 0.05) * draw.uniform(0.6, 1.6, 6)
-    sway = torch.from_numpy(np.sin(pace * np.arange(STREAM)[:, None] + phase))
+    sway = torch.from_numpy(np.sin(pace * np.arange(snapshots)[:, None] + phase))
     rotation = rotation_from_vector(sway[:, :3] * torch.tensor(turn, dtype=torch.float64))
     centre = middle + sway[:, 3:] * torch.tensor(far, dtype=torch.float64)
     poses = RigidTransform(rotation, centre - rotation @ obj.points.double().mean(0))
-    seen = true.expand(STREAM).project(poses.apply(obj.points.double()), obj.radius)
+    seen = true.expand(snapshots).project(poses.apply(obj.points.double()), obj.radius)
     snapshot, camera, fiducial = np.nonzero(seen.visible.numpy())
     count = len(snapshot)
     return {

@@ -16,7 +16,7 @@ import torch
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
-from imgcal.association import Associations, PipelineOptions, SnapshotIdentity, relocalize, track
+from imgcal.association import Associations, PipelineOptions, SnapshotIdentity, associate, relocalize, track
 from imgcal.detection import DetectionOptions, detect_snapshot
 from imgcal.io import load_object, read_rig
 from imgcal.online import RigKeeper
@@ -24,6 +24,7 @@ from imgcal.pipeline import calibrate, fit_labelled
 from imgcal.synthesis import FrameModel, PhysicalDrift, Truth, simulate_frames, simulate_truth, true_detections
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 from renderers import ClutterModel
+from scripts.benchmarks.calibration_speed import carried
 from scripts.benchmarks.effort import Effort
 from scripts.benchmarks.peers import opencv_live
 from scripts.output import BLUE, GREEN, GREY, RED, figure, markdown
@@ -38,16 +39,24 @@ BEGUN = 20  # snapshots of a running rig before it is timed: it measures the noi
 SIZES = ((640, 480), (1280, 1024), (2048, 1088), (4096, 3000))
 COLD, KNOWN, RUNNING = "identity, cold", "identity, pose known", "running: blobs to a rig"
 LABELLED, OPENCV = "labels to a rig", "OpenCV, labels to cameras"
-IDENTITY, ESTIMATION = "identity", "estimation"
+IDENTITY, FOLLOWED, ESTIMATION = "identity", "identity, followed", "estimation"
 DETECTION, FRAMES = "detection", "running: frames to a rig"
 QUICK, EXACT = "OpenCV, detection, 1 threshold", "OpenCV, detection, 10 thresholds"
 COLOURS = {COLD: GREEN, KNOWN: "#8fbf6f", RUNNING: BLUE, LABELLED: "#6fa8dc", OPENCV: RED}
-COLOURS |= {IDENTITY: GREEN, ESTIMATION: BLUE, DETECTION: GREEN, FRAMES: BLUE, QUICK: "#e58a80", EXACT: RED}
+COLOURS |= {
+    IDENTITY: GREEN,
+    FOLLOWED: "#8fbf6f",
+    ESTIMATION: BLUE,
+    DETECTION: GREEN,
+    FRAMES: BLUE,
+    QUICK: "#e58a80",
+    EXACT: RED,
+}
 AXES = {
     "cameras": (COLD, KNOWN, RUNNING, LABELLED, OPENCV),
     "fiducials": (COLD, KNOWN, RUNNING, LABELLED, OPENCV),
     "fiducials of a lattice": (COLD, KNOWN),
-    "snapshots": (IDENTITY, ESTIMATION, OPENCV),
+    "snapshots": (IDENTITY, FOLLOWED, ESTIMATION, OPENCV),
     "megapixels": (DETECTION, FRAMES, QUICK, EXACT),
 }
 
@@ -183,7 +192,17 @@ def of_snapshots(scene: Scene, seconds: float) -> dict[str, float]:
     while not runs or (time.perf_counter() - begin < seconds and len(runs) < 5):
         runs.append(calibrate(blank, scene.rig, scene.obj).seconds)
     stages = {name: 1e3 * float(np.median([run[name] for run in runs])) for name in (IDENTITY, ESTIMATION)}
+    moved, rig = _follow(len(scene.truth.uv), scene.rig), scene.rig.to(torch.float64)
+    followed = side_by_side({FOLLOWED: lambda: associate(moved, rig, scene.obj)}, seconds)
+    stages[FOLLOWED] = followed[FOLLOWED].p50
     return stages | {OPENCV: 1e3 * scene.rig.num_cameras * _views_by_opencv(scene)}
+
+
+def _follow(snapshots: int, rig: CameraRig) -> Detections:
+    """Blobs of an object that moves smoothly; that of `make_scene` is somewhere else in every snapshot."""
+    names = tuple(f"{number:05d}" for number in range(snapshots))
+    columns = carried("O10", "asymmetric8", snapshots)
+    return Detections(**columns, camera_names=rig.camera_names, snapshot_names=names)
 
 
 def _views_by_opencv(scene: Scene) -> float:
