@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -97,48 +97,32 @@ def calibrate(
         return _calibrate_lights(detections, repeats, rig, obj, options, found - started)
     if obj.parts and (sight is not None or initializer is not None):
         obj.require_rigid("for detectors and networks that look for a pattern")
-    labelled: Associations | None = None
-    is_solid = obj.pose_rank == 6 and not obj.parts
-    may_be_misread = is_solid and sight is None  # once it has been asked, images and rig follow our conventions
-    if may_be_misread and not detections.labelled.any() and lines_of_sight_miss(detections, rig):
+    case = _Case(detections, rig, obj, options, may_be_misread=_is_solid(obj) and sight is None)
+    if case.may_be_misread and not detections.labelled.any() and lines_of_sight_miss(detections, rig):
         # Identity takes minutes to find nothing in a long capture.
-        doubt = RefusedError("identity: the cameras' lines of sight to the object do not meet")
-        _try_conventions(doubt, detections, rig, obj, options)
-        may_be_misread = False
+        case.try_conventions("identity: the cameras' lines of sight to the object do not meet")
+        case = replace(case, may_be_misread=False)  # images and rig follow our conventions
     try:
         with require_solvable():
             labelled = associate(detections, rig, obj, options, progress, sight)
-            identified = time.perf_counter()
-            given = detections if sight is None else _given_labels(labelled)
-            fit = fit_with_timing(labelled, given, rig, obj, options, initializer)
-            has_stick = any(part.pose_rank == 5 for part in obj.each)
-            if has_stick and (again := label_again(fit, given, obj, options)) is not None:
-                with contextlib.suppress(RefusedError), require_solvable():
-                    fit = fit_with_timing(again, given, rig, obj, options)
-            is_steady = not fit.moved and fit.unsynchronized is None
-            if obj.has_lights and is_steady and (lit := add_lights(fit.labelled, fit.estimate.rig, obj)) is not None:
-                with contextlib.suppress(RefusedError), require_solvable():
-                    fit = fit_steady(lit, given, rig, obj, options)
     except RefusedError as error:
-        if sight is not None and labelled is not None and (other := _next_sight(sight, labelled)) is not None:
+        case.explain(error, None)
+        raise
+    identified = time.perf_counter()
+    try:
+        fit = _fit_labels(labelled, detections if sight is None else _given_labels(labelled), case, initializer)
+    except RefusedError as error:
+        if sight is not None and (other := _next_sight(sight, labelled)) is not None:
             with contextlib.suppress(RefusedError):
                 fit = calibrate(
                     detections, rig, obj, options, initializer=initializer, progress=progress, detector=other
                 )
                 return replace(fit, labelled=name_repeats(fit.labelled, repeats), repeats=repeats)
-        with contextlib.suppress(*UNSOLVABLE):  # what cannot be solved explains nothing
-            if is_solid:  # the extent of the view says nothing for a light, and little for a stick
-                if may_be_misread:
-                    _try_conventions(error, detections, rig, obj, options)
-                require_units(error, detections, rig, obj)
-            if labelled is not None:
-                require_matching_images(error, detections, labelled, rig, obj)
-                require_same_moments(error, detections, labelled, rig, obj, options)
+        case.explain(error, labelled)
         raise
-    used, given_snapshots = len(fit.labelled.used), len(detections.snapshot_names)
-    if may_be_misread and used < LEAST_USED * given_snapshots:
-        doubt = RefusedError(f"identity: only {used} of {given_snapshots} snapshots could be used")
-        _try_conventions(doubt, detections, rig, obj, options)
+    used, given = len(fit.labelled.used), len(detections.snapshot_names)
+    if case.may_be_misread and used < LEAST_USED * given:
+        case.try_conventions(f"identity: only {used} of {given} snapshots could be used")
     seconds = {
         "detection": found - started,
         "identity": identified - found,
@@ -148,20 +132,70 @@ def calibrate(
     return replace(fit, labelled=name_repeats(fit.labelled, repeats), seconds=seconds, late=late, repeats=repeats)
 
 
-def _try_conventions(
-    error: RefusedError, detections: Detections, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
-) -> None:
-    """Replace a refusal if images or rig follow other conventions; see `require_conventions`."""
-    options = replace(options, blind_cameras=True)
+def _is_solid(obj: CalibrationObject) -> bool:
+    """Tell whether its extent in an image means something; that of a light says nothing, and of a stick little."""
+    return obj.pose_rank == 6 and not obj.parts
 
-    def fit(some: Detections, rig: CameraRig) -> float:
-        with require_solvable():
-            found = fit_steady(associate(some, rig, obj, options), some, rig, obj, options)
-        if len(found.labelled.used) < MOST_USED * len(some.snapshot_names):
-            raise RefusedError("identity: the object was found in few of the snapshots")
-        return float(found.rms)
 
-    require_conventions(error, detections, rig, fit)
+@dataclass(frozen=True)
+class _Case:
+    """What is to be calibrated, and whether images or rig may follow other conventions than ours."""
+
+    detections: Detections
+    rig: CameraRig
+    obj: CalibrationObject
+    options: PipelineOptions
+    may_be_misread: bool
+
+    def explain(self, error: RefusedError, labelled: Associations | None) -> None:
+        """Replace a refusal if a cause can be named: other conventions, units or images, or late cameras.
+
+        Args:
+            error: the refusal.
+            labelled: the labels, where the refusal is not about these.
+
+        Raises:
+            RefusedError: with the cause.
+        """
+        given = (self.detections, self.rig, self.obj)
+        with contextlib.suppress(*UNSOLVABLE):  # what cannot be solved explains nothing
+            if self.may_be_misread:
+                self.try_conventions(error)
+            if _is_solid(self.obj):
+                require_units(error, *given)
+            if labelled is not None:
+                require_matching_images(error, self.detections, labelled, self.rig, self.obj)
+                require_same_moments(error, self.detections, labelled, self.rig, self.obj, self.options)
+
+    def try_conventions(self, doubt: RefusedError | str) -> None:
+        """Replace a refusal if images or rig follow other conventions; see `require_conventions`."""
+        options = replace(self.options, blind_cameras=True)
+
+        def fit(some: Detections, rig: CameraRig) -> float:
+            with require_solvable():
+                found = fit_steady(associate(some, rig, self.obj, options), some, rig, self.obj, options)
+            if len(found.labelled.used) < MOST_USED * len(some.snapshot_names):
+                raise RefusedError("identity: the object was found in few of the snapshots")
+            return float(found.rms)
+
+        error = RefusedError(doubt) if isinstance(doubt, str) else doubt
+        require_conventions(error, self.detections, self.rig, fit)
+
+
+def _fit_labels(labelled: Associations, given: Detections, case: _Case, initializer: Initializer | None) -> Calibration:
+    """Fit; with the rig that was found, label sticks once more and add lights, and fit again."""
+    rig, obj, options = case.rig, case.obj, case.options
+    with require_solvable():
+        fit = fit_with_timing(labelled, given, rig, obj, options, initializer)
+        has_stick = any(part.pose_rank == 5 for part in obj.each)
+        if has_stick and (again := label_again(fit, given, obj, options)) is not None:
+            with contextlib.suppress(RefusedError), require_solvable():
+                fit = fit_with_timing(again, given, rig, obj, options)
+        is_steady = not fit.moved and fit.unsynchronized is None
+        if obj.has_lights and is_steady and (lit := add_lights(fit.labelled, fit.estimate.rig, obj)) is not None:
+            with contextlib.suppress(RefusedError), require_solvable():
+                fit = fit_steady(lit, given, rig, obj, options)
+    return fit
 
 
 def _calibrate_lights(
