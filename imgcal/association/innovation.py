@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from imgcal.association.blobs import PaddedBlobs
 from imgcal.estimation import Problem, levenberg_marquardt_cpu
-from imgcal.estimation.levenberg_marquardt_cpu import SnapshotFit
 from imgcal.geometry import NEAREST_DEPTH, kernels, lens_codes, lens_kernels
 from renderers.compiling import njit
 
@@ -85,7 +84,7 @@ def innovations(
     labels: NDArray[np.int64],
     sigma: NDArray[np.float64],
     shared: SharedValues,
-    fitted: Sequence[SnapshotFit],
+    fitted: Sequence[levenberg_marquardt_cpu.SnapshotFit],
 ) -> Innovations:
     """Compare predictions with blobs.
 

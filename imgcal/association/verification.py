@@ -95,7 +95,7 @@ class Known:
     @cached_property
     def image_size(self) -> NDArray[np.int64]:
         """Width and height: (C, 2) px."""
-        return self.rig.image_size.numpy()
+        return np.ascontiguousarray(self.rig.image_size.numpy())
 
     @cached_property
     def focal_length(self) -> float:

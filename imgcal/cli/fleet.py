@@ -19,9 +19,19 @@ from imgcal.cli.common import EVERY, check_folder, open_rig
 from imgcal.cli.interruption import unwind_at_termination
 from imgcal.errors import InputError, RefusedError
 from imgcal.extras import advice, missing
-from imgcal.fleet import Dataset, Engine, FleetCount, KindOfRig, LearntPrior, Manifest, Settings, Spread, rig_kinds
+from imgcal.fleet import (
+    HOURS,
+    Dataset,
+    Engine,
+    FleetCount,
+    KindOfRig,
+    LearntPrior,
+    Manifest,
+    Settings,
+    Spread,
+    rig_kinds,
+)
 from imgcal.fleet import recalibrate_fleet as recalibrate
-from imgcal.fleet.fleet_summary import HOURS
 from imgcal.io import load_object, write_text, yaml_text
 from imgcal.messages import plural
 from imgcal.types import RigPrior

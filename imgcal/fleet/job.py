@@ -27,10 +27,9 @@ from imgcal.association import PipelineOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import camera_covariance, whitened_covariance
 from imgcal.fleet.drift_information import parameter_units
-from imgcal.fleet.manifest import Item, is_shipped, open_file, short_reason
-from imgcal.formats import load_rig
-from imgcal.formats.source import Source
-from imgcal.io import Capture, load_object, open_input, rig_text
+from imgcal.fleet.manifest import Item, open_file, short_reason
+from imgcal.formats import Source, load_rig
+from imgcal.io import Capture, is_shipped, load_object, open_input, rig_text
 from imgcal.messages import one_line
 from imgcal.pipeline import Calibration, Detector, DetectorName, calibrate, capture_sight, detect_capture
 from imgcal.types import CalibrationObject, CameraRig

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from imgcal.errors import InputError
-from imgcal.io.names import SAMPLE, shipped_names
+from imgcal.io import is_shipped
 from imgcal.messages import list_names, quote
 
 REQUIRED = ("capture",)
@@ -178,12 +178,6 @@ def _base_folder(url: str, path: str) -> str:
     except (OSError, ValueError):  # too long for a name, or no text: opening it reports the error
         is_file = True
     return str(found) if is_file else path
-
-
-def is_shipped(name: str) -> bool:
-    """Tell whether this is the name of a shipped rig, object or sample."""
-    shipped = (*shipped_names("rigs", ".yaml"), *shipped_names("objects", ".csv"))
-    return name in shipped or name.startswith(f"{SAMPLE}:")
 
 
 def open_file(url: str) -> Any:

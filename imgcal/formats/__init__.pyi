@@ -16,6 +16,7 @@ from .lens import Lens
 from .limits import LIMIT
 from .loading import load_cameras, load_rig
 from .registry import FORMATS, find_format, is_foreign, read_foreign_rig
+from .source import Source
 from .write_back import Updated, write_into
 from .writing import OURS, Written, convert_rig, select_cameras
 
@@ -31,6 +32,7 @@ __all__ = [
     "Format",
     "Holds",
     "Lens",
+    "Source",
     "StorableRig",
     "Updated",
     "Written",

@@ -41,6 +41,17 @@ def shipped_names(kind: str, suffix: str) -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in data_path(kind).glob(f"*{suffix}")))
 
 
+def is_shipped(name: str) -> bool:
+    """Tell whether this is the name of a shipped rig, object or sample.
+
+    Examples:
+        >>> is_shipped("O10"), is_shipped("sample:O10"), is_shipped("rig.yaml")
+        (True, True, False)
+    """
+    shipped = (*shipped_names("rigs", ".yaml"), *shipped_names("objects", ".csv"))
+    return name in shipped or name.startswith(f"{SAMPLE}:")
+
+
 def sample_path(path: str | Path) -> Path:
     """Replace the name of a shipped sample capture by its folder; other paths stay as they are.
 
