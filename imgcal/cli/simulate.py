@@ -108,7 +108,8 @@ class Simulate(arguments.Simulate):
         for snapshot, shot in enumerate(progress(shots, self.snapshots, "rendering frames")):
             for (camera, image), shares in zip(shot.frames.items(), shot.seen.tolist(), strict=True):
                 write_frame(out / "frames" / camera / f"{snapshot:05d}.png", image)
-                rows += [f"{snapshot:05d},{camera},{n},{share:.3f}" for n, share in enumerate(shares)]
+                labels = obj.labels or range(len(shares))
+                rows += [f"{snapshot:05d},{camera},{n},{share:.3f}" for n, share in zip(labels, shares, strict=True)]
         write_text(out / "truth" / "seen.csv", "\n".join([*rows, ""]))
 
     def _truth(self, rig: CameraRig, obj: CalibrationObject, generator: torch.Generator) -> Truth:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import csv
 import gzip
 import io
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -117,7 +117,8 @@ def save_detections(detections: Detections, path: str | Path, obj: CalibrationOb
     Args:
         detections: blobs; numbers are written in their shortest exact form.
         path: the file to write.
-        obj: several objects whose fiducials the labels are (`CalibrationObject.of_several`): adds the column `object`.
+        obj: whose fiducials the labels are, which are written as it calls them; several objects
+            (`CalibrationObject.of_several`) add the column `object`. None = labels are written as rows.
 
     Raises:
         InputError: the file cannot be written, or a name could not be read again.
@@ -135,8 +136,8 @@ def save_detections(detections: Detections, path: str | Path, obj: CalibrationOb
     for name in (*detections.camera_names, *detections.snapshot_names):
         if not is_file_name(name):
             raise InputError(f"{path}: not written: found {shorten(name)!r}, expected a name that can be a file name")
-    labelled, known = detections.fiducial >= 0, np.isfinite(detections.radius)
-    columns = {
+    known = np.isfinite(detections.radius)
+    columns: dict[str, Iterable[str]] = {
         "snapshot": map(detections.snapshot_names.__getitem__, detections.snapshot.tolist()),
         "camera": map(detections.camera_names.__getitem__, detections.camera.tolist()),
         "u": map(repr, detections.uv[:, 0].tolist()),
@@ -145,12 +146,8 @@ def save_detections(detections: Detections, path: str | Path, obj: CalibrationOb
         "radius": (repr(v) if k else "" for v, k in zip(detections.radius.tolist(), known.tolist(), strict=True)),
         "flags": map(str, detections.flags.tolist()),
     }
-    if labelled.any() and obj is not None and obj.parts:
-        called = list(obj.rows) if not isinstance(obj.rows, int) else []
-        columns["object"] = (called[v][0] if v >= 0 else "" for v in detections.fiducial.tolist())
-        columns["fiducial"] = (str(called[v][1]) if v >= 0 else "" for v in detections.fiducial.tolist())
-    elif labelled.any():
-        columns["fiducial"] = (str(v) if v >= 0 else "" for v in detections.fiducial.tolist())
+    if detections.fiducial.max(initial=-1) >= 0:
+        columns |= _label_columns(detections.fiducial.tolist(), None if obj is None else obj.rows)
     with replacing(path) as file:
         # No time stamp and no file name inside: equal content gives equal bytes.
         binary = gzip.GzipFile("", "wb", 6, file, mtime=0) if path.suffix == ".gz" else file
@@ -162,6 +159,17 @@ def save_detections(detections: Detections, path: str | Path, obj: CalibrationOb
         text.detach()
         if binary is not file:
             binary.close()
+
+
+def _label_columns(rows: Sequence[int], fiducials: Fiducials | None) -> dict[str, Iterable[str]]:
+    """Write rows of the object as tables call them: the inverse of `_replace_labels` and `_rows_of_several`."""
+    if not isinstance(fiducials, Sequence):
+        return {"fiducial": (str(row) if row >= 0 else "" for row in rows)}
+    keys = [key if isinstance(key, tuple) else ("", key) for key in fiducials]
+    columns: dict[str, Iterable[str]] = {"fiducial": (str(keys[row][1]) if row >= 0 else "" for row in rows)}
+    if any(name for name, _ in keys):
+        columns = {"object": (keys[row][0] if row >= 0 else "" for row in rows), **columns}
+    return columns
 
 
 def _indices(chunk: Chunk, column: str, known: dict[str, int], allowed: tuple[str, ...] | None) -> NDArray[np.int64]:

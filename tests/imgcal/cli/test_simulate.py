@@ -1,6 +1,7 @@
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from imgcal.cli.arguments import Level
 from imgcal.cli.main import main
-from imgcal.io import load_detections, read_frame, read_rig
+from imgcal.io import load_detections, load_object, read_frame, read_rig, save_object
 from imgcal.synthesis import DIFFICULTIES
 
 
@@ -167,3 +168,18 @@ def test_a_rig_without_working_distance_is_simulated_in_its_volume(tmp_path):
     assert main([*arguments, *held, "--exposure-ms", "0", "--out", str(tmp_path / "c")]) == 0
     smeared, sharp = (read_frame(tmp_path / name / "frames" / "cam01" / "00001.png").max() for name in "bc")
     assert smeared <= sharp
+
+
+def test_the_truth_calls_fiducials_as_the_object_does(tmp_path):
+    obj = replace(load_object("asymmetric8"), labels=(17, 16, 15, 14, 13, 12, 11, 10))
+    save_object(obj, tmp_path / "lab.csv")
+    out = tmp_path / "a"
+    arguments = ["--rig", "T4", "--object", str(tmp_path / "lab.csv"), "--out", str(out), "--snapshots", "3"]
+    assert main(["simulate", *arguments]) == 0
+    seen = {line.split(",")[2] for line in (out / "truth" / "seen.csv").read_text().splitlines()[1:]}
+    assert seen == set(map(str, obj.labels))
+    arguments = ["--rig", "T4", "--object", str(out / "object.csv"), "--out", str(tmp_path / "out"), "--no-report"]
+    labelled = tmp_path / "labelled.csv"
+    for blobs, more in ((out / "truth" / "detections.csv", ["--labelled", str(labelled)]), (labelled, [])):
+        assert load_detections(blobs, fiducials=obj.rows).fiducial.max() == 7
+        assert main(["calibrate", str(blobs), *arguments, *more]) == 0

@@ -183,6 +183,16 @@ def test_names_that_could_not_be_read_again_are_not_written(
     assert not (tmp_path / "new.csv").exists()
 
 
+def test_labels_are_written_as_the_object_calls_them(tmp_path: Path) -> None:
+    obj = replace(load_object("wand4"), labels=(7, 8, 9, 11))
+    path = tmp_path / "blobs.csv"
+    path.write_text("snapshot,camera,u,v,fiducial\n0,a,1,2,11\n0,a,3,4,7\n0,a,5,6,\n")
+    found = load_detections(path, fiducials=obj.rows)
+    assert found.fiducial.tolist() == [3, 0, -1]
+    save_detections(found, tmp_path / "again.csv", obj)
+    assert_same(load_detections(tmp_path / "again.csv", fiducials=obj.rows), found)
+
+
 def test_labels_of_several_objects_name_their_object(tmp_path: Path) -> None:
     both = CalibrationObject.of_several([load_object("wand4"), replace(load_object("wand4"), labels=(7, 8, 9, 11))])
     path = tmp_path / "blobs.csv"
