@@ -133,13 +133,15 @@ class Convert(arguments.Convert):
 
     def _write(self, files: Files) -> list[Path]:
         """In one step; the sources must survive."""
-        written = [self.out / name if name else self.out for name in files]
+        folder = self.out.parent if "" in files else self.out
+        written = [folder / name if name else self.out for name in files]
         for path in written:
             for what, source in [*(("SOURCE", one) for one in self.source), *(("--into", one) for one in self.into)]:
                 if path.exists() and source.exists() and (path.samefile(source) or path.parent.samefile(source)):
                     raise InputError(f"--out: {path} would overwrite {what}, expected another path")
         if "" in files:
-            write_bytes(self.out, files[""])
+            for path, content in zip(written, files.values(), strict=True):
+                write_bytes(path, content)
             return written
         if self.out.exists() and not self.out.is_dir():
             raise InputError(f"--out: found the file {self.out}, expected a folder: this format has several files")

@@ -188,7 +188,7 @@ def to_camera_rig(rig: ForeignRig, name: str) -> CameraRig:
     def column(values: list[Any]) -> torch.Tensor:
         return torch.tensor(np.array(values), dtype=torch.float64)
 
-    models = [_model_name(camera.lens) for camera in rig.cameras]
+    models = [_model_name(camera.lens) for camera in rig.cameras] if rig.own is None else rig.own.lens_models
     width = lens_width(lens_label(models))
     values: dict[str, Any] = {
         "focal_length": column([camera.lens.focal_length for camera in rig.cameras]),

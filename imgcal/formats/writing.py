@@ -19,7 +19,7 @@ from imgcal.formats.foreign_rig import ForeignRig, FormatError, worst_difference
 from imgcal.formats.format import Files
 from imgcal.formats.limits import HELD_DISTORTION, LIMIT
 from imgcal.formats.registry import FORMATS, find_format, read_back
-from imgcal.io import RigCovariance, rig_from_text, rig_text
+from imgcal.io import POSTERIOR, RigCovariance, posterior_bytes, rig_from_text, rig_text
 from imgcal.types import RigPrior
 
 OURS = "imgcal"
@@ -61,15 +61,7 @@ def convert_rig(
         RefusedError: a lens cannot be expressed within `limit`.
     """
     if to == OURS:
-        held = fit_to_target(rig, NATIVE, "an imgcal rig file", limit)
-        made = to_camera_rig(held.rig, name)
-        if hold_distortion:
-            made = replace(made, prior=replace(made.prior or RigPrior(), distortion=HELD_DISTORTION))
-        text = rig_text(made, name, _valid_covariance(held))
-        back = from_camera_rig(rig_from_text(text, name))
-        lost = rig.covariance is not None and _valid_covariance(held) is None
-        notes = ["standard deviations are left out: they are those of other lens parameters"] if lost else []
-        return _compare(rig, held, back, {"": text.encode()}, notes)
+        return _convert_to_ours(rig, name, limit, hold_distortion)
     target = find_format(to)
     if target.write is None:
         able = ", ".join(one.name for one in FORMATS if one.write is not None)
@@ -105,9 +97,25 @@ def convert_rig(
     return _compare(rig, held, back, files, notes)
 
 
-def _valid_covariance(held: StorableRig) -> RigCovariance | None:
-    """The uncertainty of the rig, where no lens was fitted: fitted parameters have another one."""
-    return held.rig.covariance if all(fit.exact for fit in held.fits) else None
+def _convert_to_ours(rig: ForeignRig, name: str, limit: float, hold_distortion: bool) -> Written:
+    """Make a rig file of ours, and the file of its posterior beside it where that still describes the rig."""
+    held = fit_to_target(rig, NATIVE, "an imgcal rig file", limit)
+    made = to_camera_rig(held.rig, name)
+    if hold_distortion:
+        made = replace(made, prior=replace(made.prior or RigPrior(), distortion=HELD_DISTORTION))
+    files: Files = {}
+    notes: list[str] = []
+    beside: str | None = None
+    if made.posterior is not None:
+        posterior = None if hold_distortion else made.posterior()
+        if posterior is not None and posterior.belongs_to(made):
+            beside = f"{name}{POSTERIOR}"
+            files[beside] = posterior_bytes(posterior)
+        else:
+            notes.append("the posterior of the calibration is left out: it describes other cameras, or another prior")
+    full = rig.covariance is not None and rig.covariance.matrix is not None
+    text = rig_text(made, name, rig.covariance, full, beside)
+    return _compare(rig, held, from_camera_rig(rig_from_text(text, name)), {**files, "": text.encode()}, notes)
 
 
 def _compare(rig: ForeignRig, held: StorableRig, back: ForeignRig, files: Files, notes: list[str]) -> Written:

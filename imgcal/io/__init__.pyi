@@ -22,8 +22,8 @@ from .names import (
     title_from_name,
 )
 from .object_csv import load_object, load_objects, object_from_text, object_text, save_object
-from .posterior_file import read_posterior, write_posterior
-from .rig_yaml import RigCovariance, load_rig_covariance, read_rig, rig_from_text, rig_text, save_rig
+from .posterior_file import posterior_bytes, read_posterior, write_posterior
+from .rig_yaml import POSTERIOR, RigCovariance, load_rig_covariance, read_rig, rig_from_text, rig_text, save_rig
 from .safetensors_file import read_tensors, read_texts, write_tensors
 from .validation import StrictModel, StrictRecord, validate
 from .yaml_file import (
@@ -42,6 +42,7 @@ __all__ = [
     "IMAGE_SUFFIXES",
     "MARGIN",
     "MODEL",
+    "POSTERIOR",
     "PREVIOUS",
     "VIDEO_SUFFIXES",
     "Capture",
@@ -80,6 +81,7 @@ __all__ = [
     "open_input",
     "parse_foreign_yaml",
     "parse_yaml",
+    "posterior_bytes",
     "publishing",
     "read_bytes",
     "read_frame",

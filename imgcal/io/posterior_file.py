@@ -8,7 +8,8 @@ from pathlib import Path
 import torch
 
 from imgcal.errors import InputError
-from imgcal.io.safetensors_file import read_tensors, write_tensors
+from imgcal.io.atomic import write_bytes
+from imgcal.io.safetensors_file import read_tensors, tensor_bytes
 from imgcal.types import CameraRig, RigPosterior
 
 FORMAT = "imgcal-posterior/1"
@@ -22,13 +23,18 @@ def write_posterior(path: str | Path, posterior: RigPosterior) -> None:
     Raises:
         InputError: the file cannot be written.
     """
+    write_bytes(path, posterior_bytes(posterior))
+
+
+def posterior_bytes(posterior: RigPosterior) -> bytes:
+    """Make the content that `write_posterior` writes."""
     rig = posterior.rig
     tensors = {name: getattr(rig, name) for name in RIG} | {name: getattr(posterior, name) for name in OWN}
     tensors |= {"rotation": rig.cam_from_rig.rotation, "translation": rig.cam_from_rig.translation}
     texts = {"snapshots": str(posterior.snapshots), "scale_tolerance": repr(posterior.scale_tolerance)}
     if posterior.time is not None:
         texts["time"] = repr(posterior.time)
-    write_tensors(path, tensors, FORMAT, texts)
+    return tensor_bytes(tensors, FORMAT, texts)
 
 
 def read_posterior(path: str | Path, rig: CameraRig) -> RigPosterior:

@@ -120,18 +120,21 @@ def save_rig(
         ('cam01', 'cam02')
     """
     path = Path(path)
-    text = rig_text(rig, path, covariance, full)
-    if posterior is not None:
-        beside = path.with_name(f"{path.stem}{POSTERIOR}")
-        write_posterior(beside, posterior)
-        text += yaml_text({"posterior": beside.name})
+    beside = None if posterior is None else f"{path.stem}{POSTERIOR}"
+    text = rig_text(rig, path, covariance, full, beside)
+    if posterior is not None and beside is not None:
+        write_posterior(path.with_name(beside), posterior)
     write_text(path, text)
 
 
 def rig_text(
-    rig: CameraRig, where: str | Path = "rig", covariance: RigCovariance | None = None, full: bool = False
+    rig: CameraRig,
+    where: str | Path = "rig",
+    covariance: RigCovariance | None = None,
+    full: bool = False,
+    posterior: str | None = None,
 ) -> str:
-    """Make the text that `save_rig` writes; errors begin with `where`.
+    """Make the text that `save_rig` writes; errors begin with `where`, and `posterior` names the file beside it.
 
     Raises:
         InputError: the rig has batch axes, or `full` is given without a covariance matrix.
@@ -157,6 +160,8 @@ def rig_text(
         content["volume"] = _volume_entry(rig.volume)
     if covariance is not None:
         content["covariance"] = _covariance_entry(covariance, rig, full, where)
+    if posterior is not None:
+        content["posterior"] = posterior
     validate(content, RigFile, f"{where}: not written")
     return yaml_text(content)
 

@@ -22,20 +22,27 @@ PICKLES = (b"PK\x03\x04", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
 def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], file_format: str, texts: Mapping[str, str]) -> None:
     """Write tensors and texts in one step: a full disk leaves the previous file as it was.
 
-    Args:
-        path: the file to write.
-        tensors: any dtype, on any device.
-        file_format: such as "imgcal-network/1"; what `read_tensors` must be asked for.
-        texts: what else belongs to them; the keys `format` and `checksum` are taken.
+    Arguments as for `tensor_bytes`, and the file to write.
 
     Raises:
         InputError: the file cannot be written.
+    """
+    write_bytes(path, tensor_bytes(tensors, file_format, texts))
+
+
+def tensor_bytes(tensors: Mapping[str, Tensor], file_format: str, texts: Mapping[str, str]) -> bytes:
+    """Make the content that `write_tensors` writes.
+
+    Args:
+        tensors: any dtype, on any device.
+        file_format: such as "imgcal-network/1"; what `read_tensors` must be asked for.
+        texts: what else belongs to them; the keys `format` and `checksum` are taken.
     """
     # Copies: safetensors refuses tensors that share memory, such as tied weights.
     stored = {
         name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()
     }
-    write_bytes(path, save(stored, {**texts, "format": file_format, "checksum": _checksum(stored)}))
+    return save(stored, {**texts, "format": file_format, "checksum": _checksum(stored)})
 
 
 def read_tensors(path: str | Path, file_format: str) -> tuple[dict[str, Tensor], dict[str, str]]:

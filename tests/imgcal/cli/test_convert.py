@@ -9,6 +9,7 @@ from imgcal.cli.main import main
 from imgcal.io import RigCovariance, load_rig_covariance, read_rig, save_rig
 from imgcal.types import CameraRig
 from tests.imgcal.cli.conftest import Workplace
+from tests.imgcal.io.test_posterior_file import posterior_for
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -131,6 +132,18 @@ def test_uncertainty_goes_from_ours_to_ours(o10: CameraRig, tmp_path: Path, caps
     assert code == 0
     assert "standard deviations are left out" in out
     assert len(list((tmp_path / "c").iterdir())) == 10
+
+
+def test_the_posterior_goes_along_unless_the_rig_changes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = read_rig("T4")
+    save_rig(rig, tmp_path / "a.yaml", posterior=posterior_for(rig))
+    assert run(capsys, tmp_path / "a.yaml", "--out", tmp_path / "b.yaml")[0] == 0
+    kept = read_rig(tmp_path / "b.yaml")
+    assert kept.posterior is not None and kept.posterior().belongs_to(rig)
+    for more in (["--cameras", "cam01", "cam02"], ["--hold-distortion"]):
+        code, out, _ = run(capsys, tmp_path / "a.yaml", "--out", tmp_path / "c.yaml", *more)
+        assert code == 0 and "note: the posterior of the calibration is left out" in out
+        assert read_rig(tmp_path / "c.yaml").posterior is None
 
 
 def test_one_s_file_to_another_s(camchain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

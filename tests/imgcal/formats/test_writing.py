@@ -1,11 +1,13 @@
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.formats import FORMATS, OURS, convert_rig, find_format, select_cameras
-from imgcal.io import RigCovariance
+from imgcal.formats import FORMATS, OURS, convert_rig, find_format, from_camera_rig, select_cameras
+from imgcal.geometry import lens_label
+from imgcal.io import RigCovariance, load_rig_covariance, read_rig
 from tests.imgcal.formats.rigs import brown, rig_of
 
 WRITTEN = [OURS, *(one.name for one in FORMATS if one.write is not None)]
@@ -27,6 +29,23 @@ def test_uncertainty_goes_along_where_there_is_a_place() -> None:
     )
     assert "std:" in convert_rig(rig, OURS, "x").files[""].decode()
     assert any("standard deviations are left out" in note for note in convert_rig(rig, "kalibr", "x").notes)
+
+
+def test_a_rig_of_ours_keeps_its_lens_models_and_its_covariance(tmp_path: Path) -> None:
+    rig = read_rig("T4").select([0, 1])
+    distortion = torch.nn.functional.pad(rig.distortion, (0, 3))  # k4 to k6 are zero
+    rig = replace(rig, distortion=distortion, lens_model=lens_label(["rational", "brown_conrady"]))
+    width = rig.num_parameters
+    draws = torch.randn(2 * width, 2 * width, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    draws[2 * width - 3 :] = 0  # k4 to k6 of the second camera
+    covariance = RigCovariance.from_matrix(1e-6 * draws @ draws.T, 2)
+    made = convert_rig(from_camera_rig(rig, covariance), OURS, "x")
+    (tmp_path / "rig.yaml").write_bytes(made.files[""])
+    kept = load_rig_covariance(tmp_path / "rig.yaml")
+    assert read_rig(tmp_path / "rig.yaml").lens_models == rig.lens_models
+    assert kept is not None and kept.matrix is not None and covariance.matrix is not None
+    assert torch.equal(kept.matrix, covariance.matrix)
+    assert made.notes == ()
 
 
 def test_a_unit_that_the_format_states_is_not_another() -> None:
