@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from imgcal.errors import InputError
 from imgcal.formats import (
     colmap_binary,
@@ -26,8 +28,9 @@ from imgcal.formats import (
     vicon,
 )
 from imgcal.formats.file_storage import is_matrix, merge_storages
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, known_points
 from imgcal.formats.format import Files, Format
+from imgcal.formats.limits import ROUNDING
 from imgcal.formats.source import Source
 from imgcal.io import is_file_name
 from imgcal.messages import with_article
@@ -54,6 +57,12 @@ FORMATS = (  # asked in this order: who knows a file by more comes before who kn
     motive.FORMAT,
     vicon.FORMAT,
 )
+COPIES = {
+    colmap_text.FORMAT.name: colmap_binary.FORMAT,
+    colmap_binary.FORMAT.name: colmap_text.FORMAT,
+}
+"""Formats in which a tool keeps the same calibration twice, in one folder."""
+
 BY_NAME = {one.name: one for one in FORMATS}
 NATIVE = re.compile(rb"(?m)^[\"']?format[\"']?[ \t]*:")
 
@@ -201,11 +210,34 @@ def _keys(values: dict[str, object]) -> str:
 def _read(source: Source, one: Format) -> ForeignRig:
     try:
         rig = one.read(source)
+        copy = COPIES.get(one.name)
+        if copy is not None and copy.recognizes(source):
+            rig = _join_copy(rig, copy, source)
     except FormatError as error:
         raise InputError(f"{source.where}: this is {with_article(one.title)}: {error}") from error
     if len(rig.cameras) > limits.MOST_CAMERAS:
         raise InputError(f"{source.where}: found {len(rig.cameras)} cameras, expected at most {limits.MOST_CAMERAS}")
     return _make_names_sound(replace(rig, format=one.name))
+
+
+def _join_copy(rig: ForeignRig, one: Format, source: Source) -> ForeignRig:
+    """Add the places of a copy of the rig in another format, so that both copies are written back.
+
+    Raises:
+        FormatError: the copy cannot be read, or says something else.
+    """
+    beside = f"found {with_article(one.title)} beside it"
+    try:
+        copy = one.read(source)
+    except FormatError as error:
+        raise FormatError(f"{beside}: {error}") from error
+    pairs = list(zip(rig.cameras, copy.cameras, known_points(rig), strict=False))
+    off = float(np.max([np.abs(other.project(points) - camera.project(points)) for camera, other, points in pairs]))
+    if rig.names != copy.names or not off <= ROUNDING:
+        differing = "other cameras" if rig.names != copy.names else f"cameras that are {off:.3g} px off"
+        raise FormatError(f"{beside} with {differing}: remove the one that is out of date")
+    cameras = [replace(camera, places=camera.places + other.places) for camera, other, _ in pairs]
+    return replace(rig, cameras=tuple(cameras))
 
 
 def _make_names_sound(rig: ForeignRig) -> ForeignRig:

@@ -13,7 +13,7 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.formats.conversion import fit_note, lens_refusal, millimetres
 from imgcal.formats.fitting import Fit, fit_lens_like
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, worst_difference
-from imgcal.formats.limits import LIMIT
+from imgcal.formats.limits import LIMIT, ROUNDING
 from imgcal.formats.patching import Change, TextFile, patch_bytes
 from imgcal.formats.registry import find_format, is_foreign, read_back, read_foreign_rig
 from imgcal.formats.source import SUFFIXES, Source
@@ -21,7 +21,6 @@ from imgcal.io import read_bytes
 from imgcal.messages import name_cameras, with_article
 
 DIGITS = (0, 9, 12, 17)  # tried in this order: those of the file first
-ROUNDING = 1e-3  # px that the digits of a file may cost: a hundredth of how well markers are measured
 MOST_BYTES = 2**30
 STAYED = 1e-6  # px: a camera that is off by less from what the file says has not been recalibrated
 
@@ -120,7 +119,12 @@ def _write_back(
     sized = _fill_sizes(wanted, rig)
     for digits in DIGITS:
         files, stamps = _patch(contents, changes, digits, now)
-        back = read_back(files, old.format, original_rig)
+        try:
+            back = read_back(files, old.format, original_rig)
+        except FormatError:
+            if digits == DIGITS[-1]:
+                raise
+            continue  # rounded so that its values do not fit together
         if back.names != old.names:
             raise FormatError("the new file, read back, has other cameras")
         reread, points = worst_difference(sized, _fill_sizes(back, rig))

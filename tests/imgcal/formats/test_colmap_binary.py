@@ -24,6 +24,24 @@ def test_rigs_and_images(tmp_path: Path) -> None:
         read_foreign_rig(folder)
 
 
+def test_a_copy_as_text_says_the_same(tmp_path: Path) -> None:
+    folder, rig = folder_of(tmp_path), rig_of(brown(-0.1, 0.02), fisheye(0.01), brown(0, 0, 0, 0, 0.01))
+    put_files(folder, convert_rig(rig, "colmap", "x").files)
+    assert apart(rig, read_in_mm(folder, "m")) < 1e-8
+    text = (folder / "cameras.txt").read_text()
+    (folder / "cameras.txt").write_text(text.replace("1010.5", "1011.5"))
+    for name in (None, "colmap-binary"):
+        with pytest.raises(InputError, match=r"found a COLMAP model .* beside it with cameras that are [\d.]+ px off"):
+            read_foreign_rig(folder, name)
+    put_files(folder, convert_rig(rig_of(brown(), brown()), "colmap", "x").files)
+    with pytest.raises(InputError, match=r"found a COLMAP model .* beside it with other cameras"):
+        read_foreign_rig(folder)
+    (folder / "images.bin").unlink()
+    (folder / "rigs.bin").unlink()
+    with pytest.raises(InputError, match=r"found a COLMAP model .binary. beside it: found only intrinsics"):
+        read_foreign_rig(folder)
+
+
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "rigs.bin"])
 def test_a_file_that_ends_too_early(tmp_path: Path, name: str) -> None:
     folder = folder_of(tmp_path)

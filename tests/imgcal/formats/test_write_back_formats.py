@@ -75,6 +75,18 @@ def test_a_drift_goes_back(name: str, tmp_path: Path) -> None:
     fitted_into(path, name, drifted(rig), tmp_path / "new")
 
 
+def test_both_copies_of_a_colmap_model_are_replaced(tmp_path: Path) -> None:
+    rig = rig_of(*[replace(LENS, focal_length=(1000.0, 1000.0))] * 3)
+    files = convert_rig(rig, "colmap", "rig").files | convert_rig(rig, "colmap-binary", "rig").files
+    files["cameras.txt"] = files["cameras.txt"].replace(b"1000.0", b"1000.00")  # as few decimals cost too much
+    both = put_files(tmp_path / "both", files)
+    new = drifted(ours(both, "colmap"))
+    made = write_into(new, [both], NOW, unit="m")
+    for suffix in ("txt", "bin"):
+        copy = {name: content for name, content in made.files.items() if name.endswith(suffix)}
+        assert apart(new, read_in_mm(put_files(tmp_path / suffix, copy), "m")) < 1e-3
+
+
 @pytest.mark.parametrize("name", [one.name for one in WRITABLE])
 def test_damaged_originals(name: str, tmp_path: Path) -> None:
     """One line of error, or a correct result."""
