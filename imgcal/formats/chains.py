@@ -49,6 +49,15 @@ def follow_links(root: str, cameras: Sequence[str], links: Sequence[Link]) -> di
     Raises:
         FormatError: a camera that no chain of links reaches.
     """
+    poses = find_linked(root, links)
+    lost = [camera for camera in cameras if camera not in poses]
+    if lost:
+        raise FormatError(f"{name_cameras(lost)}: no pose relative to {root}, and without one there is no rig")
+    return {camera: poses[camera] for camera in cameras}
+
+
+def find_linked(root: str, links: Sequence[Link]) -> dict[str, Pose]:
+    """Find camera_from_root of all cameras that chains of links reach, the nearest first."""
     near: dict[str, list[tuple[str, Pose]]] = {}
     for link in links:
         near.setdefault(link.source, []).append((link.destination, link.pose))
@@ -61,7 +70,4 @@ def follow_links(root: str, cameras: Sequence[str], links: Sequence[Link]) -> di
             if destination not in poses:
                 poses[destination] = compose(pose, poses[source])
                 waiting.append(destination)
-    lost = [camera for camera in cameras if camera not in poses]
-    if lost:
-        raise FormatError(f"{name_cameras(lost)}: no pose relative to {root}, and without one there is no rig")
-    return {camera: poses[camera] for camera in cameras}
+    return poses

@@ -6,14 +6,15 @@ unless the model has been given a scale.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from imgcal.formats import places
-from imgcal.formats.chains import IDENTITY, Pose, compose, inverse
+from imgcal.formats.chains import IDENTITY, Link, Pose, compose, find_linked, inverse
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.lens import Array, Lens
 from imgcal.formats.values import quaternion_from_rotation, rotation_from_quaternion
@@ -231,42 +232,54 @@ def _convert_images(
             f"found no rigs.txt, and {len(images)} images with one set of intrinsics: treated as that many cameras at "
             "one moment, which is wrong if one camera moved"
         )
-    first = max(frames.values(), key=len)
-    frame = next(key for key, value in frames.items() if value is first)
+    frames = dict(sorted(frames.items(), key=lambda item: -len(item[1])))  # the fullest first
+    frame, first = next(iter(frames.items()))
+    root = next(iter(first))
+    poses = find_linked(root, _links(frames.values()))
+    if len(poses) < 2:
+        raise FormatError("found no rig, and no two cameras with images of one moment (of one name in each folder)")
+    _check_steady(frames, poses)
     if len(frames) > 1:
-        _check_steady(frames, first)
-        notes.append(f"found no rigs.txt: the cameras' poses are those of the images {frame!r} of each folder")
+        linked = [camera for camera in poses if camera not in first]
+        through = f"; {name_cameras(linked)}: linked through other images" if linked else ""
+        notes.append(f"found no rigs.txt: the cameras' poses are those of the images {frame!r} of each folder{through}")
+    if lost := [camera for camera in dict.fromkeys(chain.from_iterable(frames.values())) if camera not in poses]:
+        notes.append(f"{name_cameras(lost)}: left out, no image that links it to {root}")
     cameras = []
-    for camera, image in first.items():
-        if image.camera not in known:
-            raise FormatError(f"image {image.name}: camera {image.camera} is not among the cameras")
-        row = known[image.camera]
-        others = [
-            place for images_of in frames.values() if camera in images_of
-            for place in images_of[camera].place(image.pose)
-        ]  # fmt: skip
-        cameras.append(row.camera(camera, image.pose, *others))
+    for camera, pose in poses.items():
+        taken = [images_of[camera] for images_of in frames.values() if camera in images_of]
+        row = known.get(taken[0].camera)
+        if row is None:
+            raise FormatError(f"image {taken[0].name}: camera {taken[0].camera} is not among the cameras")
+        placed = compose(pose, first[root].pose)
+        others = [place for image in taken for place in image.place(placed)]
+        cameras.append(row.camera(camera, placed, *others))
     return ForeignRig(name, tuple(cameras), None, "COLMAP's world" + (f" at {frame!r}" if frame else ""), tuple(notes))
 
 
-def _check_steady(frames: dict[str, dict[str, ColmapImage]], first: dict[str, ColmapImage]) -> None:
-    """The cameras must stand to each other in every frame as they do in the first."""
-    root = next(iter(first))
-    size = max(float(np.linalg.norm(compose(image.pose, inverse(first[root].pose))[1])) for image in first.values())
+def _links(frames: Iterable[dict[str, ColmapImage]]) -> list[Link]:
+    """Link the cameras of each frame to its first one."""
+    links = []
+    for images in frames:
+        (base, first), *others = images.items()
+        links += [Link(camera, base, compose(image.pose, inverse(first.pose))) for camera, image in others]
+    return links
+
+
+def _check_steady(frames: dict[str, dict[str, ColmapImage]], poses: dict[str, Pose]) -> None:
+    """The cameras must stand to each other in every frame as their poses say."""
+    size = max(float(np.linalg.norm(pose[1])) for pose in poses.values())
     for frame, images in frames.items():
-        if root not in images:
-            continue
-        for camera, image in images.items():
-            if camera not in first:
-                continue
-            now = compose(image.pose, inverse(images[root].pose))
-            then = compose(first[camera].pose, inverse(first[root].pose))
+        placed = [camera for camera in poses if camera in images]
+        for camera in placed[1:]:
+            now = compose(images[camera].pose, inverse(images[placed[0]].pose))
+            then = compose(poses[camera], inverse(poses[placed[0]]))
             turned = float(np.abs(now[0] - then[0]).max())
             moved = float(np.linalg.norm(now[1] - then[1]))
             if turned > ROTATION_STEADY or moved > PLACE_STEADY * size:
                 raise FormatError(
-                    f"found no rigs.txt, and camera {camera} has another pose relative to {root} in {frame!r}: the "
-                    "cameras are not fixed to each other, or the model was made without a rig (see COLMAP's "
+                    f"found no rigs.txt, and camera {camera} has another pose relative to {placed[0]} in {frame!r}: "
+                    "the cameras are not fixed to each other, or the model was made without a rig (see COLMAP's "
                     "rig_configurator)"
                 )
 

@@ -68,6 +68,31 @@ def test_images_of_fixed_cameras_are_a_rig() -> None:
         rig_from_model("colmap", CAMERAS, images(taken), [])
 
 
+def test_cameras_of_other_moments_are_linked_through_those_that_they_share() -> None:
+    from_rig = {name: pose() for name in "abcdef"}
+    moments = {"0": "abc", "1": "db", "2": "ed", "3": "f"}
+    taken = {}
+    for frame, cameras in moments.items():
+        rig_from_world = pose()
+        taken |= {f"{camera}/{frame}.png": compose(from_rig[camera], rig_from_world) for camera in cameras}
+    rig = rig_from_model("colmap", CAMERAS, images(taken), [])
+    assert rig.names == ["a", "b", "c", "d", "e"]
+    for camera in rig.cameras:
+        linked = camera.in_frame_of(rig.cameras[0])
+        expected = compose(from_rig[camera.name], inverse(from_rig["a"]))
+        assert np.allclose(linked.rotation, expected[0]) and np.allclose(linked.translation, expected[1])
+    assert "camera f: left out, no image that links it to a" in rig.notes
+    assert any("; cameras d, e: linked through other images" in note for note in rig.notes)
+    taken |= {"d/4.png": pose(), "b/4.png": pose()}
+    with pytest.raises(FormatError, match="camera d has another pose relative to b in '4'"):
+        rig_from_model("colmap", CAMERAS, images(taken), [])
+
+
+def test_images_of_no_common_moment_are_no_rig() -> None:
+    with pytest.raises(FormatError, match="found no rig, and no two cameras with images of one moment"):
+        rig_from_model("colmap", CAMERAS, images({"a/0.png": pose(), "b/1.png": pose()}), [])
+
+
 def test_images_of_one_moment_are_a_rig() -> None:
     taken = {"a_left.png": pose(), "b_right.png": pose()}
     rig = rig_from_model("colmap", CAMERAS, images(taken), [ColmapRig(1, {1: None}), ColmapRig(2, {2: None})])
