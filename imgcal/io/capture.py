@@ -44,6 +44,7 @@ class Capture:
     snapshot_names: tuple[str, ...]  # S, of all cameras together; "2" comes before "10"
     files: Mapping[str, Mapping[str, tuple[Path, int]]]  # camera -> snapshot -> file, page or frame in it
     image_size: Mapping[str, tuple[int, int]]  # camera -> width, height in pixels; empty when opened without a rig
+    masks: Mapping[str, Path]  # camera -> file, of cameras that have one
     bit_depth: int | None = None  # 8, 12 or 16 as stated in capture.yaml; None = not stated
     videos_differ: bool = False  # time stamps of the videos need not agree
 
@@ -102,8 +103,8 @@ class Capture:
         Returns:
             (H, W) bool, True where the image is to be ignored; None when the camera has no mask.
         """
-        path = self.folder / "masks" / f"{camera}.png"
-        if not path.exists():
+        path = self.masks.get(camera)
+        if path is None:
             return None
         mask = read_frame(path, size=self.image_size.get(camera))
         _check_size(mask, path, camera, self.image_size.get(camera))
@@ -169,10 +170,6 @@ def open_capture(
     if not videos_differ:
         _check_counts(frames, files)
     names = tuple(files) if rig is None else rig.camera_names
-    masks = folder / "masks"
-    for path in _listing(masks) if masks.exists() else ():
-        if path.stem not in names or path.suffix.lower() != ".png":
-            raise InputError(f"{path}: expected masks named <camera name>.png, cameras: {list_names(names)}")
     settings = folder / "capture.yaml"
     return Capture(
         folder=folder,
@@ -180,6 +177,7 @@ def open_capture(
         snapshot_names=tuple(sorted({snapshot for found in files.values() for snapshot in found}, key=natural_key)),
         files={name: files.get(name, {}) for name in names},
         image_size={} if rig is None else _sizes(rig),
+        masks=_find_masks(folder / "masks", names),
         bit_depth=read_yaml(settings, _Settings, FORMAT).bit_depth if settings.exists() else None,
         videos_differ=videos_differ,
     )
@@ -230,6 +228,19 @@ def _listing(folder: Path) -> list[Path]:
         if not is_file_name(path.name):
             raise InputError(f"{path}: found a name that is not valid text, or is too long: rename it")
     return sorted(entries, key=lambda path: natural_key(path.name))
+
+
+def _find_masks(folder: Path, cameras: Sequence[str]) -> dict[str, Path]:
+    """Find the mask of each camera that has one."""
+    found: dict[str, Path] = {}
+    for path in _listing(folder) if folder.exists() else ():
+        if path.stem not in cameras or path.suffix.lower() != ".png":
+            raise InputError(f"{path}: expected masks named <camera name>.png, cameras: {list_names(cameras)}")
+        if path.stem in found:
+            both = f"{found[path.stem].name} and {path.name}"
+            raise InputError(f"{folder}: found {both}, expected one mask of camera {path.stem}")
+        found[path.stem] = path
+    return found
 
 
 def _folder_snapshots(folder: Path) -> dict[str, tuple[Path, int]]:

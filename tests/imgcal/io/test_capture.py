@@ -170,6 +170,16 @@ def test_masks(tmp_path: Path) -> None:
     put(tmp_path, "masks/a.png", mask[:, :30])
     with pytest.raises(InputError, match=r"a\.png: found 30x24 pixels, expected 32x24"):
         capture.mask("a")
+    (tmp_path / "masks/a.png").rename(tmp_path / "masks/a.PNG")
+    put(tmp_path, "masks/b.png", mask)
+    capture = open_capture(tmp_path, make_rig("a", "b"))
+    assert capture.mask("b") is not None
+    with pytest.raises(InputError, match=r"a\.PNG: found 30x24 pixels, expected 32x24"):
+        capture.mask("a")
+    put(tmp_path, "masks/b.PNG", mask)
+    with pytest.raises(InputError, match=r"masks: found b\.PNG and b\.png, expected one mask of camera b"):
+        open_capture(tmp_path, make_rig("a", "b"))
+    (tmp_path / "masks/b.PNG").unlink()
     put(tmp_path, "masks/c.png", mask)
     with pytest.raises(InputError, match=r"c\.png: expected masks named <camera name>\.png, cameras: a, b"):
         open_capture(tmp_path, make_rig("a", "b"))
