@@ -22,6 +22,7 @@ from imgcal.formats.values import (
     text,
     vector_from_rotation,
 )
+from imgcal.io import natural_key
 from imgcal.messages import name_cameras
 
 TITLE = "EasyMocap intri.yml and extri.yml"
@@ -48,7 +49,8 @@ def _read(source: Source) -> ForeignRig:
         raise FormatError("found only extri.yml: give intri.yml as well, or the folder of both")
     names = values.get("names")
     listed = [text(name, "names") for name in names] if isinstance(names, list) else []
-    order = sorted(set(inside) & set(outside), key=lambda name: listed.index(name) if name in listed else len(listed))
+    order = sorted(set(inside) & set(outside), key=natural_key)
+    order.sort(key=lambda name: listed.index(name) if name in listed else len(listed))
     notes = ["metres, as EasyMocap has them"]
     if lost := sorted(set(inside) ^ set(outside)):
         notes.append(f"{name_cameras(lost)}: left out, not in both files")

@@ -39,6 +39,12 @@ def test_what_is_in_both_files(tmp_path: Path, rot: bool) -> None:
         assert rig.cameras[0].image_size is None
 
 
+def test_cameras_without_a_list_of_names_come_in_natural_order(tmp_path: Path) -> None:
+    names = ("10", "2", "cam", "1", "b", "a", "3")
+    made = {key: text.replace(b"names", b"other") for key, text in files(names, names).items()}
+    assert read_foreign_rig(put(tmp_path, **made)).names == ["1", "2", "3", "10", "a", "b", "cam"]
+
+
 def test_one_of_two_files(tmp_path: Path) -> None:
     for name, said in (("intri__yml", "found only intri.yml"), ("extri__yml", "found only extri.yml")):
         with pytest.raises(InputError, match=said):
