@@ -28,6 +28,7 @@ class Format:
     states_unit: bool = False  # the file, or the tool's custom, says what its unit is
     from_first: bool = False  # its rig frame is its first camera's
     cameras: tuple[int, int] = (1, 256)  # how many it can hold
+    numbers_cameras: bool = False  # its files have no names of cameras, only their order
     stem: str = ""  # what its tool calls the file, without the suffix, where that is always the same
     # Cameras alone, also those that have no pose; None = those of `read`.
     read_lenses: Callable[[Source], list[ForeignCamera]] | None = None

@@ -185,5 +185,5 @@ def _write(rig: ForeignRig) -> Files:
 
 FORMAT = Format(
     "kalibr", TITLE, _recognizes, _read, _write, Holds((4,), fisheye=True), states_unit=True, from_first=True,
-    stem="camchain",
+    numbers_cameras=True, stem="camchain",
 )  # fmt: skip

@@ -132,5 +132,5 @@ def _sides(keys: dict[str, Any], names: tuple[str, ...]) -> list[str]:
 
 FORMAT = Format(
     "opencv-stereo", TITLE, _recognizes, _read, _write, Holds((5, 8, 12, 14)), unit="mm", from_first=True,
-    cameras=(2, 2),
+    cameras=(2, 2), numbers_cameras=True,
 )  # fmt: skip

@@ -90,9 +90,10 @@ def convert_rig(
     except FormatError as error:
         raise InputError(f"--to {to}: {error}") from error
     back = in_millimetres(read_back(files, to), target.name, None if target.states_unit else files_unit)
-    if sorted(back.names) == sorted(rig.names):  # files of a folder come in the order of their names
+    if not target.numbers_cameras and sorted(back.names) == sorted(rig.names):
+        # Files of a folder come in the order of their names.
         back = select_cameras(back, tuple(rig.names))
-    else:
+    elif back.names != rig.names:
         notes.append(f"the cameras have other names in the files, in this order: {', '.join(back.names[:8])}")
     return _compare(rig, held, back, files, notes)
 

@@ -65,6 +65,16 @@ def test_what_cannot_be_written() -> None:
         convert_rig(rig, "ros", "x")
 
 
+@pytest.mark.parametrize(("to", "names"), [("kalibr", ("cam1", "cam0")), ("opencv-stereo", ("2", "1"))])
+def test_a_format_that_numbers_cameras_keeps_their_order(to: str, names: tuple[str, str]) -> None:
+    rig = rig_of(brown(-0.1), brown(0.05), names=names)
+    made = convert_rig(rig, to, "x")
+    assert made.round_trip < 1e-8
+    assert f"the cameras have other names in the files, in this order: {names[1]}, {names[0]}" in made.notes
+    ordered = convert_rig(select_cameras(rig, names[::-1]), to, "x")
+    assert not any("other names" in note for note in ordered.notes)
+
+
 def test_cameras_are_chosen_by_name() -> None:
     rig = rig_of(brown(), brown(), brown())
     assert select_cameras(rig, ("side2", "side0")).names == ["side2", "side0"]
