@@ -33,6 +33,9 @@ class Convert(arguments.Convert):
 
     def run(self) -> None:
         """Read, convert, verify, write."""
+        if not self.source:
+            expected = f"imgcal convert SOURCE --out {self.out.name} (a file, a folder, or a shipped rig's name)"
+            raise InputError(f"SOURCE: found none, expected a calibration to convert: {expected}")
         if self.into:
             self._write_back()
             return
@@ -110,7 +113,7 @@ class Convert(arguments.Convert):
         """The rig in millimetres with its image sizes, and what it is called."""
         where = ", ".join(map(str, self.source))
         sizes = dict(map(_size, self.image_size))
-        first = self.source[0] if self.source else Path()
+        first = self.source[0]
         ours = (
             len(self.source) == 1 and self.source_format in (None, OURS) and not (first.exists() and is_foreign(first))
         )

@@ -113,6 +113,15 @@ def test_what_is_refused(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("more", [(), ("--to", "kalibr"), ("--into", "original.xcp")])
+def test_a_missing_source_is_asked_for(
+    more: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, error = run(capsys, "--out", tmp_path / "x.yaml", *more)
+    assert (code, error.count("\n")) == (2, 1)
+    assert "SOURCE: found none, expected a calibration to convert: imgcal convert SOURCE --out x.yaml" in error
+
+
 def test_the_source_survives(camchain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = camchain.read_bytes()
     code, _, error = run(capsys, camchain, "--to", "kalibr", "--out", camchain)
