@@ -19,7 +19,7 @@ from imgcal.formats.values import (
     number,
     numbers,
     rotation,
-    text,
+    texts,
     vector_from_rotation,
 )
 from imgcal.io import natural_key
@@ -47,8 +47,7 @@ def _read(source: Source) -> ForeignRig:
         raise FormatError("found only intri.yml: give extri.yml as well, or the folder of both")
     if not inside:
         raise FormatError("found only extri.yml: give intri.yml as well, or the folder of both")
-    names = values.get("names")
-    listed = [text(name, "names") for name in names] if isinstance(names, list) else []
+    listed = texts(values["names"], "names") if isinstance(values.get("names"), list) else []
     order = sorted(set(inside) & set(outside), key=natural_key)
     order.sort(key=lambda name: listed.index(name) if name in listed else len(listed))
     notes = ["metres, as EasyMocap has them"]

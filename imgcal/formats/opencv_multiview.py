@@ -17,7 +17,15 @@ from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, P
 from imgcal.formats.format import Files, Format
 from imgcal.formats.lens import Lens
 from imgcal.formats.source import Source
-from imgcal.formats.values import camera_matrix, coefficients, image_size, numbers, rotation, text, vector_from_rotation
+from imgcal.formats.values import (
+    camera_matrix,
+    coefficients,
+    image_size,
+    numbers,
+    rotation,
+    texts,
+    vector_from_rotation,
+)
 
 TITLE = "OpenCV multi-view calibration (FileStorage)"
 PINHOLE, FISHEYE = 0, 1
@@ -39,7 +47,7 @@ def _read(source: Source) -> ForeignRig:
     distortions = _rows(values["distortions"], count, "distortions") if "distortions" in values else [[]] * count
     sizes = _rows(values["image_sizes"], count, "image_sizes") if "image_sizes" in values else [None] * count
     models = [int(model) for model in numbers(values.get("models", [0] * count), "models")]
-    names = [text(name, "cam_ids") for name in values.get("cam_ids", range(count))]
+    names = texts(values.get("cam_ids", list(range(count))), "cam_ids")
     if len(models) != count or len(names) != count:
         raise FormatError(f"found {count} camera matrices, {len(models)} models and {len(names)} cam_ids")
     cameras = []

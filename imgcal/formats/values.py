@@ -164,3 +164,10 @@ def text(value: Any, what: str) -> str:
     if isinstance(value, bool) or not isinstance(value, str | int | float):
         raise FormatError(f"{what}: found {reprlib.repr(value)}, expected text")
     return str(value)
+
+
+def texts(value: Any, what: str) -> list[str]:
+    """Read a list of short texts (names of cameras)."""
+    if not isinstance(value, list):
+        raise FormatError(f"{what}: found {reprlib.repr(value)}, expected a list of names")
+    return [text(one, what) for one in value]

@@ -38,6 +38,13 @@ def test_what_does_not_fit_together_is_said(tmp_path: Path) -> None:
         read_foreign_rig(put(tmp_path, a__yaml=storage_text(bad)))
 
 
+@pytest.mark.parametrize("value", ["4", '"ab"', "{ a: 1 }"])
+def test_names_that_are_no_list(tmp_path: Path, value: str) -> None:
+    content = storage_text({**CONTENT, "Rs": np.array(TURNS)}) + f"cam_ids: {value}\n".encode()
+    with pytest.raises(InputError, match=r"a\.yaml: this is an OpenCV .*: cam_ids: found .*, expected a list of names"):
+        read_foreign_rig(put(tmp_path, a__yaml=content) / "a.yaml")
+
+
 def test_opencv_reads_what_is_written(tmp_path: Path) -> None:
     rig = rig_of(brown(-0.1, 0.02), fisheye(0.01, -0.02), brown(0.1, 0, 0, 0, 0, 0.2))
     path = put_files(tmp_path, convert_rig(rig, "opencv-multiview", "x", unit="mm").files)
