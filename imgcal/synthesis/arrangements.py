@@ -99,7 +99,8 @@ def arrange_rig(
         name: None = the shape and the number of cameras.
 
     Raises:
-        InputError: no camera or too many; a radius that is not positive; a camera at the target.
+        InputError: no camera or too many; a radius that is not positive; a length of more than a kilometre; a camera at
+            the target.
 
     Examples:
         >>> rig = arrange_rig("ring", 8, 4000.0, height=2500.0, target=(0.0, 0.0, 1000.0))
@@ -110,6 +111,9 @@ def arrange_rig(
         raise InputError(f"cameras: found {cameras}, expected 1 to {limits.MOST_CAMERAS}")
     if not 1e-3 <= radius <= 1e6:
         raise InputError(f"radius: found {radius:g}, expected 0.001 to 1e+06 mm")
+    for what, values in (("height", (height,)), ("target", target)):
+        if not all(abs(value) <= 1e6 for value in values):
+            raise InputError(f"{what}: found {' '.join(f'{v:g}' for v in values)}, expected -1e+06 to 1e+06 mm")
     positions, middle = arrange_positions(shape, cameras, radius, height), torch.tensor(target, dtype=torch.float64)
     cam_from_rig = look_at(positions, middle)
     if volume is None:

@@ -33,13 +33,15 @@ class ConvexVolume:
         """Refuse points that enclose no volume.
 
         Raises:
-            InputError: fewer than four points, or all in one plane.
+            InputError: fewer than four points, all in one plane, or a coordinate that is not finite.
         """
         points = tuple(tuple(float(value) for value in point) for point in self.points)
         object.__setattr__(self, "points", points)
         if len(points) < 4:
             raise InputError(f"volume: found {len(points)} points, expected 4 or more that enclose a volume")
         corners = np.array(points)
+        if not np.isfinite(corners).all():
+            raise InputError("volume: found a coordinate that is not finite, expected mm")
         spread = np.linalg.svd(corners - corners.mean(0), compute_uv=False)
         if not spread[2] > FLAT * spread[0]:
             raise InputError("volume: found points that all lie in one plane, expected ones that enclose a volume")

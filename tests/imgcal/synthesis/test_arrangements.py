@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 
@@ -37,6 +39,11 @@ def test_impossible_arrangements():
         arrange_rig("ring", 0, 1000.0)
     with pytest.raises(InputError, match="radius"):
         arrange_rig("ring", 3, -1.0)
+    for value in (math.inf, -math.inf, math.nan, 1e300):
+        with pytest.raises(InputError, match=r"height: found .*, expected -1e\+06 to 1e\+06 mm"):
+            arrange_rig("ring", 3, 1000.0, height=value)
+        with pytest.raises(InputError, match=r"target: found 0 .* 0, expected"):
+            arrange_rig("ring", 3, 1000.0, target=(0.0, value, 0.0))
     with pytest.raises(InputError, match="very point"):
         arrange_rig("row", 3, 1000.0, target=(0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="field_of_view_deg"):

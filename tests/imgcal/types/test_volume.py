@@ -20,7 +20,13 @@ def test_a_box_is_one_whatever_the_order_of_its_corners():
 
 @pytest.mark.parametrize(
     "points",
-    [((0, 0, 0), (1, 0, 0), (0, 1, 0)), ((0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)), ((5, 5, 5),) * 4],
+    [
+        ((0, 0, 0), (1, 0, 0), (0, 1, 0)),
+        ((0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)),
+        ((5, 5, 5),) * 4,
+        ((0, 0, np.inf), (1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        ((0, 0, np.nan), (1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    ],
 )
 def test_what_encloses_nothing_is_refused(points):
     with pytest.raises(InputError, match="expected"):
