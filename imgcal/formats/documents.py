@@ -23,8 +23,9 @@ MOST_DEPTH = 32
 MOST_ELEMENTS = 300_000
 
 OPENCV_TAGS = frozenset(f"tag:yaml.org,2002:opencv-{kind}" for kind in ("matrix", "nd-matrix", "sparse-matrix"))
-TABLE = re.compile(r"\[{1,2}[\w\s.\"'/-]+\]{1,2}[ \t]*(#.*)?$")
-ASSIGNMENT = re.compile(r"[\w.\"'-]+[ \t]*=")
+QUOTED = r"\"(?:[^\"\\]|\\.)*\"|'[^']*'"
+TABLE = re.compile(rf"\[{{1,2}}(?:[\w\s./-]|{QUOTED})+\]{{1,2}}[ \t]*(#.*)?$")
+ASSIGNMENT = re.compile(rf"(?:[\w.-]|{QUOTED})+[ \t]*=")
 
 
 @dataclass

@@ -25,11 +25,11 @@ def test_extrinsics_of_zeros_are_refused(tmp_path: Path) -> None:
 
 
 def test_written_and_read(tmp_path: Path) -> None:
-    rig = rig_of(brown(-0.1, 0.02, 0.001, 0.0), brown(), names=("int_cam1_img", "a b"))
+    rig = rig_of(brown(-0.1, 0.02, 0.001, 0.0), brown(), names=("int_cam1_img", "Miqus (1): a, b"))
     path = put_files(tmp_path, convert_rig(rig, "pose2sim", "x").files)
     tables = tomllib.loads(path.read_text())
     assert {len(tables[name]["distortions"]) for name in rig.names} == {4}
-    assert abs(tables["a b"]["translation"][2]) < 1.0  # metres
+    assert abs(tables["Miqus (1): a, b"]["translation"][2]) < 1.0  # metres
     assert apart(rig, read_in_mm(path)) < 1e-8
     with pytest.raises(RefusedError, match=r"Pose2Sim Calib.toml cannot express"):
         convert_rig(rig_of(brown(-0.3, 0.1, 0, 0, -0.05), brown()), "pose2sim", "x")
