@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -84,7 +85,7 @@ def load_cameras(path: str | Path) -> CameraRig:
         (('left', 'right'), tensor([1005., 1005.], dtype=torch.float64))
     """
     path = Path(path)
-    if not path.is_file() or _starts_with(path, RIG_FORMAT):
+    if not path.is_file() or _names_format(path, RIG_FORMAT):
         return drop_poses(read_rig(path))
     content = read_yaml(path, _CamerasFile, FORMAT)
     cameras = content.cameras
@@ -148,7 +149,8 @@ def save_cameras(image_size: Mapping[str, tuple[int, int]], field_of_view_deg: f
     write_text(path, yaml_text(content))
 
 
-def _starts_with(path: Path, file_format: str) -> bool:
+def _names_format(path: Path, file_format: str) -> bool:
     """Tell whether a file names a format; its reader checks the rest."""
+    line = rf"(?m)^([\"']?)format\1[ \t]*:[ \t]*([\"']?){file_format}\2[ \t]*(#.*)?\r?$"
     with path.open("rb") as file:
-        return any(line.split() == [b"format:", file_format.encode()] for line in file.read(4096).splitlines())
+        return re.search(line.encode(), file.read(4096)) is not None

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.io import load_cameras, save_cameras
+from imgcal.io import load_cameras, read_rig, save_cameras, save_rig
 
 TEXT = """\
 format: imgcal-cameras/1
@@ -23,6 +23,16 @@ def test_reads_angles_and_lengths(tmp_path):
 def test_a_rig_is_read_without_its_places():
     cameras = load_cameras("T4")
     assert cameras.camera_names[0] == "cam01" and not cameras.positions.any()
+
+
+@pytest.mark.parametrize(
+    "line", ['format: "imgcal-rig/1"', "'format': imgcal-rig/1  # ours", "format:   imgcal-rig/1 "]
+)
+def test_the_format_of_a_rig_may_be_in_quotes_and_before_a_remark(line, tmp_path):
+    save_rig(read_rig("T4"), tmp_path / "rig.yaml")
+    text = (tmp_path / "rig.yaml").read_text()
+    (tmp_path / "rig.yaml").write_text(text.replace("format: imgcal-rig/1", line))
+    assert load_cameras(tmp_path / "rig.yaml").num_cameras == read_rig(tmp_path / "rig.yaml").num_cameras == 4
 
 
 def test_what_is_written_can_be_read(tmp_path):
