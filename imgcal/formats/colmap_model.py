@@ -16,7 +16,7 @@ import numpy as np
 from imgcal.formats import places
 from imgcal.formats.chains import IDENTITY, Link, Pose, compose, find_linked, inverse
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
-from imgcal.formats.lens import Array, Lens
+from imgcal.formats.lens import Array, Lens, Model
 from imgcal.formats.values import quaternion_from_rotation, rotation_from_quaternion
 from imgcal.messages import name_cameras, shorten
 
@@ -85,10 +85,8 @@ class ColmapCamera:
             focal, centre, ks = (p[0], p[1]), (p[2], p[3]), p[4:]
         if min(focal) <= 0:
             raise FormatError(f"camera {self.id}: found the focal length {min(focal):g}, expected a positive one")
-        model = "fisheye" if self.model.endswith("FISHEYE") else "opencv"
-        return Lens(
-            focal, (centre[0] - HALF, centre[1] - HALF), tuple(ks), "fisheye" if model == "fisheye" else "opencv"
-        )
+        model: Model = "fisheye" if self.model.endswith("FISHEYE") else "opencv"
+        return Lens(focal, (centre[0] - HALF, centre[1] - HALF), tuple(ks), model)
 
 
 @dataclass(frozen=True)

@@ -60,38 +60,32 @@ def _camera(row: list[str], number_of_line: int, path: Path) -> ColmapCamera:
 
 
 def _rig(row: list[str], line: int, path: Path) -> ColmapRig:
-    place = f"rigs.txt: line {line}"
-    rest = row[2:]
+    place, rest = f"rigs.txt: line {line}", list(row)
+
+    def take(count: int, what: str) -> list[str]:
+        if len(rest) < count:
+            raise FormatError(f"{place}: ends in the middle of a {what}")
+        taken = rest[:count]
+        del rest[:count]
+        return taken
+
+    rig, _ = take(2, "rig")
     sensors: dict[int, Pose | None] = {}
     at: dict[int, At] = {}
-    plain = 2  # numbers of the row so far: its words are no numbers
+    words = 0  # the kinds of the sensors so far: the other values are numbers
     while rest:
-        if len(rest) < 2:
-            raise FormatError(f"{place}: ends in the middle of a sensor")
-        kind, sensor, pose, taken = rest[0], int(number(rest[1], place)), IDENTITY, 2
-        posed = True
-        if len(rest) < len(row) - 2:  # not the reference
-            if len(rest) < 3:
-                raise FormatError(f"{place}: ends in the middle of a sensor")
-            posed, taken = rest[2] == "1", 3
-            if posed:
-                pose, taken = (
-                    pose_from_quaternion([number(v, place) for v in rest[3:10]], place)
-                    if len(rest) >= 10
-                    else _short(place),
-                    10,
-                )
-        if kind == "CAMERA" and taken == 10:
-            at[sensor] = At(path, line, plain + 2)
-        plain += taken - 1
+        kind, name = take(2, "sensor")
+        words += 1
+        pose: Pose | None = IDENTITY  # of the first one, the reference
+        if words > 1:
+            posed = take(1, "sensor") == ["1"]
+            pose = pose_from_quaternion(numbers(take(7, "pose"), place), place) if posed else None
         if kind == "CAMERA":
-            sensors[sensor] = pose if posed else None
-        rest = rest[taken:]
-    return ColmapRig(int(number(row[0], place)), sensors, at)
-
-
-def _short(place: str) -> Pose:
-    raise FormatError(f"{place}: ends in the middle of a pose")
+            sensor = int(number(name, place))
+            sensors[sensor] = pose
+            if words > 1 and pose is not None:
+                at[sensor] = At(path, line, len(row) - len(rest) - words - 7)
+    return ColmapRig(int(number(rig, place)), sensors, at)
 
 
 def _images(path: Path) -> Iterator[ColmapImage]:

@@ -14,7 +14,7 @@ from imgcal.formats.chains import Link, Pose, follow_links, inverse, pose_from_m
 from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.format import Files, Format
-from imgcal.formats.lens import Lens
+from imgcal.formats.lens import Lens, Model
 from imgcal.formats.source import Source
 from imgcal.formats.values import array, coefficients, focal_length, image_size, mapping, numbers, text
 from imgcal.io import Flow, yaml_text
@@ -26,7 +26,7 @@ BETWEEN = re.compile(r"T_(cam\d+|imu\d*)_(cam\d+|imu\d*)")
 NO_LENS = {
     "omni": "an omnidirectional model (omni)", "ds": "a double sphere (ds)", "eucm": "an extended unified model (eucm)",
 }  # fmt: skip
-DISTORTIONS = {
+DISTORTIONS: dict[str, tuple[Model, tuple[int, ...]]] = {
     "radtan": ("opencv", (4, 5)), "plumb_bob": ("opencv", (4, 5)), "rational_polynomial": ("opencv", (8,)),
     "equidistant": ("fisheye", (4,)), "equi": ("fisheye", (4,)), "none": ("opencv", (0, 4)), "": ("opencv", (0, 4)),
 }  # fmt: skip
@@ -129,7 +129,7 @@ def _lens(name: str, entry: dict[str, Any]) -> Lens:
         raise FormatError(f"{name}: found distortion_coeffs without a distortion_model")
     ks = () if kind in ("none", "") else ks
     focal = focal_length(fx, fy, f"{name}: intrinsics")
-    return Lens(focal, (cx, cy), ks, "fisheye" if family == "fisheye" else "opencv")
+    return Lens(focal, (cx, cy), ks, family)
 
 
 def _links(values: dict[str, Any], entries: dict[str, dict[str, Any]], names: list[str]) -> list[Link]:

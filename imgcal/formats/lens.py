@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Model = Literal["opencv", "fisheye", "to_ideal"]
 
 STEPS = 24  # from the principal point outwards, so that each solution is near the one before
 NEWTON = 12
@@ -31,7 +32,7 @@ class Lens:
     focal_length: tuple[float, float]  # pixels: fx, fy
     principal_point: tuple[float, float]  # pixels: cx, cy; (0, 0) is the centre of the top-left pixel
     coefficients: tuple[float, ...] = ()
-    model: Literal["opencv", "fisheye", "to_ideal"] = "opencv"
+    model: Model = "opencv"
     skew: float = 0.0  # pixels: what y on the z = 1 plane adds to u
 
     @property

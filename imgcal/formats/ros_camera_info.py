@@ -17,7 +17,7 @@ from imgcal.formats.documents import Document
 from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place, unplaced_camera
 from imgcal.formats.format import Files, Format
-from imgcal.formats.lens import Array, Lens
+from imgcal.formats.lens import Array, Lens, Model
 from imgcal.formats.source import Source
 from imgcal.formats.values import array, camera_matrix, coefficients, image_size, nearest_rotation, numbers, text
 from imgcal.io import Flow, yaml_text
@@ -28,7 +28,7 @@ KEYS = {
     "d": ("distortion_coefficients", "D", "d"), "r": ("rectification_matrix", "R", "r"),
     "p": ("projection_matrix", "P", "p"), "model": ("distortion_model",), "name": ("camera_name",),
 }  # fmt: skip
-MODELS = {
+MODELS: dict[str, tuple[Model, tuple[int, ...]]] = {
     "plumb_bob": ("opencv", (0, 4, 5)), "radtan": ("opencv", (0, 4, 5)), "": ("opencv", (0, 4, 5, 8, 12, 14)),
     "rational_polynomial": ("opencv", (8, 12, 14)), "equidistant": ("fisheye", (4,)), "fisheye": ("fisheye", (4,)),
 }  # fmt: skip
@@ -146,7 +146,7 @@ def _info(values: dict[str, Any], document: Document) -> _Info:
         )
     family, counts = MODELS[model]
     ks = coefficients(get("d"), f"{name}: distortion_coefficients", counts)
-    lens = Lens(focal, centre, ks, "fisheye" if family == "fisheye" else "opencv", skew)
+    lens = Lens(focal, centre, ks, family, skew)
     size = image_size([get("width") or 0, get("height") or 0], f"{name}: image_width, image_height")
     r, p = get("r"), get("p")
     rectified = (

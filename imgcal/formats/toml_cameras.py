@@ -373,7 +373,7 @@ CALISCOPE = Format(
     "caliscope", "caliscope camera array", _is_caliscope, _read_caliscope, _write_caliscope,
     Holds((5,), fisheye=True), accepts=has_tables, states_unit=True, read_lenses=_read_caliscope_lenses,
 )  # fmt: skip
-OLD_CALISCOPE = Format(
-    "caliscope-config", "caliscope config.toml (older)", lambda source: False, _read_caliscope, _write_old_caliscope,
-    Holds((5,), fisheye=True), accepts=has_tables, states_unit=True, read_lenses=_read_caliscope_lenses,
+OLD_CALISCOPE = replace(
+    CALISCOPE, name="caliscope-config", title="caliscope config.toml (older)", recognizes=lambda source: False,
+    write=_write_old_caliscope,
 )  # fmt: skip
