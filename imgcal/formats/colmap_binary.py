@@ -111,14 +111,16 @@ def _rigs(reader: _Reader) -> list[ColmapRig]:
         places: dict[int, At] = {}
         for place in range(sensors):
             kind, sensor = reader.read("iI")
-            pose: Pose | None = IDENTITY
+            pose: Pose | None = IDENTITY  # of the first one, the reference
             if place:
                 (posed,) = reader.read("B")
-                places[sensor] = reader.at()
+                at = reader.at()
                 pose = reader.pose() if posed else None
+                if kind == CAMERA and posed:
+                    places[sensor] = at
             if kind == CAMERA:
                 poses[sensor] = pose
-        found.append(ColmapRig(rig, poses, {sensor: places[sensor] for sensor in poses.keys() & places.keys()}))
+        found.append(ColmapRig(rig, poses, places))
     return found
 
 

@@ -1,10 +1,12 @@
 import struct
+from datetime import datetime
 from pathlib import Path
 
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats import convert_rig, read_foreign_rig
+from imgcal.formats import convert_rig, read_foreign_rig, write_into
+from tests.imgcal.formats.originals import drifted
 from tests.imgcal.formats.rigs import apart, brown, fisheye, put_files, read_in_mm, rig_of
 
 
@@ -40,6 +42,16 @@ def test_a_copy_as_text_says_the_same(tmp_path: Path) -> None:
     (folder / "rigs.bin").unlink()
     with pytest.raises(InputError, match=r"found a COLMAP model .binary. beside it: found only intrinsics"):
         read_foreign_rig(folder)
+
+
+def test_an_imu_with_the_number_of_a_camera_is_left_alone(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path)
+    rigs, imu = (folder / "rigs.bin").read_bytes(), struct.pack("<iIB7d", 1, 3, 1, 1, 0, 0, 0, 5, 6, 7)
+    (folder / "rigs.bin").write_bytes(rigs[:12] + struct.pack("<I", 4) + rigs[16:] + imu)
+    new = drifted(read_in_mm(folder, "m"))
+    made = write_into(new, [folder], datetime(2026, 11, 24), unit="m")
+    assert made.files["rigs.bin"].endswith(imu)
+    assert made.files["rigs.bin"] != (folder / "rigs.bin").read_bytes()
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "rigs.bin"])
