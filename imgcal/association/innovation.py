@@ -57,7 +57,7 @@ class SharedValues:
     prior_std: NDArray[np.float64]  # (C, K)
     points: NDArray[np.float64]  # (N, 3) mm, fiducials relative to their centroid
     radius_squared: NDArray[np.float64]  # (N,) mm^2
-    lenses: NDArray[np.int64]  # (C,) see `lens_codes`
+    lenses: NDArray[np.int64] | None  # (C,) see `lens_codes`
 
     @classmethod
     def of(cls, problem: Problem) -> SharedValues:
@@ -65,15 +65,18 @@ class SharedValues:
         factory, points, squared = problem.factory, problem.points, problem.radius_squared
         lens = (factory.focal_length, factory.principal_point, factory.distortion)
         rig = (factory.cam_from_rig.rotation, levenberg_marquardt_cpu.camera_positions(factory), *lens)
+        rotation, position, focal_length, principal_point, distortion, prior_std = (
+            np.ascontiguousarray(tensor[0].numpy()) for tensor in (*rig, problem.prior_std)
+        )
         return cls(
-            *(np.ascontiguousarray(tensor[0].numpy()) for tensor in (*rig, problem.prior_std)),
+            rotation, position, focal_length, principal_point, distortion, prior_std,
             np.ascontiguousarray(points.numpy()),
             np.zeros(len(points)) if squared is None else squared.numpy(),
             lens_codes(factory.lens_model, *factory.distortion.shape[-2:]),
-        )
+        )  # fmt: skip
 
     @cached_property
-    def arrays(self) -> tuple[np.ndarray, ...]:
+    def arrays(self) -> tuple[np.ndarray | None, ...]:
         """All but the object's, in the order of `_compare`."""
         rig = (self.rotation, self.position, self.focal_length, self.principal_point, self.distortion)
         return (*rig, self.prior_std, self.radius_squared, self.lenses)

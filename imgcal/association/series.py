@@ -238,12 +238,12 @@ class _Series:
             return None
         points = self.tracker.obj.points.double().numpy()
         poses = [(pose.rotation.double().numpy(), pose.translation.double().numpy()) for pose in (first, second, third)]
-        moved = [_continue(*poses[:2], points), poses[1]]
+        moved = [_continue(poses[0], poses[1], points), poses[1]]
         shown = [points @ rotation.T + translation for rotation, translation in (*moved, poses[2])]
         by_motion, by_rest = (np.linalg.norm(one - shown[-1], axis=1).mean() for one in shown[:2])
         if by_motion >= by_rest:
             return None
-        there = _continue(*poses[1:], points)
+        there = _continue(poses[1], poses[2], points)
         return RigidTransform(*(torch.from_numpy(part).to(third.rotation) for part in there))
 
     def _nearest_pose(self, s: int, accepted: NDArray[np.int64]) -> RigidTransform | None:

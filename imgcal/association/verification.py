@@ -167,8 +167,8 @@ class Fits:
         """Keep the given labellings, without a copy if it is a single one."""
         chosen = one_or_some(rows)
         found = None if self.innovations is None else self.innovations.select(rows)
-        given = (self.labels, self.offset, self.rotation, self.centre, self.sigma, self.cost)
-        return Fits(*(column[chosen] for column in given), found)
+        places = (self.offset[chosen], self.rotation[chosen], self.centre[chosen])
+        return Fits(self.labels[chosen], *places, self.sigma[chosen], self.cost[chosen], found)
 
 
 def join(parts: Sequence[Fits]) -> Fits:
@@ -177,11 +177,11 @@ def join(parts: Sequence[Fits]) -> Fits:
         return parts[0]
     found = [_require_innovations(part) for part in parts]
 
-    def cat(records: Sequence[Any], kind: type[Fits | Innovations]) -> list[NDArray[Any]]:
+    def cat(records: Sequence[Any], kind: type[Fits | Innovations]) -> dict[str, Any]:
         names = [field.name for field in fields(kind) if field.name != "innovations"]
-        return [np.concatenate([getattr(record, name) for record in records]) for name in names]
+        return {name: np.concatenate([getattr(record, name) for record in records]) for name in names}
 
-    return Fits(*cat(parts, Fits), Innovations(*cat(found, Innovations)))
+    return Fits(**cat(parts, Fits), innovations=Innovations(**cat(found, Innovations)))
 
 
 def start(scene: Scene, poses: Poses, labels: NDArray[np.int64]) -> Fits:
@@ -338,8 +338,8 @@ def make_problem(scene: Scene, fits: Fits) -> Problem:
     """Convert labellings into an estimation problem."""
     count = len(fits.labels)
     uv, root_weight = (torch.from_numpy(array)[:, None] for array in _observe(scene, fits))
-    rigs = {"factory": scene.rig.expand(count), "prior_std": scene.std.expand(count, -1, -1)}
-    return replace(scene.known.problem, uv=uv, root_weight=root_weight, **rigs)
+    factory, prior_std = scene.rig.expand(count), scene.std.expand(count, -1, -1)
+    return replace(scene.known.problem, uv=uv, root_weight=root_weight, factory=factory, prior_std=prior_std)
 
 
 def _observe(scene: Scene, fits: Fits) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

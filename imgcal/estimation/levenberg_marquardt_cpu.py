@@ -101,10 +101,11 @@ class SnapshotFit:
     def of(cls, solution: Solution) -> SnapshotFit:
         """Take the values of a solution with one rig and one snapshot."""
         state, found = solution.state, solution.equations
+        states = (state.offset[0], state.rotation[0, 0], state.centre[0, 0])
+        offset, rotation, centre = (part.numpy() for part in states)
         parts = (found.camera[0], found.coupling[0, 0], found.pose[0, 0])
         camera, coupling, pose = (part.contiguous().numpy() for part in parts)
-        given = (part[0].numpy() for part in (state.offset, state.rotation[:, 0], state.centre[:, 0]))
-        return cls(*given, float(found.cost[0]), camera, coupling, pose)
+        return cls(offset, rotation, centre, float(found.cost[0]), camera, coupling, pose)
 
 
 class RigSolver:
@@ -153,10 +154,9 @@ class RigSolver:
             tolerance: as for `minimize`.
         """
         if without_machine_code(_minimize_rig):
-            values = (torch.from_numpy(array)[None, None] for array in (uv, root_weight, *start[1:]))
-            uv_, root_weight_, rotation, centre = values
-            problem = replace(self._problem, uv=uv_, root_weight=root_weight_)
-            state = State(torch.from_numpy(start[0])[None], rotation, centre)
+            pixels, weights, turn, place = (torch.from_numpy(a)[None, None] for a in (uv, root_weight, *start[1:]))
+            problem = replace(self._problem, uv=pixels, root_weight=weights)
+            state = State(torch.from_numpy(start[0])[None], turn, place)
             return SnapshotFit.of(minimize(problem, state, loss, threshold, max_iterations, tolerance))
         offset, rotation, centre = start
         first = (offset, rotation[None], centre[None], np.zeros_like(self._given[-1]))

@@ -30,7 +30,7 @@ from imgcal.association.verification import (
 )
 from imgcal.geometry import rotation_from_vector
 from imgcal.io import load_object
-from tests.imgcal.association.scenes import DRIFT, degrees_between, make_object, scene_of, take
+from tests.imgcal.association.scenes import degrees_between, make_object, scene_of, take
 
 ODDS = (1e5, 1e2)
 

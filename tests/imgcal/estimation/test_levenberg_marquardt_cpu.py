@@ -1,15 +1,18 @@
 """The compiled solver against the tensor solver."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 
 import numba
+import numpy as np
 import pytest
 import torch
 
 from imgcal.estimation import (
     NormalEquations,
+    Problem,
     Solution,
+    State,
     levenberg_marquardt,
     levenberg_marquardt_cpu,
     linearize,
@@ -96,10 +99,26 @@ def test_same_minimum_with_an_object_that_is_not_exact(
         )
 
 
+def fit_in_arrays(problem: Problem, start: State) -> levenberg_marquardt_cpu.SnapshotFit:
+    given = (problem.uv[0, 0].numpy(), problem.root_weight[0, 0].numpy())
+    first = (start.offset[0].numpy(), start.rotation[0, 0].numpy(), start.centre[0, 0].numpy())
+    return levenberg_marquardt_cpu.RigSolver(problem).fit_snapshot(*given, first, "huber", 4.0, 60, 1e-9)
+
+
+def test_one_snapshot_in_arrays_is_fitted_as_in_tensors(simulate) -> None:
+    case = simulate(1, snapshots=1, cameras=3, missing=0.1, noise=0.06)
+    problem = case.problem()
+    solution = levenberg_marquardt_cpu.minimize(problem, case.start(problem), "huber", 4.0, 60, 1e-9)
+    found, expected = fit_in_arrays(problem, case.start(problem)), levenberg_marquardt_cpu.SnapshotFit.of(solution)
+    for field in fields(expected):
+        np.testing.assert_array_equal(getattr(found, field.name), getattr(expected, field.name))
+
+
 def test_tensors_stand_in_for_missing_machine_code(simulate, monkeypatch) -> None:
     case = simulate(1, snapshots=3, cameras=2, fiducials=6, radius=None, missing=0.05, noise=0.06)
     problem = case.problem()
     start, points = case.start(problem), problem.points.expand(1, -1, -1)
+    one = simulate(1, snapshots=1, cameras=2).problem()
     solutions = [
         levenberg_marquardt_cpu.minimize(each, make.start(each), "huber", 4.0, 60, 1e-9)
         for make in (case, simulate(1, snapshots=20, cameras=2, tolerance=0.4))  # poses, cameras are eliminated last
@@ -112,6 +131,7 @@ def test_tensors_stand_in_for_missing_machine_code(simulate, monkeypatch) -> Non
         lambda: (
             levenberg_marquardt_cpu.RigSolver(problem).minimize(problem, start, "huber", 4.0, 60, 1e-9).state.offset
         ),
+        lambda: torch.from_numpy(fit_in_arrays(one, simulate(1, snapshots=1, cameras=2).start(one)).coupling),
         lambda: levenberg_marquardt_cpu.linearize(problem, start, "huber", 4.0).pose,
         lambda: problem.factory.project_values(points).uv,
     )
