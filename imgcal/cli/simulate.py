@@ -104,11 +104,13 @@ class Simulate(arguments.Simulate):
         model = replace(model, exposure_ms=self.exposure_ms)
         for camera in rig.camera_names:
             (out / "frames" / camera).mkdir(parents=True)
-        shots, rows = simulate_shots(truth, obj, model, generator), ["snapshot,camera,fiducial,seen"]
+        shots = simulate_shots(truth, obj, model, generator)
+        rows = ["snapshot,camera,object,fiducial,seen" if obj.parts else "snapshot,camera,fiducial,seen"]
+        parts = [(f"{part.name}," if obj.parts else "", part) for part in obj.each]
+        labels = [f"{name}{n}" for name, part in parts for n in part.labels or range(part.num_fiducials)]
         for snapshot, shot in enumerate(progress(shots, self.snapshots, "rendering frames")):
             for (camera, image), shares in zip(shot.frames.items(), shot.seen.tolist(), strict=True):
                 write_frame(out / "frames" / camera / f"{snapshot:05d}.png", image)
-                labels = obj.labels or range(len(shares))
                 rows += [f"{snapshot:05d},{camera},{n},{share:.3f}" for n, share in zip(labels, shares, strict=True)]
         write_text(out / "truth" / "seen.csv", "\n".join([*rows, ""]))
 

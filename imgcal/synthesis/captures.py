@@ -165,9 +165,8 @@ def _join(parts: Sequence[Spots]) -> Spots:
     spots = Spots(**joined)
     if not smears:
         return spots
-    return replace(
-        spots, smear=Smear(torch.cat([s.path for s in smears], 1), torch.cat([s.defocus for s in smears], 1))
-    )
+    path = torch.cat([smear.path for smear in smears], 1)
+    return replace(spots, smear=Smear(path, smears[0].defocus[:, :1].expand(path.shape[:-1])))  # a camera has one focus
 
 
 def true_detections(truth: Truth) -> Detections:

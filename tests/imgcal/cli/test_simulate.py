@@ -1,3 +1,4 @@
+import csv
 import signal
 import subprocess
 import sys
@@ -145,6 +146,18 @@ def test_a_named_difficulty(tmp_path):
     assert len(lines) == 1 + 4 * 8
     shares = [float(line.rpartition(",")[2]) for line in lines[1:]]
     assert 0 <= min(shares) < 0.1 and max(shares) > 0.9
+
+
+def test_what_is_seen_of_several_objects_is_called_as_in_the_table_of_blobs(tmp_path):
+    arguments = ["simulate", "--rig", "T4", "--object", "asymmetric8", "cube8", "--snapshots", "1"]
+    assert main([*arguments, "--difficulty", "clutter", "--out", str(tmp_path / "a")]) == 0
+    seen, blobs = (
+        list(csv.DictReader((tmp_path / "a" / "truth" / f"{name}.csv").read_text().splitlines()))
+        for name in ("seen", "detections")
+    )
+    assert list(seen[0]) == ["snapshot", "camera", "object", "fiducial", "seen"]
+    names = lambda rows: {(row["camera"], row["object"], row["fiducial"]) for row in rows}  # noqa: E731
+    assert len(names(seen)) == 4 * 16 and names(blobs) <= names(seen)
 
 
 def test_kappa_alone_is_the_papers_drift(tmp_path):

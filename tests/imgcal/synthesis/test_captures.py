@@ -4,7 +4,19 @@ import numpy as np
 import torch
 
 from imgcal.detection import DetectionOptions, detect
-from imgcal.synthesis import FrameModel, PhysicalDrift, RelativeDrift, simulate_frames, simulate_truth, true_detections
+from imgcal.io import load_object, read_rig
+from imgcal.synthesis import (
+    DIFFICULTIES,
+    FrameModel,
+    PhysicalDrift,
+    RelativeDrift,
+    join_truths,
+    simulate_frames,
+    simulate_shots,
+    simulate_truth,
+    true_detections,
+)
+from imgcal.types import CalibrationObject
 from renderers import SensorModel
 
 
@@ -19,6 +31,16 @@ def test_one_rig_many_poses(o10, asymmetric8):
     table = true_detections(truth)
     assert len(table) == 4 * 10 * 8
     assert np.array_equal(table.uv.reshape(4, 10, 8, 2), truth.uv.numpy())
+
+
+def test_a_camera_has_one_focus_for_all_objects(asymmetric8):
+    rig, cube8, generator = read_rig("T4"), load_object("cube8"), torch.Generator().manual_seed(0)
+    first = simulate_truth(rig, asymmetric8, 2, generator, None)
+    truth = join_truths([first, simulate_truth(rig, cube8, 2, generator, None)])
+    several = CalibrationObject.of_several([asymmetric8, cube8])
+    for shot in simulate_shots(truth, several, FrameModel(difficulty=DIFFICULTIES["defocus"]), generator):
+        defocus = shot.markers.smear.defocus
+        assert torch.equal(defocus, defocus[:, :1].expand(-1, 16)) and len(defocus[:, 0].unique()) == 4
 
 
 def test_detected_centres_are_the_true_ones(o10, asymmetric8):
