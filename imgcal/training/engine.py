@@ -106,6 +106,8 @@ def prepare(experiment: Experiment, state: TrainingState | None = None) -> Run:
     if settings.channels_last:
         task.network.to(memory_format=torch.channels_last)
     data, layers = stream_seeds(settings.seed, accelerator.process_index)
+    # One a kind of device: several processes train on "cpu:0", which has the same default generator as "cpu".
+    dropout = {own.type: torch.Generator(own).manual_seed(layers) for own in (torch.device("cpu"), device)}
     optimizer = make_optimizer(task.network, experiment.optimizer)
     average = None if experiment.optimizer.ema is None else make_average(task.network)
     judge = task.loss
@@ -124,7 +126,7 @@ def prepare(experiment: Experiment, state: TrainingState | None = None) -> Run:
         schedule=Schedule(optimizer, experiment.schedule),
         average=average,
         generator=torch.Generator(device).manual_seed(data),
-        dropout=tuple(torch.Generator(kind).manual_seed(layers) for kind in {"cpu": 0, str(device): 0}),
+        dropout=tuple(dropout.values()),
         batch_size=batch_size,
     )
     if state is not None:

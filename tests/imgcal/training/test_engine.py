@@ -382,3 +382,16 @@ def test_data_and_dropout_are_independent_streams(experiment):
     assert torch.equal(torch.rand(8, generator=run.generator), drawn[0])
     assert torch.equal(torch.rand(8, generator=run.dropout[0]), drawn[1])
     assert (torch.corrcoef(torch.stack(drawn)) - torch.eye(4)).abs().max() < 0.95
+
+
+def test_dropout_follows_the_seed_on_a_cpu_with_a_number(experiment, monkeypatch):
+    """Accelerate names the CPU `cpu:0` if there are several processes."""
+    monkeypatch.setattr(engine.Accelerator, "device", torch.device("cpu", 0))
+    found = []
+    for default in (0, 1):
+        torch.manual_seed(default)
+        run = engine.prepare(experiment("training.validation_rigs=0"))
+        for _ in range(3):
+            engine.train_step(run)
+        found.append(run.plain.head.weight.detach())
+    assert torch.equal(*found)
