@@ -64,7 +64,8 @@ def restore(run: Run, state: TrainingState) -> None:
         run.best.network.load_state_dict(tensors["best"])
     restore_optimizer(run.optimizer, tensors["optimizer"], values["optimizer"])
     run.schedule.restore(values["schedule"])
-    states = {name: rows[index] for name, rows in tensors["random"].items()}
+    # A generator reads the memory of its state from the start: a row of a matrix must be copied.
+    states = {name: rows[index].clone() for name, rows in tensors["random"].items()}
     restore_random_states(run.generator, run.dropout, states)
     run.step, run.elapsed, run.began = values["step"], values["elapsed"], monotonic()
     run.metrics = dict(values.get("metrics", {}))

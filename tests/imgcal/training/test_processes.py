@@ -58,20 +58,27 @@ def test_killed_and_resumed_is_bit_for_bit_uninterrupted(experiment, tmp_path):
     assert all(torch.equal(whole[name], killed[name]) for name in whole)
 
 
-def test_two_processes_of_torchrun_share_a_batch(tmp_path):
-    (tmp_path / "toy.yaml").write_text(EXPERIMENT)
-    out = tmp_path / "two"
+def launch(folder, *arguments):
+    """Train the toy with two processes of torchrun; return what they print."""
+    (folder / "toy.yaml").write_text(EXPERIMENT)
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", TOY]
-    changes = ["training.device=auto", "training.accumulate=2", "training.patience=9"]
-    command = ["train", str(tmp_path / "toy.yaml"), "--out", str(out), "--set", *changes]
-    run = subprocess.run(
-        [*launcher, *command], env=environment(), cwd=ROOT, capture_output=True, text=True, timeout=120
-    )
+    command = [*launcher, "train", str(folder / "toy.yaml"), *map(str, arguments)]
+    run = subprocess.run(command, env=environment(), cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert run.returncode == 0, run.stderr
-    assert run.stderr.count("2 x cpu") == run.stderr.count("60 steps") == 1  # only the main process speaks
-    rows = read_metrics(out / "metrics.jsonl")
+    return run.stderr
+
+
+def test_two_processes_of_torchrun_share_a_batch_and_resume(tmp_path):
+    changes = ["schedule.kind=constant", "training.device=auto", "training.accumulate=2", "training.patience=9"]
+    said = launch(tmp_path, "--out", tmp_path / "whole", "--set", *changes)
+    assert said.count("2 x cpu") == said.count("60 steps") == 1  # only the main process speaks
+    rows = read_metrics(tmp_path / "whole" / "metrics.jsonl")
     losses = [row["loss"] for row in rows if "loss" in row]
     assert len(losses) == 6 and losses[-1] < losses[0]
-    state, _ = read_tensors(out / STATE, "imgcal-training/1")
+    state, _ = read_tensors(tmp_path / "whole" / STATE, "imgcal-training/1")
     assert state["random/data"].shape[0] == 2
     assert not torch.equal(*state["random/data"])  # each process draws its own rigs
+    launch(tmp_path, "--out", tmp_path / "parts", "--set", *changes, "training.steps=30")
+    launch(tmp_path, "--out", tmp_path / "parts", "--resume", "--set", *changes)
+    whole, parts = weights(tmp_path / "whole"), weights(tmp_path / "parts")
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
