@@ -183,7 +183,11 @@ def _backward(run: Run, parts: int) -> dict[str, Tensor]:
     with use_generators(*run.dropout), autocast(run):
         answer = run.task.predict(run.network, batch)
     loss = run.judge(answer, batch, run.step)
-    run.accelerator.backward(loss.total / parts)
+    total = loss.total / parts
+    if run.accelerator.num_processes > 1:
+        # Processes exchange every gradient, so a parameter that nothing depends on needs one, too: zero.
+        total = total + 0 * torch.stack([each.sum() for each in run.plain.parameters() if each.requires_grad]).sum()
+    run.accelerator.backward(total)
     numbers = {"loss": loss.total.detach(), **loss.means}
     # Copy them: with CUDA graphs, the next step overwrites this memory.
     return dict(zip(numbers, torch.stack(list(numbers.values())).unbind(), strict=True))

@@ -34,7 +34,10 @@ training:
 
 
 class Toy(Network):
-    """Two passes of one small network on the points; dropout draws from the default generator."""
+    """Two passes of one small network on the points; dropout draws from the default generator.
+
+    Nothing depends on `idle`.
+    """
 
     takes: ImageOptions | None = None
     width = 24
@@ -42,6 +45,7 @@ class Toy(Network):
     def __init__(self, config, factory, obj, drift_std, generator, images=None):
         super().__init__(Parameterization(factory, obj, drift_std), self.takes and (images or self.takes))
         self.register_buffer("prior_std", drift_std)
+        self.idle = nn.Parameter(torch.zeros(2))
         with use_generators(generator):
             self.make_layers(factory, obj)
 
