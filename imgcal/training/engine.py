@@ -10,7 +10,6 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any
 
-import numpy as np
 import torch
 from accelerate import Accelerator
 from accelerate.utils import broadcast
@@ -29,6 +28,7 @@ from imgcal.training.optimization import (
     set_training_mode,
     update_average,
 )
+from imgcal.training.random_streams import make_stream
 from imgcal.training.run import Best, Pending, Run
 from imgcal.training.state import TrainingState
 
@@ -99,15 +99,15 @@ def prepare(experiment: Experiment, state: TrainingState | None = None) -> Run:
     accelerator = Accelerator(cpu=settings.device == "cpu" or not torch.accelerator.is_available())
     device, processes = accelerator.device, accelerator.num_processes
     batch_size = _micro_batch_size(settings, processes)
-    weights = torch.Generator().manual_seed(settings.seed)
+    weights = make_stream("weights", settings.seed)
     task = experiment.make_task(device, batch_size, weights, fresh=state is None)
     freeze(task.network, experiment.optimizer.freeze)
     set_training_mode(task.network)
     if settings.channels_last:
         task.network.to(memory_format=torch.channels_last)
-    data, layers = stream_seeds(settings.seed, accelerator.process_index)
     # One a kind of device: several processes train on "cpu:0", which has the same default generator as "cpu".
-    dropout = {own.type: torch.Generator(own).manual_seed(layers) for own in (torch.device("cpu"), device)}
+    stream = settings.seed, accelerator.process_index
+    dropout = {own.type: make_stream("layers", *stream, own) for own in (torch.device("cpu"), device)}
     optimizer = make_optimizer(task.network, experiment.optimizer)
     average = None if experiment.optimizer.ema is None else make_average(task.network)
     judge = task.loss
@@ -125,24 +125,13 @@ def prepare(experiment: Experiment, state: TrainingState | None = None) -> Run:
         optimizer=optimizer,
         schedule=Schedule(optimizer, experiment.schedule),
         average=average,
-        generator=torch.Generator(device).manual_seed(data),
+        generator=make_stream("data", *stream, device),
         dropout=tuple(dropout.values()),
         batch_size=batch_size,
     )
     if state is not None:
         restore(run, state)
     return run
-
-
-def stream_seeds(seed: int, process: int) -> tuple[int, int]:
-    """Seeds of a process's two independent streams of random numbers: for its data and for its layers.
-
-    Examples:
-        >>> stream_seeds(1, 2)
-        (4098, 15529898885419721899)
-    """
-    (layers,) = np.random.SeedSequence((seed, process)).generate_state(1, np.uint64)
-    return seed * 4096 + process, int(layers)
 
 
 def _micro_batch_size(settings: TrainingConfig, processes: int) -> int:

@@ -25,10 +25,10 @@ from imgcal.synthesis import degrade_crops, host_generator, render_crops, sample
 from imgcal.training.experiment import Experiment, Fraction
 from imgcal.training.frame_dataset import FrameDataset, expect_elsewhere, load_splits, thin, turn
 from imgcal.training.infrared import evidence_at_best, make_queries, query_losses
+from imgcal.training.random_streams import FIXED, make_stream
 from imgcal.training.task import Loss, Task
 
 SECOND_LOOKS = 0.5  # share of the batches that simulate a second look, after a rig was fitted to a first one
-VALIDATION_SEED = 20_000_003
 CAMERAS = 2  # crops per rig: more rigs and objects instead of more cameras
 FIDUCIALS = (5, 12)  # of the objects
 FIDUCIALS_AT_ONCE = 16  # that are asked for in a crop of a real frame
@@ -161,7 +161,7 @@ class InfraredTask(Task[CropBatch, Evidence]):
         """Correct share of the visible, wrong share of the claimed, and the offsets' NEES, on fixed crops."""
         if not self.sizes:
             return {}
-        generator = torch.Generator(self.device).manual_seed(VALIDATION_SEED)
+        generator = make_stream("validation", FIXED, device=self.device)
         counts = torch.stack([_counts(predict(batch), batch) for batch in self._validation(generator)]).sum(0)
         right, wrong, nees = torch.stack(_shares(counts)).tolist()
         return {

@@ -24,10 +24,9 @@ from imgcal.networks import (
 from imgcal.synthesis import Patches, expose_patches, host_generator, render_patches
 from imgcal.training.experiment import Experiment, Fraction
 from imgcal.training.frame_dataset import load_patches
+from imgcal.training.random_streams import FIXED, make_stream
 from imgcal.training.task import Loss, Task
 from imgcal.types import BlobKind
-
-POOL_SEED, VALIDATION_SEED = 20_000_001, 20_000_003
 
 
 class MeasurerExperiment(Experiment):
@@ -88,13 +87,13 @@ class MeasurerTask(Task[PatchBatch, Measured]):
         self.network = network.to(device)
         self.device = device
         self.sizes = experiment.training.validation_sizes(batch_size)
-        self.pool = _pool(experiment.pool, POOL_SEED, device)
+        self.pool = _pool(experiment.pool, "pool", device)
         self.share = experiment.frames_share
         if experiment.frames is None:
-            self.held_out = _pool(max(sum(self.sizes), 1), VALIDATION_SEED, device)
+            self.held_out = _pool(max(sum(self.sizes), 1), "validation patches", device)
             return
         own, held_out = load_patches(experiment.frames)
-        draw = torch.Generator().manual_seed(VALIDATION_SEED)
+        draw = make_stream("validation rows", FIXED)
         rows = torch.randint(len(held_out), (max(sum(self.sizes), 1),), generator=draw)
         self.own, self.held_out = (_to(part, device) for part in (own.as_patches(), held_out.select(rows).as_patches()))
 
@@ -130,7 +129,7 @@ class MeasurerTask(Task[PatchBatch, Measured]):
         """Mean absolute error per axis and NEES of single markers, and wrong classifications, on fixed patches."""
         if not self.sizes:
             return {}
-        generator = torch.Generator(self.device).manual_seed(VALIDATION_SEED)
+        generator = make_stream("validation light", FIXED, device=self.device)
         rows = torch.arange(sum(self.sizes), device=self.device).split(self.sizes)
         batches = [_expose(self.held_out.select(some), generator) for some in rows]
         answers = [predict(batch) for batch in batches]
@@ -152,10 +151,10 @@ class MeasurerTask(Task[PatchBatch, Measured]):
 
 
 @lru_cache(maxsize=4)
-def _pool(count: int, seed: int, device: torch.device) -> Patches:
+def _pool(count: int, purpose: str, device: torch.device) -> Patches:
     """Render a fixed set of patches, once for all trainings of a process."""
     with torch.no_grad():
-        return render_patches(count, torch.Generator(device).manual_seed(seed))
+        return render_patches(count, make_stream(purpose, FIXED, device=device))
 
 
 def _to(patches: Patches, device: torch.device) -> Patches:

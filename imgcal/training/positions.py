@@ -29,10 +29,10 @@ from imgcal.networks import (
 )
 from imgcal.training.data import Levels, draw_levels, object_to
 from imgcal.training.experiment import Experiment
+from imgcal.training.random_streams import FIXED, make_stream
 from imgcal.training.task import Loss, Task
 from imgcal.types import Views
 
-VALIDATION_SEED = 20_000_004
 CENTRES = 0.09  # of the width of an image: standard deviation of the centre of its dots
 SPREADS = ((0.04, 0.15), (0.05, 0.2))  # of it, along u and v: smallest and largest standard deviation of the dots
 PAIRED, APART = 0.25, 0.012  # share of dots next to another one; their distance in widths of the image, each axis
@@ -120,7 +120,7 @@ class PositionsTask(Task[PositionBatch, Located]):
             return {}
         medians, lost = {}, {}
         for level in self.experiment.levels:
-            generator = torch.Generator(self.device).manual_seed(VALIDATION_SEED)
+            generator = make_stream("validation", FIXED, device=self.device)
             batch = self._draw(count, (level,), generator)
             parts = (tensor.split(self.batch_size) for tensor in (batch.images, batch.uv, batch.seen))
             found = torch.cat([predict(PositionBatch(*part)).uv for part in zip(*parts, strict=True)])

@@ -20,11 +20,9 @@ from imgcal.training.data import Levels, RigBatch, Source, object_to
 from imgcal.training.end_to_end import end_to_end_loss
 from imgcal.training.experiment import Experiment
 from imgcal.training.losses import LossConfig, compound
+from imgcal.training.random_streams import FIXED, make_stream
 from imgcal.training.task import Loss, Task
 from imgcal.types import CalibrationObject, CameraRig, Prediction
-
-# Seed for validation rigs, which must not depend on the length of the training.
-VALIDATION_SEED = 20_000_003
 
 LEAST_GOOD = 0.01  # smallest share of random rigs that see everything
 
@@ -99,12 +97,12 @@ class RigTask(Task[RigBatch, Passes]):
         if device.type != "cpu":  # avoids waiting for the device; a CPU need not draw more than it uses
             self.source = replace(self.source, good=self._share_of_good(device))
         self.prior_std = experiment.drift.std(self.factory).to(device, torch.float32)  # (C, K)
-        fixed = torch.Generator(device).manual_seed(VALIDATION_SEED)
+        fixed = make_stream("validation rigs", FIXED, device=device)
         sizes = experiment.training.validation_sizes(batch_size)
         self.validation = [self.source.sample(size, fixed) for size in sizes]
 
     def _share_of_good(self, device: torch.device) -> float:
-        fixed = torch.Generator(device).manual_seed(VALIDATION_SEED)
+        fixed = make_stream("share of good rigs", FIXED, device=device)
         rig, obj, drift, poses = self.source.factory, self.source.obj, self.source.drift, self.source.pose_range
         found = share_of_good_rigs(rig, obj, fixed, drift=drift, pose_range=poses)
         if found < LEAST_GOOD:
@@ -133,7 +131,7 @@ class RigTask(Task[RigBatch, Passes]):
         """RE in pixels of the last pass, on fixed rigs."""
         if not self.validation:
             return {}
-        generator = torch.Generator(self.prior_std.device).manual_seed(VALIDATION_SEED)
+        generator = make_stream("validation views", FIXED, device=self.prior_std.device)
         batches = (self.source.show(made, generator) for made in self.validation)
         errors = torch.cat([self.errors(predict(batch)[-1], batch) for batch in batches])
         return {"validation_re_px": float(errors.mean()), "validation_re_median_px": float(errors.median())}

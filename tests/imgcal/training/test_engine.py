@@ -14,7 +14,7 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.io import read_metrics, read_rig, read_tensors, save_rig
 from imgcal.networks import load_checkpoint
 from imgcal.training import Callbacks, DivergedError, engine, is_finished, load_experiment, progress, rigs
-from imgcal.training.engine import stream_seeds
+from imgcal.training.random_streams import make_stream
 from tests.imgcal.training.toy import Toy, ToyOfImages, train
 
 
@@ -374,14 +374,18 @@ def test_weights_that_are_not_finite_are_no_result(experiment, tmp_path, monkeyp
         train(experiment("training.validation_rigs=0"), tmp_path)
 
 
-def test_data_and_dropout_are_independent_streams(experiment):
-    drawn = []
-    for process in (0, 1):
-        drawn += [torch.rand(8, generator=torch.Generator().manual_seed(s)) for s in stream_seeds(0, process)]
+def test_weights_data_and_dropout_are_streams_of_their_own(experiment, monkeypatch):
+    weights, make = [], Toy.__init__
+
+    def note(self, config, factory, obj, drift_std, generator, images=None):
+        weights.append(generator.get_state())
+        make(self, config, factory, obj, drift_std, generator, images)
+
+    monkeypatch.setattr(Toy, "__init__", note)
     run = engine.prepare(experiment("training.seed=0"))
-    assert torch.equal(torch.rand(8, generator=run.generator), drawn[0])
-    assert torch.equal(torch.rand(8, generator=run.dropout[0]), drawn[1])
-    assert (torch.corrcoef(torch.stack(drawn)) - torch.eye(4)).abs().max() < 0.95
+    states = [weights[0], run.generator.get_state(), run.dropout[0].get_state()]
+    expected = [make_stream(purpose, 0).get_state() for purpose in ("weights", "data", "layers")]
+    assert all(torch.equal(found, state) for found, state in zip(states, expected, strict=True))
 
 
 def test_dropout_follows_the_seed_on_a_cpu_with_a_number(experiment, monkeypatch):

@@ -41,6 +41,20 @@ def test_validation_shows_the_same_rigs_in_parts(experiment):
     assert not task_of(experiment("training.validation_rigs=0")).validate(truth)
 
 
+def test_validation_corrupts_rigs_by_other_random_numbers_than_it_draws_them_with(experiment, monkeypatch):
+    begun = []
+    for name in ("sample", "show"):
+
+        def note(self, made, generator, plain=getattr(data.Source, name)):
+            begun.append(generator.get_state())
+            return plain(self, made, generator)
+
+        monkeypatch.setattr(data.Source, name, note)
+    task = task_of(experiment("training.validation_rigs=7", "corruption={noise: 0.3}"))
+    task.validate(lambda batch: (batch.truth,))
+    assert len(begun) == 2 and not torch.equal(*begun)
+
+
 def test_levels_that_would_have_no_effect_are_refused(experiment, monkeypatch):
     with pytest.raises(InputError, match=r"levels: found \[0, 1\], but the network points takes points"):
         task_of(experiment("levels=[0, 1]"))
