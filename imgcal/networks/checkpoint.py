@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -146,21 +147,21 @@ def read_subject(path: str | Path) -> tuple[CameraRig, CalibrationObject]:
 
 
 def warm_start(start: str | Path | Sequence[str | Path], network: nn.Module) -> tuple[str, ...]:
-    """Copy the parameters of checkpoints that match by name and shape, whatever rig or drift they were trained for.
+    """Copy the weights of checkpoints that match by name and shape, whatever rig or drift they were trained for.
 
     Args:
         start: a file, the folder of a training run, or the name of a shipped network; or several, where later ones
             override earlier ones.
-        network: receives the parameters.
+        network: receives the weights: parameters, and buffers such as the running means of batch normalization.
 
     Returns:
-        Names of the network's parameters that no checkpoint has with the same shape.
+        Names of the network's weights that no checkpoint has with the same shape.
 
     Raises:
-        InputError: a file cannot be used, or none of its parameters match.
+        InputError: a file cannot be used, or none of its weights match.
     """
     missing = [set(_take_over(path, network)) for path in ([start] if isinstance(start, str | Path) else start)]
-    return tuple(name for name, _ in network.named_parameters() if all(name in names for names in missing))
+    return tuple(name for name in network.state_dict() if all(name in names for names in missing))
 
 
 def _take_over(path: str | Path, network: nn.Module) -> tuple[str, ...]:
@@ -168,19 +169,21 @@ def _take_over(path: str | Path, network: nn.Module) -> tuple[str, ...]:
     path = model_file(path)
     tag = FORMATS_OF_FRAMES.get(type(network))
     tensors, texts = read_tensors(path, FORMAT) if tag is None else read_weights(path, tag)
-    own = dict(network.named_parameters())
+    own = network.state_dict()
     fitting = [name for name in own if name in tensors and tensors[name].shape == own[name].shape]
     spec = None if tag is not None else _read_records(path, texts)[0]
     if spec is not None and is_position_training(spec):
         fitting = [name for name in fitting if name.startswith("positions.")]  # the rest is untrained
     if not fitting:
-        raise InputError(f"{path}: found no parameter that matches the network by name and shape")
-    with torch.no_grad():
-        for name in fitting:
-            own[name].copy_(tensors[name])
-    trunk = getattr(network, "trunk", None)
-    if spec is not None and isinstance(trunk, IterativeRefiner) and any(name.startswith("trunk.") for name in fitting):
+        raise InputError(f"{path}: found no weights that match the network by name and shape")
+    # A copy of the network converts this file's weights; those from other files stay as they are.
+    source = copy.deepcopy(network)
+    source.load_state_dict({name: tensors[name] for name in fitting}, strict=False)
+    trunk = getattr(source, "trunk", None)
+    if spec is not None and isinstance(trunk, IterativeRefiner):
         trunk.rescale(spec.drift.std(_parse_texts(path, texts)[0]))
+    converted = source.state_dict()
+    network.load_state_dict({name: converted[name] for name in fitting}, strict=False)
     return tuple(name for name in own if name not in fitting)
 
 

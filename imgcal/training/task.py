@@ -55,7 +55,7 @@ class Task(ABC, Generic[SomeBatch, Answer]):
     judged: ClassVar[str]  # number from `validate` that determines the best weights; smaller is better
     headline: ClassVar[Mapping[str, str]] = {}  # numbers of a progress line with formats: {"re_px": "RE {:.3g} px"}
     network: nn.Module  # on its device, in training mode
-    untrained: tuple[str, ...] = ()  # parameters that a warm start did not find
+    untrained: tuple[str, ...] = ()  # weights that a warm start did not find
     files: Mapping[str, str] = MappingProxyType({})  # by key, content of files that must not change before a resume
 
     @abstractmethod

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from safetensors.torch import save
+from torch import nn
 
 from imgcal.errors import InputError
 from imgcal.io import load_object, read_rig, read_tensors, write_tensors
@@ -25,6 +26,14 @@ def toy(monkeypatch):
 @pytest.fixture
 def experiment(tmp_path):
     return experiments(tmp_path)
+
+
+class Normalized(Toy):
+    """Has running means of batches, as many encoders of timm."""
+
+    def make_layers(self, factory, obj):
+        super().make_layers(factory, obj)
+        self.trunk.append(nn.BatchNorm1d(self.width))
 
 
 def built(setup):
@@ -144,15 +153,17 @@ def test_a_rig_in_single_precision_is_the_same(made, tmp_path):
     load_network(tmp_path / "a.safetensors", read_rig("T4"), load_object("asymmetric8"))
 
 
-def test_bfloat16_is_for_parameters_only(made, tmp_path):
-    experiment, network = made
-    path = tmp_path / "small.safetensors"
-    save_network(path, network, experiment, {}, dtype=torch.bfloat16)
+def test_bfloat16_is_for_parameters_only(experiment, tmp_path, monkeypatch):
+    monkeypatch.setattr("imgcal.networks.factory.build", Normalized)
+    setup, path = experiment(), tmp_path / "small.safetensors"
+    network = built(setup)
+    network.trunk[3].running_mean.fill_(1 / 3)
+    save_network(path, network, setup, {}, dtype=torch.bfloat16)
     tensors, _ = read_tensors(path, FORMAT)
     assert tensors["trunk.0.weight"].dtype == torch.bfloat16
-    assert torch.equal(tensors["prior_std"], network.prior_std)
+    assert torch.equal(tensors["trunk.3.running_mean"], network.trunk[3].running_mean)
     found = load_network(path)
-    assert {tensor.dtype for tensor in found.state_dict().values()} == {torch.float32}
+    assert {tensor.dtype for tensor in found.parameters()} == {torch.float32}
     torch.testing.assert_close(found.trunk[0].weight, network.trunk[0].weight, rtol=2**-8, atol=0.0)
 
 
@@ -252,7 +263,7 @@ def test_warm_start_takes_what_fits(made, path, experiment):
     assert torch.equal(network.trunk[0].bias, made[1].trunk[0].bias)
     assert torch.equal(network.trunk[0].weight, trunk)
     assert torch.equal(network.prior_std, prior_std)  # buffers belong to the new rig and drift
-    with pytest.raises(InputError, match="no parameter that matches"):
+    with pytest.raises(InputError, match="no weights that match"):
         warm_start(path, torch.nn.Linear(3, 4))
 
 
@@ -289,3 +300,40 @@ def test_of_several_starts_the_last_one_wins(made, tmp_path):
         save_network(files[-1], network, setup, {})
     other = built(setup)
     assert warm_start([*files], other) == () and all(bool((p == 2.0).all()) for p in other.parameters())
+
+
+def test_warm_start_takes_running_means_over_and_says_which_it_does_not_find(experiment, tmp_path, monkeypatch):
+    monkeypatch.setattr("imgcal.networks.factory.build", Normalized)
+    setup = experiment()
+    trained, network, wide = built(setup), built(setup), built(setup)
+    trained.trunk[3].running_mean.fill_(0.5)
+    trained.trunk[3].num_batches_tracked.fill_(7)
+    save_network(tmp_path / "a.safetensors", trained, setup, {})
+    assert warm_start(tmp_path / "a.safetensors", network) == ()
+    assert all(torch.equal(tensor, trained.state_dict()[name]) for name, tensor in network.state_dict().items())
+    wide.trunk[3] = nn.BatchNorm1d(2 * Toy.width)
+    names = [f"trunk.3.{name}" for name in ("weight", "bias", "running_mean", "running_var")]
+    assert warm_start(tmp_path / "a.safetensors", wide) == tuple(names)
+
+
+def test_warm_start_converts_what_it_takes_to_the_new_drift_and_nothing_else(experiment, tmp_path, monkeypatch):
+    """Offsets are in units of the drift, here three times as wide."""
+    monkeypatch.undo()  # the real networks
+    trunk = "network={{preset: points, change: {{trunk: {{width: 16, depth: 1, later_depth: 1, passes: {}}}}}}}"
+    generator = torch.Generator().manual_seed(0)
+    for passes in (1, 2):
+        setup = experiment(trunk.format(passes))
+        trained = built(setup)
+        with torch.no_grad():
+            for parameter in trained.parameters():
+                parameter.copy_(torch.rand(parameter.shape, generator=generator) + 0.1)
+        save_network(tmp_path / f"{passes}.safetensors", trained, setup, {})
+    wide = "drift={kappa_intrinsics: 0.03, kappa_extrinsics: 0.03}"
+    network = built(experiment(trunk.format(2), wide, "object=cube27"))
+    before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+    left = warm_start([tmp_path / "2.safetensors", tmp_path / "1.safetensors"], network)
+    assert "trunk.later.embed.0.weight" in left  # its inputs are fiducials and offsets
+    assert all(torch.equal(network.state_dict()[name], before[name]) for name in left)
+    head = network.trunk.later.camera_head[-1].weight  # only the first file has it
+    ratio = head[-2:].detach() / trained.trunk.later.camera_head[-1].weight[-2:].detach()
+    torch.testing.assert_close(ratio, torch.full_like(ratio, 1 / 3))

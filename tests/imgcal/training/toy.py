@@ -44,7 +44,7 @@ class Toy(Network):
 
     def __init__(self, config, factory, obj, drift_std, generator, images=None):
         super().__init__(Parameterization(factory, obj, drift_std), self.takes and (images or self.takes))
-        self.register_buffer("prior_std", drift_std)
+        self.register_buffer("prior_std", drift_std, persistent=False)
         self.idle = nn.Parameter(torch.zeros(2))
         with use_generators(generator):
             self.make_layers(factory, obj)
