@@ -118,9 +118,9 @@ class TrainingFolder(Callbacks):
             self._say(f"{_summary(run)}  {100 * done:.0f} %, {left:.0f} min left")
 
     def on_checkpoint(self, run: Run, state: TrainingState, result: Result) -> None:
-        """Write both; where a file cannot be written the previous one survives."""
-        save_state(self.folder / STATE, state)
+        """Write both, the model first: it is never older than the state. What cannot be written survives as it was."""
         result.save(self.folder / RESULT)
+        save_state(self.folder / STATE, state)
 
     def on_end(self, run: Run) -> None:
         """Close the logs, and print the state of the training."""

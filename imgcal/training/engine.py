@@ -73,6 +73,9 @@ def _take_steps(run: Run, listener: Callbacks, should_stop: Callable[[], bool]) 
     due = run.experiment.training
     seconds, stop = run.seconds, False
     logged = (run.step, seconds)
+    if is_finished(run, seconds):  # continued from its last state: its result may be missing
+        validate(run, listener, extra=True)
+        save(run, listener)
     while not (stop or is_finished(run, seconds)):
         run.schedule.set_progress(progress(run, seconds))
         train_step(run)

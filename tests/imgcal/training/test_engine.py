@@ -212,20 +212,42 @@ def test_a_loss_that_is_not_finite_stops_with_the_batch(experiment, tmp_path, mo
     assert all(tensor.isfinite().all() for tensor in weights(tmp_path).values())
 
 
-def test_a_full_disk_leaves_the_previous_checkpoint(experiment, tmp_path):
+def test_a_full_disk_leaves_the_previous_state(experiment, tmp_path):
     setup = experiment("training.steps=20")
     train(setup, tmp_path)
-    before = {name: (tmp_path / name).read_bytes() for name in (STATE, RESULT)}
+    before = (tmp_path / STATE).read_bytes()
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before[STATE]) // 2, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, hard))
     try:
         with pytest.raises(InputError, match=f"{STATE}: cannot be written"):
             train(experiment("training.steps=40"), tmp_path, resume=True)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert before == {name: (tmp_path / name).read_bytes() for name in (STATE, RESULT)}
+    assert (tmp_path / STATE).read_bytes() == before
     assert not list(tmp_path.glob(".*"))
     assert train(experiment("training.steps=40"), tmp_path, resume=True).step == 40
+
+
+@pytest.mark.parametrize("patience", ["null", "9"])
+def test_a_finished_training_whose_model_is_missing_writes_it_again(experiment, tmp_path, patience):
+    setup = experiment("training.steps=50", f"training.patience={patience}")
+    train(setup, tmp_path)
+    expected, metrics, rows = weights(tmp_path), load_checkpoint(tmp_path / RESULT).metrics, logged(tmp_path)
+    (tmp_path / RESULT).unlink()
+    train(setup, tmp_path, resume=True)
+    assert same(weights(tmp_path), expected)
+    assert load_checkpoint(tmp_path / RESULT).metrics["validation_re_px"] == metrics["validation_re_px"]
+    assert logged(tmp_path) == rows
+
+
+def test_a_model_is_never_older_than_the_state(experiment, tmp_path, monkeypatch):
+    def interrupt(path, state):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("imgcal.cli.training_folder.save_state", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        train(experiment("training.steps=20"), tmp_path)
+    assert load_checkpoint(tmp_path / RESULT).metrics["step"] == 20
 
 
 def test_a_warm_start(experiment, tmp_path, capsys):
