@@ -384,7 +384,8 @@ class Harvest:
     All cameras together give the object's pose in a snapshot, so frames in which detection fails are labelled, too.
     Writes OUT/train.safetensors and OUT/held_out.safetensors (other snapshots that are never neighbours of those in
     train; other cameras, if there are fewer than five snapshots), the same for patches of single markers
-    (train_patches, held_out_patches), and OUT/README.md, which describes them.
+    (train_patches, held_out_patches), and OUT/README.md, which describes them. Of 5 to 19 snapshots, every fifth is
+    held out, and its neighbours are in neither file.
 
     For example:
         imgcal harvest my_capture --rig out/rig.yaml --object object.csv --out dataset

@@ -224,7 +224,7 @@ Part = TypeVar("Part", FrameDataset, PatchDataset)
 
 
 def split(crops: Part, snapshots: int, cameras: int) -> tuple[Part, Part]:
-    """Hold out stretches of snapshots, with a gap on both sides of each; of few snapshots, cameras.
+    """Hold out stretches of snapshots, with a gap of at least one on both sides of each; of few snapshots, cameras.
 
     Raises:
         RefusedError: one of the two would be empty.
@@ -233,7 +233,7 @@ def split(crops: Part, snapshots: int, cameras: int) -> tuple[Part, Part]:
         stretch = max(snapshots // (2 * HELD_OUT), 1)
         number = crops.snapshot // stretch
         held_out = number % HELD_OUT == HELD_OUT - 1
-        gap = max(stretch // 10, 1) if stretch > 1 else 0
+        gap = max(stretch // 10, 1)
         within = crops.snapshot % stretch
         # Snapshots next to a held-out stretch belong to neither.
         beside = ((number % HELD_OUT == HELD_OUT - 2) & (within >= stretch - gap)) | (
