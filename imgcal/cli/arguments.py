@@ -402,7 +402,6 @@ class Harvest:
     out: Path  #: folder to write
     snapshots: str | None = None  #: A:B, numbers in file order from 0, without B; default: all
     detector: str = "auto"  #: what finds the object where blobs decide nothing: auto, both, or classical (nothing)
-    size: int = 96  #: pixels, width and height of a crop, as the network expects it
     seed: int = 0  #: seed of the random places of crops
     videos_differ: bool = False  #: accept videos whose lengths or time stamps differ; match frames by number
     detection: Annotated[DetectionOptions, tyro.conf.arg(name="")] = field(default_factory=DetectionOptions)

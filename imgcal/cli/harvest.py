@@ -76,7 +76,7 @@ class Harvest(arguments.Harvest):
 
         crops, patches = cut_labelled(
             lambda snapshot: capture.frames_of(first + snapshot), detections, rig, obj,
-            detection=self.detection, sight=sight, size=self.size, seed=self.seed, progress=bar,
+            detection=self.detection, sight=sight, seed=self.seed, progress=bar,
         )  # fmt: skip
         count = len(detections.snapshot_names)
         splits = split(crops, count, rig.num_cameras)

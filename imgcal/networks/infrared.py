@@ -20,6 +20,7 @@ from torch.nn import functional
 
 from imgcal.io import StrictModel
 from imgcal.networks.infrared_encoders import ENCODERS, STRIDE, EncoderName
+from imgcal.types import CROP_SIZE
 
 GEOMETRY = 6
 """Numbers of relative geometry per fiducial: `Queries.geometry`."""
@@ -29,7 +30,7 @@ class InfraredConfig(StrictModel):
     """Architecture of the query network."""
 
     encoder: EncoderName = "cnn"  # CNN or ViT, in three sizes; vit-stem: a convolution before the tokens
-    crop: Annotated[int, Field(ge=48, le=384, multiple_of=48)] = 96  # pixels, width and height
+    crop: Annotated[int, Field(ge=48, le=384, multiple_of=48)] = CROP_SIZE  # pixels, width and height; to train: 96
     channels: Annotated[int, Field(ge=1, le=128)] = 16  # of the feature map and of the windows
     window: Annotated[int, Field(ge=4, le=64, multiple_of=2)] = 22  # cells, width and height
     close_window: Annotated[int, Field(ge=4, le=64, multiple_of=2)] = 12  # the same for the second look

@@ -17,9 +17,8 @@ from torch.nn import functional
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.synthesis.drawing import Draw, host_generator
 from imgcal.synthesis.rigs import PhysicalDrift, RelativeDrift
-from imgcal.types import CROP_MARGIN, CameraRig, CropPlacement
+from imgcal.types import CROP_MARGIN, CROP_SIZE, CameraRig, CropPlacement
 
-SIZE = 96  # crop pixels, each way
 PATCH = 24  # crop pixels, window that a spot is drawn in
 
 
@@ -92,12 +91,12 @@ def render_crops(scenes: Scenes, generator: torch.Generator) -> CropTruth:
     focal = scenes.factory.focal_length[..., 0]
     ahead = believed.depth > 0
     margin = CROP_MARGIN * focal * draw.between(0.8, 1.5, *batch)
-    placement = CropPlacement.around(believed.uv, ahead, margin, SIZE)
+    placement = CropPlacement.around(believed.uv, ahead, margin, CROP_SIZE)
     place, expected = placement.to_crop(truth.uv), placement.to_crop(believed.uv)
     pixels = focal[..., None] * scenes.radius[:, None, None] / placement.scale[..., None]
     radius, expected_radius = pixels / truth.depth, pixels / believed.depth
     crops, seen = _photograph(place, radius, draw)
-    inside = ((place > -0.5) & (place < SIZE - 0.5)).all(-1)
+    inside = ((place > -0.5) & (place < CROP_SIZE - 0.5)).all(-1)
     depth = believed.depth / believed.depth.mean(-1, keepdim=True) - 1
     return CropTruth(crops, placement, expected, expected_radius, depth, place, seen & inside & (truth.depth > 0))
 
@@ -132,7 +131,7 @@ def _photograph(place: Tensor, radius: Tensor, draw: Draw) -> tuple[Tensor, Tens
     shown = draw.unit(*batch, false) < draw.sometimes(0.6, 1.0, *batch)[..., None] ** 1.5
     typical = radius.clamp(0.3, 4).mean(-1, keepdim=True)
     strays = _Spots(
-        draw.between(-2, SIZE + 1, *batch, false, 2),
+        draw.between(-2, CROP_SIZE + 1, *batch, false, 2),
         typical * draw.between(-0.7, 0.6, *batch, false).exp(),
         shown * draw.between(0.15, 1.6, *batch, false),
         torch.where(draw.unit(*batch, false, 1) < 0.5, velocity[:, :, None], 0.0).expand(*batch, false, 2),
@@ -144,14 +143,14 @@ def _photograph(place: Tensor, radius: Tensor, draw: Draw) -> tuple[Tensor, Tens
     shot = draw.sometimes(0.5, 1.0, *batch)[..., None, None] * light.clamp(min=0)
     level = light + noise[..., None, None] * (1 + shot).sqrt() * draw.normal(*light.shape)
     # Some crops reach over the image's border.
-    columns = torch.arange(SIZE, device=light.device)
+    columns = torch.arange(CROP_SIZE, device=light.device)
     border = torch.where(draw.unit(*batch, 1) < 0.15, draw.between(0, 40, *batch, 1), -1.0)
     outside = (columns < border)[..., None, :].expand_as(level)
     flip = draw.unit(*batch, 1, 1) < 0.5
     outside = torch.where(flip, outside.flip(-1), outside)
     least = torch.where(cut < 8, cut > -0.35, True)  # less than a fifth of the marker is not asked for
-    where = place.round().clamp(0, SIZE - 1).long()
-    flat = outside.flatten(2).gather(2, where[..., 1] * SIZE + where[..., 0])
+    where = place.round().clamp(0, CROP_SIZE - 1).long()
+    flat = outside.flatten(2).gather(2, where[..., 1] * CROP_SIZE + where[..., 0])
     return level.masked_fill(outside, torch.nan), ~hidden & least & ~flat
 
 
@@ -177,7 +176,7 @@ def degrade_crops(
     batch, dots = torch.Size((count, 1)), 28
     shown = draw.unit(*batch, dots) < draw.sometimes(0.5, 1.0, *batch)[..., None] ** 1.5
     spots = _Spots(
-        draw.between(-2, SIZE + 1, *batch, dots, 2),
+        draw.between(-2, CROP_SIZE + 1, *batch, dots, 2),
         size[:, None, None] * draw.between(-0.5, 0.5, *batch, dots).exp(),
         shown * draw.between(0.4, 1.1, *batch, dots),
         torch.zeros(*batch, dots, 2, device=crops.device),
@@ -186,8 +185,8 @@ def degrade_crops(
     light = light + _add_spots(spots, draw.between(0.3, 0.8, *batch), draw)[:, 0]
     cover, level = _drapes(count, draw)
     light = light + cover * (level[:, None, None] - light)
-    where = place.round().clamp(0, SIZE - 1).long()
-    hidden = cover.flatten(1).gather(1, where[..., 1] * SIZE + where[..., 0]) > 0.5
+    where = place.round().clamp(0, CROP_SIZE - 1).long()
+    hidden = cover.flatten(1).gather(1, where[..., 1] * CROP_SIZE + where[..., 0]) > 0.5
     dark = draw.sometimes(0.4, 1.0, count)[:, None, None] * light.clamp(min=0)
     noise = torch.where(draw.unit(count) < 0.5, draw.between(math.log(0.003), math.log(0.5), count).exp(), 0.0)
     light = light + noise[:, None, None] * (1 + dark).sqrt() * draw.normal(*light.shape)
@@ -211,12 +210,12 @@ def _smear(light: Tensor, spread: Tensor, length: Tensor, draw: Draw) -> Tensor:
 
 def _drapes(count: int, draw: Draw) -> tuple[Tensor, Tensor]:
     """Draw oblongs with edges over images, most of them without any: cover (P, S, S) in [0, 1], light (P,) of them."""
-    steps = torch.arange(SIZE, device=draw.generator.device, dtype=torch.float32)
-    cover = torch.zeros(count, SIZE, SIZE, device=steps.device)
+    steps = torch.arange(CROP_SIZE, device=draw.generator.device, dtype=torch.float32)
+    cover = torch.zeros(count, CROP_SIZE, CROP_SIZE, device=steps.device)
     some = draw.unit(count) < 0.35
     for _ in range(4):
         angle = draw.between(0, math.pi, count)[:, None, None]
-        middle, half = draw.between(0, SIZE, count, 2), draw.between(0.05, 0.35, count, 2) * SIZE
+        middle, half = draw.between(0, CROP_SIZE, count, 2), draw.between(0.05, 0.35, count, 2) * CROP_SIZE
         x, y = steps - middle[:, 0, None, None], steps[:, None] - middle[:, 1, None, None]
         along, across = x * angle.cos() + y * angle.sin(), y * angle.cos() - x * angle.sin()
         inside = torch.minimum(half[:, 0, None, None] - along.abs(), half[:, 1, None, None] - across.abs())
@@ -241,7 +240,7 @@ def _join(*parts: _Spots) -> _Spots:
 def _add_spots(spots: _Spots, blur: Tensor, draw: Draw) -> Tensor:
     """Add up spots, each in a window of its own: (B, C, S, S)."""
     batch, count = spots.radius.shape[:2], spots.radius.shape[2]
-    corner = spots.place.detach().clamp(-PATCH, SIZE + PATCH).round() - PATCH // 2
+    corner = spots.place.detach().clamp(-PATCH, CROP_SIZE + PATCH).round() - PATCH // 2
     steps = torch.arange(PATCH, device=blur.device, dtype=blur.dtype)
     u, v = (corner[..., axis, None] + steps for axis in (0, 1))  # (B, C, M, PATCH)
     du, dv = (u - spots.place[..., 0, None])[..., None, :], (v - spots.place[..., 1, None])[..., :, None]
@@ -265,19 +264,21 @@ def _add_spots(spots: _Spots, blur: Tensor, draw: Draw) -> Tensor:
     beyond = du * angle.cos() + dv * angle.sin() - (spots.cut * spots.radius)[..., None, None]
     light = covered * spots.brightness[..., None, None] * torch.sigmoid(-beyond / 0.25)
     column, row = u.long()[..., None, :], v.long()[..., :, None]
-    good = (column >= 0) & (column < SIZE) & (row >= 0) & (row < SIZE)
-    index = torch.where(good, row.clamp(0, SIZE - 1) * SIZE + column.clamp(0, SIZE - 1), 0)
-    image = torch.zeros(*batch, SIZE * SIZE, device=blur.device, dtype=light.dtype)
-    return image.scatter_add(2, index.flatten(2), (light * good).flatten(2)).unflatten(2, (SIZE, SIZE))
+    good = (column >= 0) & (column < CROP_SIZE) & (row >= 0) & (row < CROP_SIZE)
+    index = torch.where(good, row.clamp(0, CROP_SIZE - 1) * CROP_SIZE + column.clamp(0, CROP_SIZE - 1), 0)
+    image = torch.zeros(*batch, CROP_SIZE * CROP_SIZE, device=blur.device, dtype=light.dtype)
+    return image.scatter_add(2, index.flatten(2), (light * good).flatten(2)).unflatten(2, (CROP_SIZE, CROP_SIZE))
 
 
 def _background(batch: torch.Size, draw: Draw) -> Tensor:
     """Slow light, drapes (stripes), streaks and edges: (B, C, S, S)."""
     one = torch.ones(1, 1, 1, 1, device=draw.generator.device)
     slow = draw.normal(math.prod(batch), 1, 5, 5)
-    slow = functional.interpolate(slow, (SIZE, SIZE), mode="bicubic", align_corners=True)[:, 0].unflatten(0, batch)
+    slow = functional.interpolate(slow, (CROP_SIZE, CROP_SIZE), mode="bicubic", align_corners=True)[:, 0].unflatten(
+        0, batch
+    )
     ground = slow * draw.sometimes(0.5, 0.4, *batch)[..., None, None]
-    steps = torch.linspace(-1, 1, SIZE, device=one.device)
+    steps = torch.linspace(-1, 1, CROP_SIZE, device=one.device)
 
     def wave(*shape: int) -> Tensor:
         """Coordinates along and across random directions, the middle shifted: two (B, C, *shape, S, S)."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from imgcal.errors import InputError
@@ -27,6 +27,7 @@ from imgcal.training.frame_dataset import FrameDataset, expect_elsewhere, load_s
 from imgcal.training.infrared import evidence_at_best, make_queries, query_losses
 from imgcal.training.random_streams import FIXED, make_stream
 from imgcal.training.task import Loss, Task
+from imgcal.types import CROP_SIZE
 
 SECOND_LOOKS = 0.5  # share of the batches that simulate a second look, after a rig was fitted to a first one
 CAMERAS = 2  # crops per rig: more rigs and objects instead of more cameras
@@ -42,6 +43,14 @@ class InfraredExperiment(Experiment):
     network: InfraredConfig = InfraredConfig()
     frames: Annotated[str, Field(min_length=1)] | None = None  # folder from `imgcal harvest`: your own frames
     frames_share: Fraction = 0.5  # share of the batches from these frames, made harder; the others are rendered
+
+    @model_validator(mode="after")
+    def _check_crop(self) -> InfraredExperiment:
+        if self.network.crop != CROP_SIZE:
+            raise ValueError(
+                f"found network.crop {self.network.crop}, expected {CROP_SIZE}, the size of rendered crops"
+            )
+        return self
 
     def make_task(self, device: torch.device, batch_size: int, weights: torch.Generator, fresh: bool) -> InfraredTask:
         """Build the network and its source of crops; see `Experiment.make_task`."""

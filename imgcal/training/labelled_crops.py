@@ -33,7 +33,7 @@ from imgcal.messages import plural
 from imgcal.networks import Expectation, Tiles, cut_crops, cut_patches
 from imgcal.training.frame_dataset import FrameDataset, PatchDataset
 from imgcal.training.marker_appearance import fit_to_light, usual_look
-from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
+from imgcal.types import CROP_SIZE, CalibrationObject, CameraRig, Detections, Observations
 
 COPIES = 3
 """Crops per place, each with another corner and another scale."""
@@ -68,7 +68,6 @@ def cut_labelled(
     *,
     detection: DetectionOptions = DetectionOptions(),
     sight: Sight | None = None,
-    size: int = 96,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> tuple[FrameDataset, PatchDataset]:
@@ -82,7 +81,6 @@ def cut_labelled(
         options: requirements on the labels that determine poses.
         detection: options with which blobs were found.
         sight: looks at frames whose blobs are inconclusive; None = such snapshots give no crops.
-        size: crop pixels, width and height.
         seed: for the placement of crops.
         progress: wraps the loops over snapshots.
 
@@ -110,7 +108,7 @@ def cut_labelled(
         for _ in range(COPIES):
             own = _cut_patches(shown, rig, around, usable, detection, generator)
             patches.append(replace(own, snapshot=torch.full_like(own.snapshot, snapshot)))
-            part = _cut(shown, rig, obj, pose, seen, sigma, detection, size, generator)
+            part = _cut(shown, rig, obj, pose, seen, sigma, detection, generator)
             parts.append(replace(part, snapshot=torch.full_like(part.snapshot, snapshot)))
     return FrameDataset.cat(parts), PatchDataset.cat(patches)
 
@@ -260,7 +258,6 @@ def _cut(
     seen: Tensor,
     sigma: Tensor,
     detection: DetectionOptions,
-    size: int,
     generator: torch.Generator,
 ) -> FrameDataset:
     """Cut the crops of a snapshot, placed with a pose near the true one."""
@@ -268,7 +265,7 @@ def _cut(
     far = (rig.positions - pose.translation).norm(dim=-1).mean()
     aside = ASIDE * far * torch.randn(1, 3, generator=generator, dtype=torch.float64)
     near = RigidTransform(rotation_from_vector(turn) @ pose.rotation, pose.translation + aside)
-    tiles = Tiles.of_object(rig, obj, near, size)
+    tiles = Tiles.of_object(rig, obj, near, CROP_SIZE)
     queries = tiles.arrange_expected(Expectation.of(rig, obj, pose, tiles.usual)).queries(tiles.placement)
     names = tuple(rig.camera_names[camera] for camera in tiles.camera.tolist())
     light = cut_crops(frames, names, tiles.placement, inverted=detection.polarity == "dark")

@@ -7,7 +7,7 @@ from .limits import BLOB_RADIUS, FIDUCIAL_RADIUS, MOST_PIXELS, SIGMA, Range, che
 from .moved_camera import Kind, MovedCamera, MovedError
 from .observations import Observations
 from .parameter_vectors import pack21, unpack18, unpack21
-from .placement import CROP_MARGIN, PATCH_SIZE, CropPlacement
+from .placement import CROP_MARGIN, CROP_SIZE, PATCH_SIZE, CropPlacement
 from .prediction import Prediction, Views
 from .rig import (
     PARAMETER_KINDS,
@@ -26,6 +26,7 @@ from .volume import ConvexVolume
 __all__ = [
     "BLOB_RADIUS",
     "CROP_MARGIN",
+    "CROP_SIZE",
     "FIDUCIAL_RADIUS",
     "MOST_LIGHTS",
     "MOST_PIXELS",

@@ -10,6 +10,8 @@ from torch import Tensor
 # Networks for frames must be given crops like those they were trained on.
 CROP_MARGIN = 0.06
 """Margin around the expected object, as a share of the focal length: a drift of 3 degrees."""
+CROP_SIZE = 96
+"""Crop pixels, width and height: markers, motion and drift have their usual sizes at this one alone."""
 PATCH_SIZE = 24
 """Pixels, width and height of a patch around one marker."""
 

@@ -1,7 +1,7 @@
 import torch
 
 from imgcal.synthesis import degrade_crops, render_crops, sample_scenes
-from imgcal.synthesis.crops import SIZE
+from imgcal.types import CROP_SIZE
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -11,15 +11,15 @@ def generator(seed: int = 0) -> torch.Generator:
 def test_crops_show_the_markers_where_the_truth_says() -> None:
     draw = generator()
     truth = render_crops(sample_scenes(24, 2, 7, draw), draw)
-    assert truth.crops.shape == (24, 2, SIZE, SIZE)
+    assert truth.crops.shape == (24, 2, CROP_SIZE, CROP_SIZE)
     assert truth.place.shape == (24, 2, 7, 2)
     images = truth.crops.flatten(0, 1)
     images = (images - images.flatten(1).nanmedian(1).values[:, None, None]).nan_to_num()
     place, seen = truth.place.flatten(0, 1), truth.seen.flatten(0, 1)
 
     def brightness(at: torch.Tensor) -> float:
-        column, row = at.round().clamp(0, SIZE - 1).long().unbind(-1)
-        return float(images.flatten(1).gather(1, row * SIZE + column)[seen].mean())
+        column, row = at.round().clamp(0, CROP_SIZE - 1).long().unbind(-1)
+        return float(images.flatten(1).gather(1, row * CROP_SIZE + column)[seen].mean())
 
     assert brightness(place) > 4 * abs(brightness(place + 12))
     assert 0.6 < float(seen.float().mean()) < 0.98

@@ -139,8 +139,13 @@ def test_frames_of_ones_own_are_mixed_with_rendered_ones_and_held_out_ones_judge
     train(own, kept)
     assert kept.rows[-1]["validation_missed"] >= 0
     plain = load_experiment("ir-cnn", TINY).make_task(torch.device("cpu"), 4, torch.Generator(), False)
-    with pytest.raises(InputError, match="found crops of 96 pixels, expected 144"):
-        load_experiment("ir-cnn", (*TINY, f"frames={tmp_path}", "network.crop=144")).make_task(
-            torch.device("cpu"), 4, torch.Generator(), False
-        )
     assert plain.own is None
+    replace(crops, crops=torch.zeros(6, 48, 48).half()).save(tmp_path / TRAIN, {})
+    replace(crops, crops=torch.zeros(6, 48, 48).half()).save(tmp_path / HELD_OUT, {})
+    with pytest.raises(InputError, match="found crops of 48 pixels, expected 96"):
+        own.make_task(torch.device("cpu"), 4, torch.Generator(), False)
+
+
+def test_crops_of_another_size_than_the_rendered_ones_are_refused() -> None:
+    with pytest.raises(InputError, match=r"found network\.crop 48, expected 96"):
+        load_experiment("ir-cnn", (*TINY, "network.crop=48"))
