@@ -11,9 +11,10 @@ from imgcal.geometry import project_kornia
 from imgcal.nn.buffers import ObjectBuffers
 from imgcal.types import CalibrationObject, CameraRig, Prediction
 
-# Nearer points (mm) are projected at this depth, differences are clipped to this size (pixels): predictions behind a
-# camera, as of an untrained network, overflow float32 and give nan gradients even where the loss itself is clamped.
-LEAST_DEPTH, LARGEST_DIFFERENCE = 50.0, 1e6
+# Nearer points are projected at a least depth: mm, or this share of the working distance if that is less. Differences
+# are clipped to this size (pixels). Otherwise predictions behind a camera, as of an untrained network, overflow float32
+# and give nan gradients even where the loss itself is clamped.
+LEAST_DEPTH, LEAST_SHARE, LARGEST_DIFFERENCE = 50.0, 0.1, 1e6
 
 
 class ReprojectionLoss(nn.Module):
@@ -77,10 +78,14 @@ def project_fiducials(cameras: CameraRig, obj: CalibrationObject) -> Tensor:
         obj: the object, including the radius of spherical fiducials.
 
     Returns:
-        (*B, C, N, 2) pixels, finite for finite cameras.
+        (*B, C, N, 2) pixels, finite for finite cameras. Fiducials nearer than 50 mm, or a tenth of the rig's working
+        distance if that is less, are projected at that depth.
     """
     points = cameras.cam_from_rig.apply(obj.points.to(cameras.focal_length))
-    points = torch.cat((points[..., :2], points[..., 2:].clamp_min(LEAST_DEPTH)), dim=-1)
+    least = LEAST_DEPTH
+    if cameras.working_distance is not None:
+        least = min(least, LEAST_SHARE * cameras.working_distance)
+    points = torch.cat((points[..., :2], points[..., 2:].clamp_min(least)), dim=-1)
     radius = None if obj.radius is None else obj.radius.to(points)
     lens = (cameras.focal_length, cameras.principal_point, cameras.distortion)
     return project_kornia(points, *lens, cameras.image_size, radius, cameras.lens_model).uv

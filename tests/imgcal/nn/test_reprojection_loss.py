@@ -61,6 +61,19 @@ def test_fiducials_behind_cameras_leave_a_finite_gradient(rig, obj, poses, drift
     assert behind.translation.grad.isfinite().all()
 
 
+@pytest.mark.parametrize("smaller", [1, 20, 1000])
+def test_does_not_depend_on_the_unit_of_length(rig, obj, poses, drifted, smaller):
+    def shrink(made):
+        cameras = replace(made.rig.cam_from_rig, translation=made.rig.cam_from_rig.translation / smaller)
+        small = replace(made.rig, cam_from_rig=cameras, working_distance=made.rig.working_distance / smaller)
+        return Prediction(small, replace(made.rig_from_object, translation=made.rig_from_object.translation / smaller))
+
+    radius = None if obj.radius is None else obj.radius / smaller
+    predicted, truth = scene(rig, poses, drifted, 3)
+    found = ReprojectionLoss(replace(obj, points=obj.points / smaller, radius=radius))(shrink(predicted), shrink(truth))
+    torch.testing.assert_close(found, ReprojectionLoss(obj)(predicted, truth))
+
+
 def test_gradcheck(rig, obj, poses, drifted, batch):
     predicted, truth = scene(rig, poses, drifted, *batch)
     module = ReprojectionLoss(obj, "none")
