@@ -83,7 +83,6 @@ class LossTerms:
     """The quantity to minimize, and errors for the log."""
 
     total: Tensor  # () with its graph
-    re: Tensor  # (B,) pixels, RE of the last pass, without graph
     passes: Tensor  # (T,) pixels, mean RE of each pass, without graph
 
 
@@ -123,8 +122,7 @@ def compound(
         total = sum((gamma ** (last - t) * terms[t] for t in range(last + 1)), start=terms.new_zeros(()))
         if config.extra.l1:
             total = total + config.extra.l1 * l1_norm(weights)
-        re = re.detach()
-    return LossTerms(total, re[-1], re.mean(-1))
+    return LossTerms(total, re.detach().mean(-1))
 
 
 def reprojection_rmse(difference: Tensor) -> Tensor:

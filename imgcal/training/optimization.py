@@ -34,11 +34,13 @@ def make_optimizer(network: nn.Module, config: OptimizerConfig) -> torch.optim.O
     settings = []
     for name, parameters in groups.items():
         base = config.learning_rates.get(name, config.lr)
-        kinds = {(scales.get(p, 1.0), p.ndim > 1): None for p in parameters}
-        for scale, matrices in sorted(kinds, reverse=True):
-            members = [p for p in parameters if (scales.get(p, 1.0), p.ndim > 1) == (scale, matrices)]
+        kinds: dict[tuple[float, bool], list[nn.Parameter]] = {}
+        for parameter in parameters:
+            kinds.setdefault((scales.get(parameter, 1.0), parameter.ndim > 1), []).append(parameter)
+        for kind in sorted(kinds, reverse=True):
+            scale, matrices = kind
             lr, decay = base * scale, config.weight_decay if matrices else 0.0
-            settings.append({"params": members, "name": name, "lr": lr, "initial_lr": lr, "weight_decay": decay})
+            settings.append({"params": kinds[kind], "name": name, "lr": lr, "initial_lr": lr, "weight_decay": decay})
     optimizers = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
     first, second = config.betas
     return optimizers[config.kind](settings, betas=(first, second), fused=True)
