@@ -156,10 +156,9 @@ def _levels(contrast: NDArray[np.generic], options: DetectionOptions, scale: int
     lower = sample[: max(1, int(0.6 * sample.size))]  # without the blobs and most of the texture
     spread = float(cv2.meanStdDev(lower)[1][0, 0])
     noise = 1.54 * spread  # converts the spread below the 60th percentile to a normal standard deviation
-    level = max(NOISE_FACTOR * noise, LEAST_CONTRAST * scale)
-    if options.threshold is not None:
-        level = max(level, 0.2 * options.threshold)  # a block mean has at least this share of a small blob's peak
-    return float(sample[sample.size // 2]), level
+    # A block mean has at least a fifth of a small blob's peak.
+    least = LEAST_CONTRAST * scale if options.threshold is None else 0.2 * options.threshold
+    return float(sample[sample.size // 2]), max(NOISE_FACTOR * noise, least)
 
 
 @njit(cache=True, nogil=True, heavy=True)

@@ -39,7 +39,7 @@ def full_scale(frame: Frame, bit_depth: int | None, camera: str) -> int:
         if frame.dtype == np.uint8:
             return 255
         brightest = int(frame.max())
-        return next(2**bits - 1 for bits in (10, 12, 16) if brightest < 2**bits)
+        return next(2**bits - 1 for bits in (10, 12, 14, 16) if brightest < 2**bits)
     if frame.dtype == np.uint8 and bit_depth > 8:
         raise InputError(f"camera {camera}: found a frame of 8 bit, expected {bit_depth} bit, the given bit depth")
     scale = 2**bit_depth - 1

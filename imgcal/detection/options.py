@@ -32,7 +32,7 @@ class DetectionOptions:
     min_radius: float = 0.9  # px; a single hot pixel measures 0.56
     max_radius: float | None = None  # px; None = 16, and more where a frame shows several blobs of one larger size
     max_elongation: float = 4.0  # largest ratio of the axes of a blob's ellipse
-    bit_depth: int | None = None  # None = 8 for uint8 frames; 10, 12 or 16 for uint16, from the brightest pixel
+    bit_depth: int | None = None  # None = 8 for uint8 frames; 10, 12, 14 or 16 for uint16, from the brightest pixel
     saturation: float | None = None  # first clipped grey value; None = 0.5 % below full scale
 
     @property

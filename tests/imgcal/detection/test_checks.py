@@ -32,7 +32,9 @@ def test_frames_are_taken_as_they_are_and_masks_as_bits() -> None:
             check_mask(wrong, frame, "left")
 
 
-@pytest.mark.parametrize(("brightest", "expected"), [(0, 1023), (1023, 1023), (1024, 4095), (4096, 65535)])
+@pytest.mark.parametrize(
+    ("brightest", "expected"), [(0, 1023), (1023, 1023), (1024, 4095), (4096, 16383), (16384, 65535)]
+)
 def test_the_brightest_pixel_tells_the_depth_of_16_bit_frames(brightest: int, expected: int) -> None:
     frame = np.zeros((16, 16), np.uint16)
     frame[2, 2] = brightest

@@ -113,6 +113,25 @@ def test_shifted_frame_gives_shifted_blobs():
         np.testing.assert_array_equal(moved.flags[rows], reference.flags)
 
 
+@pytest.mark.parametrize(("brightest", "options"), [(4300, {}), (15000, {}), (40000, {"threshold": 50.0})])
+def test_one_bright_spot_hides_no_marker_of_a_deep_frame(brightest, options):
+    """The full scale of 16-bit frames follows from the brightest pixel, and the smallest contrast from that."""
+    shape, rng = (300, 400), np.random.default_rng(0)
+    uv = scattered(shape, 60, rng)
+    frame = draw_discs(shape, uv, 2.5, contrast=500.0, background=200.0) + 3 * rng.standard_normal(shape)
+    frame[290:296, 390:396] = brightest
+    found = detect_frame(np.rint(frame).astype(np.uint16), DetectionOptions(**options))
+    assert (np.linalg.norm(found.uv[:, None] - uv, axis=-1).min(0) < 0.2).all()
+
+
+def test_clipped_frames_of_14_bit_say_so():
+    shape, rng = (200, 200), np.random.default_rng(0)
+    uv = scattered(shape, 60, rng)
+    frame = np.minimum(draw_discs(shape, uv, 5.0, contrast=40000.0, background=200.0), 16383)
+    found = detect_frame(np.rint(frame).astype(np.uint16), DetectionOptions())
+    assert len(found.uv) == len(uv) and (found.flags & BlobFlag.SATURATED > 0).all()
+
+
 def test_bit_depths_agree():
     frame, _ = scene()
     narrow = detect_frame(frame, DetectionOptions())
