@@ -15,6 +15,7 @@ from imgcal.medians import median, median_of_known
 from imgcal.monitoring import ClockSlip, MeasurementUpdate
 from imgcal.online.events import Event
 from imgcal.online.rig_state import UNTRUSTED, RigState
+from imgcal.online.sequential_test import check_like
 
 # Residuals that count.
 MEMORY_SECONDS = 5.0
@@ -222,14 +223,24 @@ class ClockOffsets:
 
     def saved(self) -> dict[str, Any]:
         """See `SequentialTest`."""
-        return {"told": self._told.tolist(), "late": self.late.tolist()}
+        last = None
+        if self._last is not None:
+            time, pose, places = self._last
+            last = (time, pose.rotation, pose.translation, places)
+        return {name.strip("_"): getattr(self, name) for name in _ARRAYS} | {"period": self._period, "last": last}
 
     def restored(self, values: dict[str, Any]) -> None:
         """See `SequentialTest`."""
-        told, late = (np.array(values[name], dtype=np.float64) for name in ("told", "late"))
-        if not all(each.shape == self._told.shape and np.isfinite(each).all() for each in (told, late)):
-            raise ValueError(f"{self.name}: expected seconds of {len(self._told)} cameras")
-        self._told, self.late, self._solved = told, late, None
+        for name in _ARRAYS:
+            key = name.strip("_")
+            setattr(self, name, check_like(f"{self.name}: {key}", getattr(self, name), values[key]))
+        self._period, self._last, self._solved = float(values["period"]), None, None
+        if values["last"] is not None:
+            time, rotation, translation, places = values["last"]
+            self._last = float(time), RigidTransform(rotation, translation), np.array(places, dtype=np.float64)
+
+
+_ARRAYS = ("_normal", "_right", "_other", "_seconds", "_told", "late")
 
 
 def unsynchronized_event(camera: str, since: float, time: float, snapshot: int) -> Event:

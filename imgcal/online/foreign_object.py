@@ -59,8 +59,9 @@ class ForeignObject:
 
     def saved(self) -> dict[str, Any]:
         """See `SequentialTest`."""
-        return {"known": self._known}
+        return {"known": self._known, "since": self._since, "times": self._times}
 
     def restored(self, values: dict[str, Any]) -> None:
         """See `SequentialTest`."""
-        self._known = bool(values["known"])
+        since, self._known, self._times = values["since"], bool(values["known"]), int(values["times"])
+        self._since = None if since is None else float(since)

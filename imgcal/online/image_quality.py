@@ -15,6 +15,7 @@ from imgcal.monitoring import Cusum, MeasurementUpdate
 from imgcal.online.camera_visibility import well_inside
 from imgcal.online.events import Event, EventKind
 from imgcal.online.rig_state import RigState
+from imgcal.online.sequential_test import check_like
 
 Array = NDArray[np.float64]
 
@@ -105,7 +106,7 @@ class ImageQuality:
         self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: MeasurementUpdate | None
     ) -> Iterable[Event]:
         """See `SequentialTest`."""
-        if self._began is None:  # also after a restart, when earlier times are not exact
+        if self._began is None:
             self._good[:] = state.time
         self._good = np.minimum(self._good, state.time)  # clocks may be set back
         if self._began is None or not 0 <= state.time - self._began < LONGEST_BLOCK:
@@ -207,19 +208,24 @@ class ImageQuality:
 
     def saved(self) -> dict[str, Any]:
         """See `SequentialTest`."""
-        return {name: getattr(self, f"_{name}").tolist() for name in _KEPT}
+        arrays = {name: getattr(self, f"_{name}") for name in _ARRAYS}
+        test = {name: getattr(self._test, name) for name in Cusum.STATE}
+        return arrays | test | {"began": self._began, "collected": self._collected}
 
     def restored(self, values: dict[str, Any]) -> None:
         """See `SequentialTest`."""
-        for name in _KEPT:
-            known = getattr(self, f"_{name}")
-            found = np.array(values[name], dtype=np.float64)
-            if found.shape != known.shape or not np.isfinite(found).all():
-                raise ValueError(f"{self.name}: {name}: expected finite numbers of {self._bad.shape[1]} cameras")
-            setattr(self, f"_{name}", found.astype(known.dtype))
+        for name in _ARRAYS:
+            setattr(self, f"_{name}", check_like(f"{self.name}: {name}", getattr(self, f"_{name}"), values[name]))
+        for name in Cusum.STATE:
+            setattr(self._test, name, check_like(f"{self.name}: {name}", getattr(self._test, name), values[name]))
+        began, self._collected = values["began"], float(values["collected"])
+        self._began = None if began is None else float(began)
 
 
-_KEPT = ("distance", "coefficients", "covariance", "variance", "blocks", "usual", "bad")
+_ARRAYS = (
+    "distance", "count", "sum", "place", "last_time", "last_value", "last_place", "coefficients", "covariance",
+    "variance", "blocks", "usual", "bad", "good",
+)  # fmt: skip
 
 
 def _prior() -> Array:

@@ -30,6 +30,15 @@ def test_a_foreign_object_is_told_once() -> None:
     assert watched(again, "identity", True, 30.0, 200) == []
 
 
+def test_a_restart_takes_nothing_of_what_has_been_seen() -> None:
+    test, again = ForeignObject(), ForeignObject()
+    watched(test, None, True, 10.0, 1)
+    watched(test, "identity", True, 11.0, 30)
+    again.restored(test.saved())
+    (event,) = watched(again, "identity", True, 12.5, 200)
+    assert event.since == 11.0 and 14.0 <= event.time < 14.2
+
+
 def test_clocks_that_are_set_back_meanwhile_do_not_keep_it_from_being_told() -> None:
     test = ForeignObject()
     watched(test, None, True, 5000.0, 1)
