@@ -104,9 +104,13 @@ class Display:
 
     def _unsynchronized(self) -> list[str]:
         """Name the cameras whose time stamps go with no other's."""
-        names, tolerance = self._intake.synchronizer.alone, self._intake.synchronizer.timing.tolerance
-        said = f"time stamps more than {1e3 * tolerance:g} ms (--tolerance) off the other cameras': set their clocks"
-        return [f"{list_names(names)}: {said}"] if names else []
+        synchronizer = self._intake.synchronizer
+        names = synchronizer.alone
+        if not names:
+            return []
+        tolerance = 1e3 * min(map(synchronizer.tolerance, names))
+        said = f"time stamps more than {tolerance:.3g} ms (--tolerance) off the other cameras': set their clocks"
+        return [f"{list_names(names)}: {said}"]
 
     def _clocks(self) -> list[str]:
         """Name the cameras whose time stamps do not say when they expose."""

@@ -1,4 +1,4 @@
-from .address import Address, parse_address
+from .address import Address, is_host, parse_address
 from .commands import Action, Command
 from .demonstration import Demonstration
 from .live_page import LivePage
@@ -15,6 +15,7 @@ __all__ = [
     "LivePage",
     "frustum_length",
     "frustums",
+    "is_host",
     "parse_address",
     "read_asset",
     "render_page",

@@ -74,9 +74,17 @@ def parse_address(text: str | None, option: str = "--serve", usual: int | None =
     given = text or ""
     match = re.fullmatch(r"(?:(?P<only>\d+)|(?P<host>\[[0-9a-fA-F:.]+\]|[\w.-]*)(?::(?P<port>\d{1,5}))?)", given)
     port = (match["only"] or match["port"] or usual) if match else None
-    if match is None or port is None or int(port) > 65535:
+    if match is None or port is None or int(port) > 65535 or not is_host(match["host"] or THIS_MACHINE):
         raise InputError(f"{option}: found {shorten(given)!r}, expected [HOST:]PORT, such as {THIS_MACHINE}:{PORT}")
     return Address((match["host"] or THIS_MACHINE).strip("[]"), int(port))
+
+
+def is_host(text: str) -> bool:
+    """Tell whether a text may be an address or the name of a machine: names have no empty or very long parts."""
+    try:
+        return bool(text.encode("idna"))
+    except UnicodeError:
+        return False
 
 
 def is_loopback(host: str) -> bool:

@@ -141,7 +141,8 @@ class RigKeeper:
 
         Args:
             source: frames by camera, (H, W), None = no frame; or blobs found elsewhere, labelled or not.
-            time: s since the epoch. A time before the previous one counts as equal to it.
+            time: s since the epoch. If it is before that of the snapshot learned last, no time has passed. The next
+                time is then compared with this one: clocks may be set back.
             silent: cameras without data, if `source` is blobs; other cameras without blobs count as having seen
                 nothing. If `source` is frames, cameras without a frame are silent.
 

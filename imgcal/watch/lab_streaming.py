@@ -19,6 +19,7 @@ from imgcal.watch.wire import LONGEST_LINE, exposure_from_json
 TICK = 0.05  # s
 LOOK_EVERY = 1.0  # s between two searches for new streams
 BUFFERED = 30  # s of samples buffered by LSL
+FORGET_AFTER = 15.0  # s without an answer to a search after which a stream is gone
 LONGEST_WAIT = 10.0  # s to wait for the sender's clock
 NAME = re.compile(r"lsl://([^\s/'\"]{1,200})/?")
 
@@ -47,7 +48,7 @@ class LabStreaming:
             import pylsl  # not in the core
         except (OSError, RuntimeError) as error:  # its wheels for some machines lack the library
             raise InputError(f"{self.address}: pylsl finds no liblsl, which has to be installed: {error}") from error
-        resolver = pylsl.ContinuousResolver(prop="name", value=found[1])
+        resolver = pylsl.ContinuousResolver(prop="name", value=found[1], forget_after=FORGET_AFTER)
         streams: dict[str, _Stream | None] = {}  # by LSL's stream number; None = unusable
         looked = float("-inf")
         while True:
@@ -55,10 +56,14 @@ class LabStreaming:
                 looked = time.monotonic()
                 yield from _open_new(resolver.results(), streams, pylsl)
             came = False
-            for stream in filter(None, streams.values()):
-                if not stream.is_ready(pylsl):
+            for number, stream in tuple(streams.items()):
+                if stream is None or not stream.is_ready(pylsl):
                     continue
-                sample, stamp = stream.inlet.pull_sample(timeout=0.0)
+                try:
+                    sample, stamp = stream.inlet.pull_sample(timeout=0.0)
+                except pylsl.util.LostError:
+                    del streams[number]  # opened again if it is found again
+                    continue
                 if sample is not None:
                     came = True
                     yield _item(sample[0], stamp, stream.inlet, pylsl)
@@ -78,15 +83,19 @@ class _Stream:
     def is_ready(self, library: Any) -> bool:
         """Tell whether to read samples: the clock is known, or the wait for it is over."""
         if not self.ready:
-            with contextlib.suppress(*_failures(library)):
+            try:
                 self.inlet.time_correction(timeout=TICK)
                 self.ready = True
-            self.ready = self.ready or time.monotonic() - self.opened > LONGEST_WAIT
+            except _failures(library) as error:
+                lost = isinstance(error, library.util.LostError)  # there is no clock to wait for
+                self.ready = lost or time.monotonic() - self.opened > LONGEST_WAIT
         return self.ready
 
 
 def _open_new(found: list[Any], streams: dict[str, _Stream | None], library: Any) -> Iterator[Item]:
-    """Open new streams of one text channel."""
+    """Open new streams of one text channel, and forget those that are gone."""
+    for gone in streams.keys() - {one.uid() for one in found}:
+        del streams[gone]
     for one in found:
         if one.uid() in streams:
             continue
@@ -95,7 +104,7 @@ def _open_new(found: list[Any], streams: dict[str, _Stream | None], library: Any
             kind = f"{one.channel_count()} channels of type {one.channel_format()}"
             yield Unreadable(f"stream {shorten(one.name())}: found {kind}, expected one of text")
             continue
-        inlet = library.StreamInlet(one, max_buflen=BUFFERED, recover=True)
+        inlet = library.StreamInlet(one, max_buflen=BUFFERED, recover=False)  # a restarted sender is a new stream
         with contextlib.suppress(*_failures(library)):
             inlet.open_stream(timeout=TICK)  # continues in the background
         streams[one.uid()] = _Stream(inlet, time.monotonic())

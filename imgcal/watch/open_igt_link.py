@@ -127,7 +127,7 @@ class OpenIGTLink:
         self.port = int(self._listening.getsockname()[1])
 
     def send(self, record: PoseRecord) -> None:
-        """See `PoseSink`: send STATUS when it changes, once a second, and to new clients."""
+        """See `PoseSink`: send STATUS when it changes, to new clients, and if the last one is a second old."""
         came = self._accept()
         now = time.monotonic()
         due = self._said is None or self._said[0] != record.status or now - self._said[1] >= STATUS_EVERY

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from imgcal.errors import InputError
 from imgcal.formats import Element, parse_xml
+from imgcal.live_page import is_host
 from imgcal.messages import list_names, one_line, shorten
 from imgcal.types import CameraRig
 from imgcal.watch.exposures import MOST_BLOBS, CameraBlobs, Exposure, Item, Unreadable
@@ -309,7 +310,7 @@ def _connect(host: str, port: int, timeout: float) -> Generator[None, None, sock
 
 def _host_and_port(address: str) -> tuple[str, int]:
     found = re.fullmatch(r"qtm://([^\s:/]+)(?::(\d{1,5}))?/?", address)
-    if found is None or not 0 < int(found[2] or PORT) < 2**16:
+    if found is None or not is_host(found[1]) or not 0 < int(found[2] or PORT) < 2**16:
         raise InputError(f"{shorten(address)}: expected an address qtm://HOST[:PORT], such as qtm://127.0.0.1:{PORT}")
     return found[1], int(found[2] or PORT)
 

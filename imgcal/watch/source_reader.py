@@ -18,7 +18,7 @@ from imgcal.watch.timing import Timing
 MOST_WAITING = 8
 """Maximum length of the queue; beyond it, a live source drops the oldest snapshot, any other source waits."""
 MOST_BYTES = 2**30
-"""Maximum memory (bytes) of the queued frames; beyond it, the oldest are dropped, too."""
+"""Maximum memory (bytes) of the queued frames; beyond it, the same happens."""
 LATELY = 3  # number of reasons to keep
 WOKEN = 0.2  # s
 LONGEST_OPENING = 10.0  # s
@@ -219,11 +219,17 @@ class SourceReader:
             if included:
                 return
         with self._changed:
-            while not self.live and len(self._snapshots) >= self._most and not self._closing:
-                self._changed.wait(WOKEN)
+            while self._is_full(snapshot) and not self._closing:
+                if self.live:
+                    self._bytes -= self._snapshots.popleft().num_bytes
+                    self.dropped += 1
+                else:
+                    self._changed.wait(WOKEN)
             self._snapshots.append(snapshot)
             self._bytes += snapshot.num_bytes
-            while len(self._snapshots) > 1 and (len(self._snapshots) > self._most or self._bytes > MOST_BYTES):
-                self._bytes -= self._snapshots.popleft().num_bytes
-                self.dropped += 1
             self._changed.notify_all()
+
+    def _is_full(self, snapshot: TimedSnapshot) -> bool:
+        """Tell whether the queue has no room for a snapshot; an empty one has."""
+        full = len(self._snapshots) >= self._most or self._bytes + snapshot.num_bytes > MOST_BYTES
+        return full and len(self._snapshots) > 0

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -24,6 +24,9 @@ INTERVALS, LEAST_INTERVALS = 8, 3
 always due."""
 BEGINNING = 3.0
 """Time (s) to wait for a camera with few exposures: it may send once a second."""
+MOST_TOLERANCE = 0.49
+"""Maximum tolerance as a share of a camera's median interval: beyond half of it, exposures would belong to two
+snapshots."""
 EARLY = 0.05
 """Share of the median interval by which it may come early."""
 ALONE = 30
@@ -96,17 +99,19 @@ class _Pending:
     exposures: dict[str, Exposure] = field(default_factory=dict)
     earliest: float = math.inf
     latest: float = -math.inf
+    tolerance: float = math.inf  # s, the smallest of its cameras
 
-    def add(self, exposure: Exposure) -> None:
+    def add(self, exposure: Exposure, tolerance: float) -> None:
         self.exposures[exposure.camera] = exposure
+        self.tolerance = min(self.tolerance, tolerance)
         self.earliest, self.latest = min(self.earliest, exposure.time), max(self.latest, exposure.time)
 
     def distance(self, time: float) -> float:
         return abs(time - (self.earliest + self.latest) / 2)
 
-    def spread(self, time: float) -> float:
-        """Time between the earliest and the latest time stamp if this one is added."""
-        return max(self.latest, time) - min(self.earliest, time)
+    def includes(self, time: float, tolerance: float) -> bool:
+        """Tell whether a time stamp belongs to it, by the tolerances of its camera and of those already present."""
+        return max(self.latest, time) - min(self.earliest, time) <= min(self.tolerance, tolerance)
 
     def finished(self) -> TimedSnapshot:
         times = sorted(exposure.time for exposure in self.exposures.values())
@@ -141,7 +146,7 @@ class Synchronizer:
         self.alone: tuple[str, ...] = ()
         """Cameras whose time stamps always differ from the others': their clocks do."""
         self._offset: dict[str, float] = {}  # last time stamp minus this machine's clock at arrival
-        self._gone = (-math.inf, -math.inf)  # earliest and latest time stamp of the last released snapshot
+        self._gone: _Pending | None = None  # the last released snapshot without a name
         self._names: deque[str] = deque(maxlen=REMEMBERED)
         self._known: set[str] = set()  # the same as a set
         self._astray: dict[str, Exposure] = {}  # last exposure of each camera whose clock has jumped
@@ -191,6 +196,14 @@ class Synchronizer:
         pending, self._pending = self._pending, []
         return self._drop_unsynchronized([self._has_continued(snapshot) for snapshot in pending])
 
+    def tolerance(self, name: str) -> float:
+        """Maximum time (s) between time stamps of a snapshot with this camera.
+
+        This is `Timing.tolerance`, but less than half the interval between the camera's exposures.
+        """
+        interval = self._rest(name, least=1)
+        return self.timing.tolerance if math.isnan(interval) else min(self.timing.tolerance, MOST_TOLERANCE * interval)
+
     def _drop_unsynchronized(self, done: list[TimedSnapshot]) -> tuple[TimedSnapshot, ...]:
         """Remove the exposures of unsynchronized cameras: the object's pose at those times is unknown."""
         kept = []
@@ -208,26 +221,30 @@ class Synchronizer:
         self._absent[camera] = 0
         self._offset[camera] = exposure.time - now
         self.counts["out_of_order"][camera] += exposure.time < before
-        self._stamps[camera].append(exposure.time)
+        if exposure.time not in self._stamps[camera]:  # a repetition says nothing about the interval
+            self._stamps[camera].append(exposure.time)
         self._newest[camera] = max(before, exposure.time)
-        pending = self._place(exposure, now)
+        tolerance = self.tolerance(camera)
+        pending = self._place(exposure, tolerance, now)
         if pending is None:
             self.counts["late"][camera] += 1
         elif camera in pending.exposures:
             self.counts["duplicate"][camera] += 1
         else:
-            pending.add(exposure)
+            pending.add(exposure, tolerance)
 
-    def _place(self, exposure: Exposure, now: float) -> _Pending | None:
+    def _place(self, exposure: Exposure, tolerance: float, now: float) -> _Pending | None:
         """Find the snapshot of an exposure, or start a new one; None = it was released already."""
         name, time = exposure.snapshot, exposure.time
         near = [pending for pending in self._pending if pending.name == name]
         if name is None:
-            near = [pending for pending in near if pending.spread(time) <= self.timing.tolerance]
+            near = [pending for pending in near if pending.includes(time, tolerance)]
         if near:
             return min(near, key=lambda pending: pending.distance(time))
-        earliest, latest = self._gone
-        if name in self._known or (name is None and (time <= latest or time - earliest <= self.timing.tolerance)):
+        gone = self._gone
+        if name in self._known or (
+            name is None and gone is not None and (time <= gone.latest or gone.includes(time, tolerance))
+        ):
             return None
         new = _Pending(name, now)
         later = [i for i, pending in enumerate(self._pending) if pending.name is None and pending.earliest > time]
@@ -245,7 +262,7 @@ class Synchronizer:
 
     def _has_continued(self, pending: _Pending) -> TimedSnapshot:
         if pending.name is None:
-            self._gone = pending.earliest, pending.latest
+            self._gone = replace(pending, exposures={})  # frames are large
         else:
             if len(self._names) == REMEMBERED:
                 self._known.discard(self._names[0])
@@ -260,11 +277,11 @@ class Synchronizer:
         self.alone = tuple(name for name in self.camera_names if self._alone[name] >= ALONE)
         return pending.finished()
 
-    def _rest(self, name: str) -> float:
-        """Usual interval between a camera's exposures; nan = too few exposures."""
+    def _rest(self, name: str, least: int = LEAST_INTERVALS) -> float:
+        """Usual interval between a camera's exposures; nan = fewer than `least` intervals are known."""
         stamps = sorted(self._stamps[name])
         rests = sorted(later - earlier for earlier, later in itertools.pairwise(stamps))
-        return rests[len(rests) // 2] if len(rests) >= LEAST_INTERVALS else math.nan
+        return rests[len(rests) // 2] if len(rests) >= least else math.nan
 
     def _nearest(self, name: str, pending: _Pending) -> float:
         """Time between a snapshot and the nearest of a camera's latest exposures."""
@@ -272,7 +289,7 @@ class Synchronizer:
 
     def _is_due(self, name: str, pending: _Pending) -> bool:
         """Tell whether a camera that sends less often than others was due for a snapshot."""
-        between = (1 - EARLY) * self._rest(name) - self.timing.tolerance
+        between = (1 - EARLY) * self._rest(name) - min(pending.tolerance, self.tolerance(name))
         return pending.name is not None or not self._nearest(name, pending) < between
 
     def _is_beside(self, name: str, pending: _Pending) -> bool:
@@ -306,4 +323,4 @@ class Synchronizer:
         for stamps in self._stamps.values():
             stamps.clear()
         self._offset.clear()
-        self._gone = (-math.inf, -math.inf)
+        self._gone = None

@@ -23,7 +23,18 @@ def test_addresses_are_read(text, expected):
 
 
 @pytest.mark.parametrize(
-    "text", ["a b", "1.2.3.4:99999", "99999999", "http://127.0.0.1", "host:port", "1:2:3", "x" * 300 + ":"]
+    "text",
+    [
+        "a b",
+        "1.2.3.4:99999",
+        "99999999",
+        "http://127.0.0.1",
+        "host:port",
+        "1:2:3",
+        "x" * 300 + ":",
+        "a..b:9000",
+        "x" * 64,
+    ],
 )
 def test_what_is_no_address_is_one_line(text):
     with pytest.raises(InputError, match=r"expected \[HOST:\]PORT"):

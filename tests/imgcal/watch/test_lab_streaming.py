@@ -6,6 +6,7 @@ import pytest
 
 from imgcal.errors import InputError
 from imgcal.watch import Exposure, LabStreaming, Unreadable
+from imgcal.watch.lab_streaming import _open_new
 
 pytest.importorskip("pylsl", reason="no pylsl (extra lsl)")
 CONFIGURATION = """
@@ -88,6 +89,26 @@ def test_garbage_is_told_and_a_stream_may_go_and_come_back(lsl):
     again.push_sample(blobs("cam03", time=1.0))
     assert collect(items, lambda found: any(isinstance(one, Exposure) for one in found))[-1].camera == "cam03"
     items.close()
+
+
+def test_a_sender_that_restarts_is_read_once(lsl):
+    items, sent = LabStreaming("lsl://imgcal-c").items(), 0
+    for _ in range(3):
+        sender = outlet(lsl, "imgcal-c")  # the same source each time
+        wait_for([sender], items)
+        collect(items, lambda found, ends=time.monotonic() + 4.0: time.monotonic() > ends)  # LSL has time to recover
+        for _ in range(5):
+            sender.push_sample(blobs("cam01", time=float(sent)))
+            sent += 1
+        found = collect(items, lambda found, ends=time.monotonic() + 2.0: time.monotonic() > ends)
+        assert [one.time for one in found] == [float(number) for number in range(sent - 5, sent)]
+        del sender
+    items.close()
+
+
+def test_a_stream_that_is_no_longer_found_is_forgotten_and_opened_again_later(lsl):
+    streams = {"unplugged": None}
+    assert list(_open_new([], streams, lsl)) == [] and streams == {}
 
 
 @pytest.mark.parametrize("address", ["lsl://", "lsl://two words", "lsl://a/b", "tcp://127.0.0.1:1"])

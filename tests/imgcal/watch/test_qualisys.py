@@ -239,7 +239,9 @@ def test_a_stream_that_runs_ahead_of_the_clock_goes_on_after_a_reconnection():
     assert (np.diff(times) > 5e-3).all() and times[9] == pytest.approx(18.0) and times[10] < 19.0
 
 
-@pytest.mark.parametrize("address", ["qtm://", "qtm://host:0", "qtm://host:70000", "tcp://host:1"])
+@pytest.mark.parametrize(
+    "address", ["qtm://", "qtm://host:0", "qtm://host:70000", "tcp://host:1", "qtm://a..b", "qtm://.:1"]
+)
 def test_addresses_that_are_none(address):
     with pytest.raises(InputError, match="expected an address qtm://HOST"):
         next(Qualisys(address, RIG).items())

@@ -79,6 +79,18 @@ def test_frames_that_wait_are_bounded_in_memory(monkeypatch):
         assert len(taken(intake)) == 2 and intake.dropped == 8
 
 
+@pytest.mark.parametrize("limit", [1, 5])  # frames: also a single snapshot may be too large
+def test_a_recording_of_large_frames_waits_too(monkeypatch, limit):
+    width, height = PAIR.image_size[0].tolist()
+    monkeypatch.setattr(module, "MOST_BYTES", limit * width * height)
+    frame = np.zeros((height, width), np.uint8)
+    items = [Exposure(name, k / 60, frame) for k in range(10) for name in PAIR.camera_names]
+    with SourceReader(Given(items), PAIR) as intake:
+        time.sleep(0.2)
+        assert intake.waiting == max(limit // 2, 1)
+        assert [s.time for s in taken(intake)] == [k / 60 for k in range(10)] and intake.dropped == 0
+
+
 def test_what_cannot_be_read_is_counted_and_does_not_end_it():
     items = [
         Unreadable("junk\nand more"), Exposure("cam99", 0.0, NOTHING), Exposure("cam01", float("nan"), NOTHING),

@@ -231,3 +231,53 @@ def test_a_camera_that_sends_more_often_than_others_is_not_beside_them():
         for camera in ABC if k % 120 == 0 else "a":
             sync.add(at(camera, k / 120))
         assert sync.alone == ()
+
+
+@pytest.mark.parametrize("live", [False, True])
+@pytest.mark.parametrize("rate", [20, 60, 150, 240, 300, 500, 1000])  # Hz
+def test_nothing_is_lost_or_mixed_at_any_frame_rate(rate, live):
+    draw, sync, done = random.Random(rate), Synchronizer(ABC, Timing()), []
+    jitter = min(0.001, 0.1 / rate)  # s
+    for k in range(300):
+        for camera in draw.sample(ABC, 3):
+            time = 1000 + k / rate + draw.uniform(-jitter, jitter)
+            done += sync.add(at(camera, time), now=50 + k / rate + draw.uniform(0, 0.002) if live else 0.0)
+    done += sync.flush()
+    assert cameras(done) == ["abc"] * 300
+    assert all(sum(sync.counts[kind].values()) == 0 for kind in ("missing", "late", "duplicate"))
+
+
+def test_a_frame_that_is_missing_at_a_high_rate_is_not_replaced_by_the_next_one():
+    sync, done, sent = Synchronizer(ABC, Timing()), [], 0
+    for k in range(400):
+        missing = {"b": k % 2 == 1, "c": k % 7 == 6}
+        for camera in ABC:
+            if missing.get(camera):
+                continue
+            sent += 1
+            done += sync.add(at(camera, k / 240))
+    done += sync.flush()
+    moments = [{round(e.time * 240) for e in s.exposures.values()} for s in done]
+    assert moments == [{k} for k in range(400)] and sum(len(s.exposures) for s in done) == sent
+
+
+def test_a_slow_camera_joins_only_the_frames_of_a_fast_one_at_its_own_moment():
+    sync, done = Synchronizer(ABC, Timing()), []
+    for k in range(480):
+        for camera in "cab" if k % 4 == 0 else "a":  # b and c at 60 Hz
+            done += sync.add(at(camera, k / 240))
+    done += sync.flush()
+    assert cameras(done) == ["abc", "a", "a", "a"] * 120
+
+
+def test_a_camera_whose_stamps_come_in_bursts_or_twice_leaves_the_others_together():
+    sync, done = Synchronizer(ABC, Timing()), []
+    for k in range(300):
+        for camera in "ab":
+            done += sync.add(at(camera, k / 60 + 0.003 * (camera == "b")))
+            sync.add(at(camera, k / 60 + 0.003 * (camera == "b")))  # the network repeats it
+        if k % 5 == 4:
+            for late in range(5):
+                done += sync.add(at("c", k / 60 + 0.008 + 0.0002 * late))
+    done += sync.flush()
+    assert sum("ab" in found for found in cameras(done)) == 300
