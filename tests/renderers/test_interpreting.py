@@ -94,7 +94,7 @@ def test_only_the_own_time_counts():
 
     with interpret_first(math.inf):
         assert outer(np.ones(15_000)) == pytest.approx(5001)
-    assert 0 < outer.interpretable.spent < 0.1 * inner.interpretable.spent
+    assert 0 < outer.interpretable.spent < 0.5 * inner.interpretable.spent
 
 
 def test_numpy_does_not_warn_as_machine_code_does_not():
