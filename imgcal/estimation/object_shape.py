@@ -147,7 +147,7 @@ class ShapeEvidence:
 
 @dataclass(frozen=True)
 class ScaleEvidence:
-    """Information of a fit about an exact object with too many fiducials to test its shape."""
+    """Information of a fit about the size of an object whose shape is not tested: it is a stick, or too large."""
 
     scale_error: tuple[float, float]  # as in `ShapeEvidence`
 
@@ -158,10 +158,11 @@ class ScaleEvidence:
 
 def object_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ShapeEvidence | ScaleEvidence | None:
     """Extract a fit's evidence about its object, for one rig (B = 1); None where rig and poses are undetermined."""
-    solid = all(pose_rank(points) == 6 for points in problem.points_of_parts())
-    if problem.object_prior_std is None and (len(problem.points) > MOST_FIDUCIALS or not solid):
+    ranks = [pose_rank(points) for points in problem.points_of_parts()]
+    if problem.object_prior_std is None and (len(problem.points) > MOST_FIDUCIALS or min(ranks) < 6):
         return scale_evidence(problem, solution, loss)
-    return shape_evidence(problem, solution, loss)
+    shape = shape_evidence(problem, solution, loss)
+    return shape if shape is None or max(ranks) == 6 else ScaleEvidence(shape.scale_error)
 
 
 def scale_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ScaleEvidence | None:
