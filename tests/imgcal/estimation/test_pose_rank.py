@@ -88,6 +88,13 @@ def test_of_a_stick_only_the_scale_is_estimated():
     assert make_problem(one, rig, replace(light, scale_tolerance=0.02), None).object_prior_std is None
 
 
+def test_a_stick_of_equal_halves_may_have_tolerances():
+    rig, obj, _, table = capture(PAIR, 20)
+    soft = replace(obj, tolerance=torch.full((2,), 0.3).double())
+    result = calibrate(replace(table, fiducial=np.full(len(table), -1)), rig, soft)
+    assert result.identity == "ambiguous" and result.estimate.problem.object_prior_std is None
+
+
 def test_a_light_needs_two_cameras_and_a_stick_two_of_its_markers():
     seen = np.zeros((3, 4, 2), dtype=bool)
     seen[:, :2] = True
