@@ -140,7 +140,7 @@ def estimate(
         observations: (*B, S, C, N).
         rig: the factory rig, (*B) or without batch axes.
         obj: N fiducials. With a radius, their images are ellipses, and the observations are the centres of those. With
-            tolerances, the object's shape is estimated too, one shape for all snapshots; a stick's shape stays fixed.
+            tolerances, the object's shape is estimated too, one shape for all snapshots; of a stick, only the scale.
             The object's modes stay zero.
         rig_from_object: (*B, S) first guess of the poses; None = `initial_pose`.
         prior_std: (*B, C, K) standard deviation of each factory value, as `CameraRig.parameter_names`; zero keeps a
@@ -316,10 +316,11 @@ def make_problem(
     points = obj.points.to(uv)
     centroid = points.mean(0)
     modes = None if obj.modes is None else obj.modes.to(uv) - obj.modes.to(uv).mean(1, keepdim=True)
+    own = None if obj.exact else object_prior_std(obj).to(uv)
     return Problem(
         modes=modes,
         part_of=torch.from_numpy(obj.part_of).to(uv.device) if obj.parts else None,
-        object_prior_std=None if obj.exact or obj.pose_rank < 6 else object_prior_std(obj).to(uv).expand(count, -1),
+        object_prior_std=None if own is None or not bool(own.any()) else own.expand(count, -1),
         uv=torch.where(seen[..., None], uv, 0.0).mT.contiguous(),
         root_weight=torch.where(seen, 1 / torch.where(seen, sigma, 1.0), 0.0),
         points=points - centroid,
@@ -333,9 +334,13 @@ def make_problem(
 
 
 def object_prior_std(obj: CalibrationObject) -> Tensor:
-    """Prior standard deviation of the object's own parameters, in the order of `State`: (M,)."""
-    granted = torch.cat([part.granted * (part.pose_rank == 6) for part in obj.parts]) if obj.parts else obj.granted
-    return torch.cat((granted.repeat_interleave(3), obj.points.new_tensor([obj.scale_tolerance])))
+    """Prior standard deviation of the object's own parameters, in the order of `State`: (M,).
+
+    Zero where they are taken from its file: the fiducials of a stick, and the scale of a single point.
+    """
+    granted = torch.cat([part.granted * (part.pose_rank == 6) for part in obj.each])
+    scale = obj.scale_tolerance * (obj.pose_rank > 3)
+    return torch.cat((granted.repeat_interleave(3), obj.points.new_tensor([scale])))
 
 
 def initial_state(problem: Problem, rig_from_object: RigidTransform, initial_rig: CameraRig | None) -> State:

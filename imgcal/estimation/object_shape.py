@@ -147,7 +147,7 @@ class ShapeEvidence:
 
 @dataclass(frozen=True)
 class ScaleEvidence:
-    """Information of a fit about an exact object with too many fiducials to test its shape."""
+    """Information of a fit about the size of an object whose shape is not tested: it is a stick, or too large."""
 
     scale_error: tuple[float, float]  # as in `ShapeEvidence`
 
@@ -158,10 +158,11 @@ class ScaleEvidence:
 
 def object_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ShapeEvidence | ScaleEvidence | None:
     """Extract a fit's evidence about its object, for one rig (B = 1); None where rig and poses are undetermined."""
-    solid = all(pose_rank(points) == 6 for points in problem.points_of_parts())
-    if problem.object_prior_std is None and (len(problem.points) > MOST_FIDUCIALS or not solid):
+    ranks = [pose_rank(points) for points in problem.points_of_parts()]
+    if problem.object_prior_std is None and (len(problem.points) > MOST_FIDUCIALS or min(ranks) < 6):
         return scale_evidence(problem, solution, loss)
-    return shape_evidence(problem, solution, loss)
+    shape = shape_evidence(problem, solution, loss)
+    return shape if shape is None or max(ranks) == 6 else ScaleEvidence(shape.scale_error)
 
 
 def scale_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ScaleEvidence | None:
@@ -319,16 +320,19 @@ class FiducialOffset:
 def offsets(estimate: Estimate, points: Array) -> tuple[FiducialOffset, ...]:
     """Compare the estimated fiducials with their places `points` (N, 3) mm, one by one.
 
-    A rigid motion of the object is no displacement. The object is first aligned so that as many fiducials as possible
-    are in their places; each of several objects separately.
+    A rigid motion of the object is no displacement, and neither is its common scale, where that has a tolerance. The
+    object is first aligned so that as many fiducials as possible are in their places; each of several objects
+    separately.
 
     Source: S-transformation (Baarda 1973) with weights that depend on the displacements, as in deformation analysis.
     """
-    found, covariance = (
-        estimate.points_object.detach().double().numpy(),
-        object_covariance(estimate, curved=False).double().numpy(),
-    )
-    moved, part_of = (found - points).ravel(), estimate.problem.part_of
+    problem, prior_std = estimate.problem, estimate.problem.object_prior_std
+    if prior_std is not None:  # the scale stays estimated, and adds nothing to the fiducials and their covariance
+        unscaled = torch.cat((prior_std[:, :-1], torch.zeros_like(prior_std[:, -1:])), dim=1)
+        problem = replace(problem, object_prior_std=unscaled)
+    found = (points_at(problem, estimate.solution.state)[0] + problem.centroid).double().numpy()
+    covariance = object_covariance(replace(estimate, problem=problem), curved=False).double().numpy()
+    moved, part_of = (found - points).ravel(), problem.part_of
     number = np.zeros(len(points), dtype=int) if part_of is None else part_of.numpy()
     centred = points - np.stack([points[number == part].mean(0) for part in range(number.max() + 1)])[number]
     # Displacement of each object by a rotation about its centroid and a translation.

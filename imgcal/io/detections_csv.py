@@ -97,8 +97,7 @@ def load_detections(
     require_left_out(path, without, left_out)
     cameras = {name: index for name, index in cameras.items() if index != LEFT_OUT}
     column = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    _check_unique(path, column, tuple(cameras), tuple(snapshots))
-    return Detections(
+    found = Detections(
         uv=np.stack((column["u"], column["v"]), axis=1),
         sigma=column["sigma"],
         camera=column["camera"],
@@ -109,6 +108,8 @@ def load_detections(
         camera_names=tuple(cameras),
         snapshot_names=tuple(snapshots),
     )
+    _check_unique(path, found)
+    return found
 
 
 def save_detections(detections: Detections, path: str | Path, obj: CalibrationObject | None = None) -> None:
@@ -278,15 +279,10 @@ def _check_inside(chunk: Chunk, part: dict[str, NDArray[Any]], rig: CameraRig) -
         )
 
 
-def _check_unique(
-    path: Path, column: dict[str, NDArray[Any]], cameras: tuple[str, ...], snapshots: tuple[str, ...]
-) -> None:
-    """Find fiducials that one camera saw twice in one snapshot."""
-    rows = np.flatnonzero(column["fiducial"] >= 0)
-    keys = np.stack([column[name][rows].astype(np.int64) for name in ("snapshot", "camera", "fiducial")])
-    order = np.lexsort(keys)  # stable: the first of equal rows stays first
-    repeated = order[1:][(np.diff(keys[:, order]) == 0).all(axis=0)]
-    if len(repeated):
-        snapshot, camera, fiducial = keys[:, repeated.min()]
-        place = f"camera {cameras[camera]} in snapshot {snapshots[snapshot]}"
-        fail_row(path, int(rows[repeated.min()]), f"found fiducial {fiducial} again for {place}, expected it once")
+def _check_unique(path: Path, detections: Detections) -> None:
+    """Refuse a fiducial that one camera saw twice in one snapshot."""
+    row = detections.find_repeated_label()
+    if row is not None:
+        camera = detections.camera_names[detections.camera[row]]
+        place = f"camera {camera} in snapshot {detections.snapshot_names[detections.snapshot[row]]}"
+        fail_row(path, row, f"found fiducial {detections.fiducial[row]} again for {place}, expected it once")

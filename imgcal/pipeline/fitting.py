@@ -21,6 +21,7 @@ from imgcal.estimation import (
     make_estimate,
     make_loss,
     make_problem,
+    object_prior_std,
 )
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.initialization import Initialization, Initializer, prediction_residual
@@ -149,7 +150,7 @@ def _fit_once(
     variance, labels = observations.sigma.numpy() ** 2, observations.seen.numpy()
     require_cameras(labels, rig, options)
     alike = labelled.identity == "ambiguous" and len(labelled.used) > 1
-    if alike and obj.tolerance is not None and bool(obj.tolerance.any()):
+    if alike and bool(object_prior_std(obj)[:-1].any()):
         raise RefusedError(
             "object: it is symmetric, and snapshots may be labelled in different orientations: the places of its "
             "fiducials within their tolerances cannot be estimated",

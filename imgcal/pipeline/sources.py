@@ -29,6 +29,7 @@ Detector = DetectorName | Proposer | Sight
 (auto); a network, or the network if blobs are not sufficient (both); another proposer of labels; or one of them with
 frames that are not in memory. Blobs decide if the others cannot."""
 ROWS = tuple(field.name for field in fields(Detections) if not field.name.endswith("_names"))
+WHOLE = ("camera", "snapshot", "fiducial", "flags")
 
 
 def as_unknown_marker(obj: CalibrationObject, detections: Detections) -> CalibrationObject:
@@ -173,8 +174,8 @@ def check_detections(detections: Detections, rig: CameraRig, obj: CalibrationObj
     Labels of unknown markers are taken off: they mean nothing from one snapshot to the next.
 
     Raises:
-        InputError: inconsistent columns, a camera, fiducial or pixel that does not exist, or an invalid standard
-            deviation.
+        InputError: inconsistent columns, a camera, fiducial or pixel that does not exist, a fiducial that a camera has
+            twice in a snapshot, or an invalid standard deviation.
     """
     count = np.shape(detections.uv)[:1]
     for name in ROWS:
@@ -182,6 +183,10 @@ def check_detections(detections: Detections, rig: CameraRig, obj: CalibrationObj
         if not isinstance(column, np.ndarray) or column.shape != expected:
             found = f"an array of shape {column.shape}" if isinstance(column, np.ndarray) else type(column).__name__
             raise InputError(f"detections: {name}: found {found}, expected a NumPy array of shape {expected}")
+    for name in WHOLE:
+        kind = getattr(detections, name).dtype
+        if not np.issubdtype(kind, np.integer):
+            raise InputError(f"detections: {name}: found an array of {kind}, expected integers")
     if obj.unknown_markers:
         detections = replace(detections, fiducial=np.full(count, -1))
     elif obj.has_lights:
@@ -197,6 +202,14 @@ def check_detections(detections: Detections, rig: CameraRig, obj: CalibrationObj
         detections.fiducial < obj.num_fiducials,
         f"a row of the object, 0 to {obj.num_fiducials - 1}, or -1",
     )
+    row = detections.find_repeated_label()
+    if row is not None:
+        camera = detections.camera_names[detections.camera[row]]
+        snapshot = detections.snapshot_names[detections.snapshot[row]]
+        raise InputError(
+            f"detections: fiducial: found {detections.fiducial[row]} again in row {row} for camera {camera} in "
+            f"snapshot {snapshot}, expected it once"
+        )
     _require(
         detections,
         "sigma",

@@ -81,6 +81,14 @@ class Detections:
         """Mark the blobs with a label: (M,) bool."""
         return self.fiducial >= 0
 
+    def find_repeated_label(self) -> int | None:
+        """Find the first row whose fiducial its camera already has in the same snapshot; None = there is none."""
+        rows = np.flatnonzero(self.labelled)
+        keys = np.stack([column[rows] for column in (self.snapshot, self.camera, self.fiducial)])
+        order = np.lexsort(keys)  # stable: the first of equal rows stays first
+        repeated = order[1:][(np.diff(keys[:, order]) == 0).all(axis=0)]
+        return int(rows[repeated.min()]) if len(repeated) else None
+
     def count_by_camera(self, rows: NDArray[np.bool_] | slice = slice(None)) -> NDArray[np.int64]:
         """Count the blobs of each camera: (C,); only those that `rows` marks."""
         return np.bincount(self.camera[rows], minlength=len(self.camera_names))

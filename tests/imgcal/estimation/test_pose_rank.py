@@ -76,6 +76,25 @@ def test_both_solvers_fix_turns_that_nothing_shows_and_add_nothing_else(points):
     torch.testing.assert_close(slow.state.offset, found.solution.state.offset, rtol=0, atol=1e-3)
 
 
+def test_of_a_stick_only_the_scale_is_estimated():
+    rig, obj, _, table = capture(TRIPLE, 6)
+    observations = to_observations(table, rig, obj)
+    soft = replace(obj, tolerance=torch.ones(3).double())
+    assert make_problem(observations, rig, soft, None).object_prior_std is None
+    problem = make_problem(observations, rig, replace(soft, scale_tolerance=0.02), None)
+    assert problem.object_prior_std.tolist() == [[*[0.0] * 9, 0.02]]
+    light = replace(obj, points=obj.points[:1], colours=obj.colours[:1])
+    one = to_observations(table.select(table.fiducial == 0), rig, light)
+    assert make_problem(one, rig, replace(light, scale_tolerance=0.02), None).object_prior_std is None
+
+
+def test_a_stick_of_equal_halves_may_have_tolerances():
+    rig, obj, _, table = capture(PAIR, 20)
+    soft = replace(obj, tolerance=torch.full((2,), 0.3).double())
+    result = calibrate(replace(table, fiducial=np.full(len(table), -1)), rig, soft)
+    assert result.identity == "ambiguous" and result.estimate.problem.object_prior_std is None
+
+
 def test_a_light_needs_two_cameras_and_a_stick_two_of_its_markers():
     seen = np.zeros((3, 4, 2), dtype=bool)
     seen[:, :2] = True

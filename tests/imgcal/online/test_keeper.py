@@ -175,7 +175,9 @@ def test_labels_that_came_with_the_blobs_are_used() -> None:
     states = kept(made, 3)
     assert all(state.refused is None for state in states)
     blobs: Detections = made.snapshot(3)
-    swapped = replace(blobs, fiducial=np.roll(blobs.fiducial, 1))
+    swapped = replace(blobs, fiducial=blobs.fiducial.copy())
+    for camera in range(made.factory.num_cameras):
+        swapped.fiducial[blobs.camera == camera] = np.roll(blobs.fiducial[blobs.camera == camera], 1)
     with RigKeeper(made.factory, made.obj) as keeper:
         assert keeper.update(blobs, 0.0).refused is None
         assert keeper.update(swapped, 0.0).belief.rig.focal_length.isfinite().all()

@@ -80,6 +80,20 @@ def test_a_scale_that_may_be_off_is_estimated() -> None:
     assert plain.scale_sigma == pytest.approx(0.003, abs=0.002)  # what can be known of it, at these priors
 
 
+@pytest.mark.parametrize("factor", [0.97, 1.01, 1.05])
+def test_another_scale_that_may_be_off_displaces_no_fiducial(factor: float) -> None:
+    rig, obj, *_, table = capture("O10", 8, scaled(factor))
+    found = calibrate(table, rig, replace(obj, scale_tolerance=0.03))
+    assert found.displaced == () and all(offset.distance < 0.01 for offset in found.shape)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.01])
+def test_a_displaced_fiducial_is_named_beside_a_scale_that_may_be_off(factor: float) -> None:
+    rig, obj, *_, table = capture("O10", 8, lambda points: moved(5, (0.6, 0.8, 0))(scaled(factor)(points)))
+    (only,) = calibrate(table, rig, replace(obj, scale_tolerance=0.03)).displaced
+    assert only.fiducial == 5 and only.distance == pytest.approx(1.0, abs=4 * only.sigma) and only.sigma < 0.1
+
+
 @pytest.mark.parametrize("snapshots", [1, 5])
 @pytest.mark.parametrize("factor", [1.15, 1.3])
 @pytest.mark.parametrize("rig_name", ["T4", "O10"])

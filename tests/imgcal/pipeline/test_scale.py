@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 import imgcal
 from imgcal.estimation import predicted_error
 from imgcal.evaluation.true_error import true_error
-from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
-from imgcal.types import RigPrior
+from imgcal.synthesis import PhysicalDrift, simulate_truth, simulate_volume, true_detections
+from imgcal.types import CalibrationObject, RigPrior
 
 
 @pytest.mark.parametrize("rig_name", ["T4", "O10"])
@@ -40,6 +41,34 @@ def test_a_scale_that_the_cameras_know_better_is_theirs() -> None:
     assert found.scale.values["from"] == "cameras"
     assert 0 < found.scale.sigma < 0.01
     assert str(found.scale) == ""
+
+
+STICKS = {"of two": ((0.0, 0, 0), (500, 0, 0)), "of three": ((0.0, 0, 0), (200, 0, 0), (500, 0, 0))}
+
+
+@pytest.mark.parametrize("points", STICKS.values(), ids=STICKS)
+def test_a_stick_whose_scale_may_be_off_is_as_long_as_the_cameras_say(points) -> None:
+    """The factory positions know its length a hundred times as well as its file."""
+    drift = PhysicalDrift(position=1.0, rotation_deg=0.1)
+    prior = RigPrior(drift.focal_length, drift.principal_point, drift.distortion, np.radians(drift.rotation_deg), 1.0)
+    rig = replace(imgcal.load_rig("room10"), prior=prior)
+    places = torch.tensor(points, dtype=torch.float64)
+    stick = CalibrationObject(places, torch.ones(len(places), 3).double(), name="stick", scale_tolerance=0.02)
+    errors = []
+    for seed in range(4):
+        truth = simulate_volume(
+            rig, replace(stick, points=1.02 * places), 40, torch.Generator().manual_seed(seed), drift
+        )
+        blobs = true_detections(truth)
+        blobs.uv[:] += 0.05 * np.random.default_rng(seed).standard_normal(blobs.uv.shape)
+        blobs.sigma[:] = 0.05
+        found = imgcal.calibrate(blobs, rig, stick)
+        length = float((found.points_object[-1] - found.points_object[0]).norm()) / 500
+        assert found.scale.source == "cameras" and found.scale.sigma < 2e-4 and found.displaced == ()
+        errors.append((length / 1.02 - 1) / found.scale.sigma)
+    assert np.abs(errors).max() < 3 and 0.3 < np.sqrt(np.mean(np.square(errors))) < 1.8
+    with pytest.raises(imgcal.RefusedError, match="give its scale a tolerance"):
+        imgcal.calibrate(blobs, rig, replace(stick, scale_tolerance=0.0))
 
 
 @pytest.mark.parametrize("rig_name", ["T4", "O10"])

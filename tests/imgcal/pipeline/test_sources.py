@@ -10,8 +10,9 @@ from imgcal.association import Proposal
 from imgcal.errors import InputError, RefusedError
 from imgcal.io import load_object, read_rig
 from imgcal.online import RigKeeper
-from imgcal.pipeline import calibrate, score
+from imgcal.pipeline import calibrate, check_detections, score
 from imgcal.synthesis import FrameModel, PhysicalDrift, simulate_frames, simulate_truth, true_detections
+from imgcal.types import CalibrationObject
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +103,34 @@ def test_blobs_that_cannot_be_of_this_rig_or_object(seen, job, column, value, re
     wrong[5] = value
     with pytest.raises(InputError, match=reason):
         job(replace(blobs, **{column: wrong}), rig, obj)
+
+
+@EVERYWHERE
+@pytest.mark.parametrize("column", ["camera", "snapshot", "fiducial", "flags"])
+def test_numbers_that_are_not_whole(seen, job, column):
+    rig, obj, _, blobs = seen
+    wrong = replace(blobs, **{column: getattr(blobs, column).astype(float)})
+    with pytest.raises(InputError, match=f"detections: {column}: found an array of float64, expected integers"):
+        job(wrong, rig, obj)
+
+
+@EVERYWHERE
+def test_a_label_that_a_camera_has_twice(seen, job):
+    rig, obj, _, blobs = seen
+    twice = blobs.select(np.array([*range(len(blobs)), 5]))
+    row = f"found {blobs.fiducial[5]} again in row 32 for camera cam01 in snapshot {blobs.snapshot_names[0]}"
+    with pytest.raises(InputError, match=f"detections: fiducial: {row}, expected it once"):
+        job(twice, rig, obj)
+    assert len(check_detections(replace(twice, fiducial=np.full(len(twice), -1)), rig, obj)) == 33
+
+
+def test_labels_of_unknown_markers_may_repeat(seen):
+    rig, obj, _, blobs = seen
+    twice = blobs.select(np.array([*range(len(blobs)), 5]))
+    assert not check_detections(twice, rig, CalibrationObject.unknown()).labelled.any()
+    both = CalibrationObject.of_several([obj, CalibrationObject.unknown()])
+    nameless = replace(twice, fiducial=np.where(twice.fiducial == twice.fiducial[5], 8, twice.fiducial))
+    assert set(check_detections(nameless, rig, both).fiducial) == {-1, *range(8)} - {twice.fiducial[5]}
 
 
 def test_columns_of_different_lengths(seen):
