@@ -147,7 +147,7 @@ class Watch(arguments.Watch):
             )  # fmt: skip
             if metrics_at is not None:
                 stack.enter_context(Metrics(loop.tally, intake, hook, metrics_at))
-            logged = 0 if not restored else None if progress is None else progress.logged
+            logged = None if progress is None else progress.logged
             if not (goes_on or self.fresh or logged is None or self._is_another(progress)):
                 forget_after(folder / EVENTS, logged)  # what came after will come again
             anew = self.fresh and put_aside(folder)

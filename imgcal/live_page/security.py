@@ -8,7 +8,6 @@ commands only with the token, which no other page can read.
 from __future__ import annotations
 
 import hmac
-import http.cookies
 import ipaddress
 import re
 import socket
@@ -79,7 +78,7 @@ class Gate:
 
     def knows(self, host: str) -> bool:
         """Tell whether a Host header names this server, by a name or address that no other site can have."""
-        match = re.fullmatch(r"(\[[0-9a-f:.]+\]|[a-z0-9.-]+)(?::\d{1,5})?", host.lower())
+        match = re.fullmatch(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::\d{1,5})?", host.lower())
         if match is None:
             return False
         name = match[1].strip("[]")
@@ -104,12 +103,9 @@ class Gate:
 
     def _is_known(self, headers: Mapping[str, list[str]]) -> bool:
         given = [value.removeprefix("Bearer ") for value in headers.get("authorization", [])]
-        jar: http.cookies.SimpleCookie = http.cookies.SimpleCookie()
-        try:
-            jar.load("; ".join(headers.get("cookie", [])))
-        except http.cookies.CookieError:
-            jar.clear()
-        given += [jar[self.cookie].value] if self.cookie in jar else []
+        # Not by http.cookies: it discards them all where another server's cookie has an unusual value.
+        pairs = (pair.strip().partition("=") for value in headers.get("cookie", []) for pair in value.split(";"))
+        given += [value for name, _, value in pairs if name == self.cookie]
         return self._matches(given[:1]) or self._matches(headers.get(TOKEN_HEADER, []))
 
     def _matches(self, given: list[str]) -> bool:

@@ -5,6 +5,7 @@ Source: The C3D File Format, user guide, https://www.c3d.org: floating-point poi
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from imgcal.errors import InputError
 from imgcal.io import write_bytes
+from imgcal.watch.line_file import create_whole, write_whole
 
 BLOCK = 512  # bytes
 PARAMETERS_AT = 2  # block of the parameters, counted from 1
@@ -47,10 +49,7 @@ class C3DFile:
         self.frames, self._rate, self._scale = 0, rate, max(reach, 1.0) / 32_000
         self._path, self._points = path, len(labels)
         content = self._begin(labels)
-        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
-        self._file = os.fdopen(os.open(path, flags, 0o644), "r+b")
-        self._file.write(content)
-        self._file.flush()
+        self._file = create_whole(path, content)
 
     def _begin(self, labels: Sequence[str]) -> bytes:
         """Make the part before the frames, and note the positions of its counts."""
@@ -88,7 +87,7 @@ class C3DFile:
             self._counts, self._data_at = counts, data_at
             raise
         finally:
-            self._file = open(self._path, "r+b")  # noqa: SIM115  # open until close
+            self._file = open(self._path, "r+b", buffering=0)  # noqa: SIM115  # open until close
 
     def append(self, points: NDArray[np.float64], error: NDArray[np.float64], cameras: NDArray[np.int64]) -> None:
         """Add frames.
@@ -99,7 +98,7 @@ class C3DFile:
             cameras: (F, N) bits: which of the first seven cameras saw the point.
 
         Raises:
-            OSError: the frames cannot be written, or exceed the limit of the format.
+            OSError: the frames cannot be written, or exceed the limit of the format; the file holds the frames so far.
         """
         if self.frames + len(points) > MOST_FRAMES:
             raise OSError(f"a C3D file holds no more than {MOST_FRAMES:,} frames")
@@ -108,23 +107,23 @@ class C3DFile:
         rows = np.empty((*points.shape[:2], 4), "<f4")
         rows[..., :3] = np.where(valid[..., None], points, 0.0)
         rows[..., 3] = np.where(valid, 256 * (cameras & (2**MASKED_CAMERAS - 1)) + steps, INVALID)
-        self._file.seek((self._data_at - 1) * BLOCK + self.frames * self._points * 16)
-        self._file.write(rows.tobytes())
-        self._file.flush()  # write the frames before their count
+        self._file.seek(0, os.SEEK_END)
+        self._write(rows.tobytes())
         self.frames += len(points)
-        self._file.seek(8)
-        self._file.write(struct.pack("<H", self.frames))
-        for name in ("POINT:FRAMES", "TRIAL:ACTUAL_END_FIELD"):
-            self._file.seek(BLOCK + self._counts[name])
-            self._file.write(struct.pack("<H", self.frames))
-        self._file.flush()
+        for place in (8, *(BLOCK + self._counts[name] for name in ("POINT:FRAMES", "TRIAL:ACTUAL_END_FIELD"))):
+            self._file.seek(place)  # after the frames that it counts
+            self._write(struct.pack("<H", self.frames))
 
     def close(self) -> None:
         """Fill the last block, and close."""
         if not self._file.closed:
-            self._file.seek(0, os.SEEK_END)
-            self._file.write(b"\0" * (-self._file.tell() % BLOCK))
+            with contextlib.suppress(OSError):  # the points can be read without it
+                self._file.seek(0, os.SEEK_END)
+                self._write(b"\0" * (-self._file.tell() % BLOCK))
             self._file.close()
+
+    def _write(self, content: bytes) -> None:
+        write_whole(self._file.fileno(), content, self._path)
 
 
 def _parameters(labels: Sequence[str], rate: float, scale: float, frames: int) -> tuple[bytes, dict[str, int]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import BinaryIO
 
 LONGEST = 2**16
 """Bytes of a line, more than any event or pose needs."""
@@ -41,17 +42,47 @@ class LineFile:
         """
         if self._descriptor is None:
             raise OSError(f"{self.path}: closed")
-        size = os.fstat(self._descriptor).st_size
-        written = os.write(self._descriptor, line)
-        if written < len(line):
-            os.ftruncate(self._descriptor, size)
-            raise OSError(f"{self.path}: {written} of {len(line)} bytes could be written")
+        write_whole(self._descriptor, line, self.path)
 
     def close(self) -> None:
         """Close the file."""
         if self._descriptor is not None:
             descriptor, self._descriptor = self._descriptor, None
             os.close(descriptor)
+
+
+def write_whole(descriptor: int, content: bytes, path: Path) -> None:
+    """Write at the current position, all or nothing.
+
+    Args:
+        descriptor: of the open file.
+        content: what to write.
+        path: for the message.
+
+    Raises:
+        OSError: the file did not grow, for example because the disk is full.
+    """
+    size = os.fstat(descriptor).st_size
+    written = os.write(descriptor, content)
+    if written < len(content):
+        os.ftruncate(descriptor, size)
+        raise OSError(f"{path}: {written} of {len(content)} bytes could be written")
+
+
+def create_whole(path: Path, content: bytes) -> BinaryIO:
+    """Create a file with this content, and open it without a buffer; nothing is left where that fails.
+
+    Raises:
+        OSError: it exists, or cannot be written.
+    """
+    file = open(path, "x+b", buffering=0)  # noqa: SIM115  # the caller closes it
+    try:
+        write_whole(file.fileno(), content, path)
+    except OSError:
+        file.close()
+        path.unlink()
+        raise
+    return file
 
 
 def _cut(path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -152,7 +153,7 @@ class Watch:
         self._hook, self._page, self._told, self._problem = hook, page, told, problem
         self._poses, self._learning = poses, learning
         self._when_saved, self._source, self._rate = saved, source, rate
-        self._saved = time.monotonic()
+        self._saved = -math.inf  # the first snapshot is saved at once
         self._progress: Progress | None = None
         self._unsaved = self._hook_told = False
         self._kept: float | None = None  # s, time of the latest rig in the history
@@ -256,11 +257,11 @@ class Watch:
 
     def save(self) -> None:
         """Write the state from which the next start resumes."""
-        self._saved = time.monotonic()
         state = self.tally.latest
         unsaved = self._unsaved or bool(self._files.problems)
         if state is None or self._progress is None or not unsaved:
             return
+        self._saved = time.monotonic()
         self._report_problems()
         progress = replace(self._progress, logged=self._log.size)
         memory = self.keeper.saved(asdict(progress))

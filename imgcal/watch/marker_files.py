@@ -13,13 +13,14 @@ from imgcal.errors import InputError
 from imgcal.online import LightPoints, LightTracks
 from imgcal.types import CalibrationObject, CameraRig
 from imgcal.watch.c3d_file import MASKED_CAMERAS, C3DFile
-from imgcal.watch.poses import PoseRecord
+from imgcal.watch.poses import PoseRecord, UnwrittenError
 from imgcal.watch.trc_file import TRCFile
 
 TO_FIND_RATE = 32
 """Number of snapshots that determine the rate before anything is written."""
 NEAR_WHOLE = 5e-4  # relative: rates this close to a whole number are rounded
 WRITE_EVERY = 1.0  # s
+AT_ONCE = 1024  # frames in one write, at most
 LONGEST_GAP = 100_000  # frames
 MOST_LIGHTS = 255
 """Maximum number of columns of lights in a file; beyond that, the column unused for the longest time is reused."""
@@ -55,7 +56,7 @@ class MarkerFile:
         self._file: C3DFile | TRCFile | None = None
         self._width = 0  # number of columns in the file
         self._rate, self._latest, self._written = 0.0, 0.0, time.monotonic()
-        self._waiting: list[Frame] = []
+        self._waiting: list[Frame | None] = []  # not written yet; None = a snapshot that is missing
 
     def send(self, record: PoseRecord) -> None:
         """See `PoseSink`."""
@@ -71,26 +72,29 @@ class MarkerFile:
 
     def close(self) -> None:
         """See `PoseSink`."""
-        if self._file is None and self._first:
-            self._begin()
-        if self._file is not None:
-            try:
-                self._write()
-            finally:
+        try:
+            if self._first:
+                self._begin()
+            self._write()
+        finally:
+            if self._file is not None:
                 self._file.close()
 
     def _begin(self) -> None:
-        """Create the file, with the known rate."""
-        self._rate = usual_rate([moment for moment, _ in self._first])
-        if self._path.suffix.lower() == ".c3d":
-            self._file = C3DFile(self._path, self._labels, self._rate, self._reach)
-        else:
-            self._file = TRCFile(self._path, self._labels, self._rate)
+        """Create the file, with the known rate; if that fails, the trial begins later."""
+        first, self._first = self._first, []
+        self._rate = usual_rate([moment for moment, _ in first])
+        try:
+            if self._path.suffix.lower() == ".c3d":
+                self._file = C3DFile(self._path, self._labels, self._rate, self._reach)
+            else:
+                self._file = TRCFile(self._path, self._labels, self._rate)
+        except OSError as error:
+            raise UnwrittenError(str(error), len(first)) from error
         self._width = len(self._labels)
-        self._latest = self._first[0][0] - 1.0 / self._rate
-        for moment, frame in self._first:
+        self._latest = first[0][0] - 1.0 / self._rate
+        for moment, frame in first:
             self._add(moment, frame)
-        self._first = []
         self._write()
 
     def _add(self, moment: float, frame: Frame) -> None:
@@ -98,20 +102,30 @@ class MarkerFile:
         steps = max(round((moment - self._latest) * self._rate), 1)
         if steps > LONGEST_GAP:
             raise OSError(f"a gap of {steps:,} frames: start a new file")
-        self._waiting += [self._empty_frame()] * (steps - 1)
+        self._waiting += [None] * (steps - 1)
         self._waiting.append(frame)
         self._latest = moment
 
     def _write(self) -> None:
+        """Write what waits; what cannot be written becomes a gap before the next frame.
+
+        Raises:
+            UnwrittenError: how many snapshots were lost.
+        """
         waiting, self._waiting = self._waiting, []
         self._written = time.monotonic()
-        if waiting and self._file is not None:
-            if len(self._labels) > self._width:
-                self._file.widen(self._labels)
-                self._width = len(self._labels)
-            wide = [self._widen(frame) for frame in waiting]
-            points, error, cameras = (np.stack(part) for part in zip(*wide, strict=True))
-            self._file.append(points, error, cameras)
+        try:
+            while waiting and self._file is not None:
+                if len(self._labels) > self._width:
+                    self._file.widen(self._labels)
+                    self._width = len(self._labels)
+                wide = [self._widen(frame) for frame in waiting[:AT_ONCE]]
+                points, error, cameras = (np.stack(part) for part in zip(*wide, strict=True))
+                self._file.append(points, error, cameras)
+                del waiting[:AT_ONCE]
+        except (OSError, InputError) as problem:
+            self._latest -= len(waiting) / self._rate
+            raise UnwrittenError(str(problem), sum(frame is not None for frame in waiting)) from problem
 
     def _frame(self, record: PoseRecord) -> Frame:
         """The markers that were seen."""
@@ -144,8 +158,10 @@ class MarkerFile:
         count = len(self._labels)
         return np.full((count, 3), np.nan), np.zeros(count), np.zeros(count, dtype=np.int64)
 
-    def _widen(self, frame: Frame) -> Frame:
+    def _widen(self, frame: Frame | None) -> Frame:
         """Extend a frame to all present columns."""
+        if frame is None:
+            return self._empty_frame()
         missing = self._width - len(frame[0])
         filled = np.pad(frame[0], ((0, missing), (0, 0)), constant_values=np.nan)
         return filled, np.pad(frame[1], (0, missing)), np.pad(frame[2], (0, missing))

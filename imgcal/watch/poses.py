@@ -98,6 +98,15 @@ class PoseRecord:
         return f"+-{shift:.2g} mm, {math.degrees(turn):.2g} deg"
 
 
+class UnwrittenError(OSError):
+    """A sink has lost poses, the one that it was given and earlier ones."""
+
+    def __init__(self, message: str, count: int) -> None:
+        """Say why, and how many."""
+        super().__init__(message)
+        self.count = count
+
+
 class PoseSink(Protocol):
     """Takes poses."""
 
@@ -106,10 +115,16 @@ class PoseSink(Protocol):
 
         Raises:
             OSError: this pose cannot be taken now; the next one may.
+            UnwrittenError: the same of several poses.
         """
 
     def close(self) -> None:
-        """Close the sink."""
+        """Close the sink.
+
+        Raises:
+            OSError: it cannot be closed.
+            UnwrittenError: poses that it held cannot be written.
+        """
 
 
 class Poses:
@@ -178,10 +193,13 @@ class Poses:
             try:
                 self._sink.send(PoseRecord.of(state))
             except Exception as error:  # a bad pose must not stop the next ones
-                self.failed += 1
+                self.failed += error.count if isinstance(error, UnwrittenError) else 1
                 self._fail(f"cannot be written: {error}")
         try:
             self._sink.close()
+        except UnwrittenError as error:
+            self.failed += error.count
+            self._fail(f"cannot be written: {error}")
         except OSError as error:
             self._fail(f"cannot be closed: {error}")
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from imgcal.errors import InputError
 from imgcal.io import write_text
+from imgcal.watch.line_file import create_whole, write_whole
 
 HEADER_LINES = 6
 WIDTH = 10  # characters of the number of frames, which is overwritten
@@ -35,10 +36,7 @@ class TRCFile:
         """
         self.frames, self._rate, self._path, self._points = 0, rate, path, len(labels)
         text = self._begin(labels)
-        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
-        self._file = os.fdopen(os.open(path, flags, 0o644), "r+b")
-        self._file.write(text.encode())
-        self._file.flush()
+        self._file = create_whole(path, text.encode())
 
     def _begin(self, labels: Sequence[str]) -> str:
         """Make the lines before the frames, and note the positions of the counts."""
@@ -74,7 +72,7 @@ class TRCFile:
             self._counts = counts
             raise
         finally:
-            self._file = open(self._path, "r+b")  # noqa: SIM115  # open until close
+            self._file = open(self._path, "r+b", buffering=0)  # noqa: SIM115  # open until close
 
     @property
     def _count(self) -> str:
@@ -89,20 +87,21 @@ class TRCFile:
             cameras: (F, N) bits.
 
         Raises:
-            OSError: the frames cannot be written.
+            OSError: the frames cannot be written; the file holds the frames so far.
         """
         rows = []
         for number, frame in enumerate(points, start=self.frames):
             cells = ["" if np.isnan(value) else f"{value:.5f}" for value in frame.ravel()]
             rows.append("\t".join((str(number + 1), f"{number / self._rate:.6f}", *cells)) + "\n")
         self._file.seek(0, os.SEEK_END)
-        self._file.write("".join(rows).encode())
-        self._file.flush()  # write the rows before their count
+        self._write("".join(rows))
         self.frames += len(points)
-        for place in self._counts:
+        for place in self._counts:  # after the rows that they count
             self._file.seek(place)
-            self._file.write(self._count.encode())
-        self._file.flush()
+            self._write(self._count)
+
+    def _write(self, text: str) -> None:
+        write_whole(self._file.fileno(), text.encode(), self._path)
 
     def close(self) -> None:
         """Close the file."""

@@ -20,7 +20,7 @@ from imgcal.io import load_object, read_rig, save_detections, save_object, save_
 from imgcal.online import RigKeeper
 from imgcal.synthesis import Truth, simulate_volume, true_detections
 from imgcal.types import CalibrationObject, CameraRig, Detections, DriftRate, RigPrior
-from imgcal.watch import FirstRefusals, Progress
+from imgcal.watch import FirstRefusals, Progress, put_aside
 from tests.imgcal.streams import Stream
 from tests.imgcal.watch.test_marker_files import points_of
 
@@ -397,12 +397,23 @@ def test_fresh_leaves_nothing_to_go_on_from_even_before_it_has_learnt(blobs, tmp
         monkeypatch.setattr(sys, "stdin", nothing)
         assert watch("-", out, "--fresh") == 3
     assert not (out / "state.json").exists() and not (out / "rig.yaml").exists()
-    (put_aside,) = set(out.glob("history/*/*.yaml")) - kept
-    assert put_aside.read_bytes() == known
+    (aside,) = set(out.glob("history/*/*.yaml")) - kept
+    assert aside.read_bytes() == known
     assert [event["message"] for event in events(out)] == ["started anew from the factory calibration"]
     assert "restart: started anew from the factory calibration" in capsys.readouterr().out
     assert watch(tmp_path / "blobs.csv", out) == 0
     assert "4 snapshots" in capsys.readouterr().out  # all of them, once more
+
+
+def test_events_of_an_earlier_recording_survive_a_start_that_was_killed_before_it_saved(blobs, tmp_path):
+    save_detections(blobs.of_snapshots(0, 4), tmp_path / "blobs.csv")
+    out = tmp_path / "out"
+    for more in ((), ("--fresh",)):
+        assert watch(tmp_path / "blobs.csv", out, *more) == 0
+    known = events(out)
+    put_aside(out)  # all that the killed start did
+    assert watch(tmp_path / "blobs.csv", out) == 0
+    assert len(known) == 1 and events(out) == known
 
 
 def test_an_address_of_qtm_is_no_address_of_zeromq(tmp_path, capsys):

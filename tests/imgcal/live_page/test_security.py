@@ -43,6 +43,12 @@ def test_elsewhere_only_plain_addresses_and_own_names_are_known():
     assert not REMOTE.knows("evil.example:8765")
 
 
+def test_a_machine_whose_name_has_an_underscore_knows_the_address_that_it_prints(monkeypatch):
+    monkeypatch.setattr("socket.gethostname", lambda: "lab_pc")
+    host = REMOTE.address.url().removeprefix("http://").rstrip("/")
+    assert host == "lab_pc:8765" and REMOTE.knows(host)
+
+
 @pytest.mark.parametrize(
     "origin", ["http://evil.example", "null", "http://127.0.0.1:3000", "https://127.0.0.1:8765", ""]
 )
@@ -79,6 +85,13 @@ def test_from_elsewhere_everything_needs_the_token():
     assert refused(REMOTE, "POST", "/command", cookie=f"imgcal-8765={TOKEN}") == 403
     assert REMOTE.token_of_query(f"token={TOKEN}") and not REMOTE.token_of_query("token=" + "&token=" * 9)
     assert not REMOTE.token_of_query(f"token={TOKEN}&token={TOKEN}")
+
+
+@pytest.mark.parametrize("other", ['prefs={"a":1}', "seen", "a b=c", "=", '"', "imgcal-9000=wrong"])
+def test_cookies_of_other_ports_do_not_hide_the_token(other):
+    for cookies in (f"{other}; imgcal-8765={TOKEN}", f"imgcal-8765={TOKEN}; {other}", f"{other};imgcal-8765={TOKEN}"):
+        assert refused(REMOTE, cookie=cookies) is None
+    assert refused(REMOTE, cookie=other) == 401
 
 
 def test_tokens_are_compared_in_constant_time(monkeypatch):

@@ -85,6 +85,13 @@ def test_the_state_is_saved_once_a_second_with_how_far_the_source_is(tmp_path, m
     assert Progress.load(tmp_path) == Progress(0.9, logged=(tmp_path / "events.jsonl").stat().st_size)
 
 
+def test_the_first_snapshot_is_saved_at_once(tmp_path):
+    keeper = KeeperOfStates()
+    with Watch(keeper, tmp_path) as loop, SourceReader(Snapshots(0.0, 0.1, 0.2), RIG) as intake:
+        loop.run(intake, threading.Event())
+        assert keeper.saves == [1]
+
+
 def test_a_start_goes_on_after_the_last_snapshot_that_the_state_knows(tmp_path):
     keeper, saved = KeeperOfStates(), []
     with Watch(keeper, tmp_path, saved=saved.append) as loop:

@@ -1,3 +1,6 @@
+import resource
+import signal
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -6,8 +9,9 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.online import ObjectPose
-from imgcal.watch import MarkerFile
+from imgcal.watch import MarkerFile, marker_files
 from imgcal.watch.marker_files import TO_FIND_RATE, marker_labels, usual_rate
+from imgcal.watch.poses import UnwrittenError
 from tests.imgcal.watch.states import OBJECT, RIG
 from tests.imgcal.watch.test_poses import record
 from tests.imgcal.watch.test_trc_file import rows_of
@@ -53,6 +57,68 @@ def test_fiducials_stand_where_the_object_was_at_even_times(tmp_path, suffix, co
         assert np.isnan(frame[number % 8]).all()
         rest = np.arange(8) != number % 8
         assert np.allclose(frame[rest], truth[rest], atol=1e-3)
+
+
+@contextmanager
+def full_disk(more):
+    """No file can grow beyond `more` bytes."""
+    limits, before = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (more, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, before)
+
+
+@pytest.mark.parametrize("suffix", [".c3d", ".trc"])
+def test_frames_that_a_full_disk_did_not_take_are_empty_and_counted(tmp_path, suffix, monkeypatch):
+    path = tmp_path / f"trial{suffix}"
+    sink, first, lost = MarkerFile(path, RIG, OBJECT), TO_FIND_RATE, 0
+    for number in range(first):
+        sink.send(seen_record(number))
+    monkeypatch.setattr(marker_files, "WRITE_EVERY", 0.0)
+    with full_disk(path.stat().st_size + 50):
+        for number in range(first, first + 10):
+            with pytest.raises(UnwrittenError) as refused:
+                sink.send(seen_record(number))
+            lost += refused.value.count
+        assert len(points_of(path)[1]) == first  # at any moment
+    for number in range(first + 10, first + 20):
+        sink.send(seen_record(number))
+    sink.close()
+    _, points = points_of(path)
+    assert lost == 10 and len(points) == first + 20
+    for number, frame in enumerate(points):
+        assert np.isnan(frame).all() if first <= number < first + 10 else not np.isnan(frame).any()
+        if number not in range(first, first + 10):
+            truth = seen_record(number).pose.points_rig()[0].numpy()
+            assert np.allclose(frame, truth, atol=1e-3)
+
+
+@pytest.mark.parametrize("suffix", [".c3d", ".trc"])
+def test_a_trial_begins_once_its_file_can_be_created(tmp_path, suffix):
+    path = tmp_path / f"trial{suffix}"
+    sink = MarkerFile(path, RIG, OBJECT)
+    for number in range(TO_FIND_RATE - 1):
+        sink.send(seen_record(number))
+    with full_disk(20), pytest.raises(UnwrittenError) as refused:
+        sink.send(seen_record(TO_FIND_RATE))
+    assert refused.value.count == TO_FIND_RATE and not path.exists()
+    for number in range(TO_FIND_RATE, 2 * TO_FIND_RATE):
+        sink.send(seen_record(number))
+    sink.close()
+    assert len(points_of(path)[1]) == TO_FIND_RATE
+
+
+@pytest.mark.parametrize("suffix", [".c3d", ".trc"])
+def test_what_cannot_be_written_at_the_end_is_counted(tmp_path, suffix):
+    sink = MarkerFile(tmp_path / f"trial{suffix}", RIG, OBJECT)
+    for number in range(5):
+        sink.send(seen_record(number))
+    with full_disk(1300 if suffix == ".c3d" else 500), pytest.raises(UnwrittenError) as refused:
+        sink.close()
+    assert refused.value.count == 5
 
 
 def test_the_residual_is_the_error_that_a_point_is_expected_to_have(tmp_path):

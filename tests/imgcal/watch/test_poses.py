@@ -8,7 +8,7 @@ import torch
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.online import ObjectPose
 from imgcal.watch import PoseRecord, Poses
-from imgcal.watch.poses import COLUMNS
+from imgcal.watch.poses import COLUMNS, UnwrittenError
 from tests.imgcal.watch.states import some_state
 
 TURN = torch.tensor([0.1, -0.2, 0.3], dtype=torch.float64)
@@ -68,6 +68,19 @@ def test_what_a_sink_cannot_take_is_counted_and_the_next_pose_is_sent():
             poses.publish(replace(some_state(), snapshot=number))
     assert [one.snapshot for one in sink.records] == [0, 2, 3] and sink.closed
     assert (poses.failed, poses.dropped, poses.problem) == (1, 0, "poses.csv: cannot be written: no space left")
+
+
+def test_poses_that_a_sink_held_and_lost_are_counted():
+    class Holding(Sink):
+        def send(self, given):
+            raise UnwrittenError("no space left", 3)
+
+        def close(self):
+            raise UnwrittenError("no space left", 2)
+
+    with Poses("trial.trc", Holding()) as poses:
+        poses.publish(some_state())
+    assert (poses.failed, poses.problem) == (5, "trial.trc: cannot be written: no space left")
 
 
 def test_a_sink_that_hangs_holds_up_nobody():
