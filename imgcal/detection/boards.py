@@ -28,8 +28,10 @@ Ints = NDArray[np.int64]
 NEIGHBOURS = 9
 """Points of a neighbourhood, including the point itself, to which a homography is fitted."""
 LEAST_POINTS = 4
-UNKNOWN_SIGMA = 0.2  # px, where there are too few corners for a comparison
+UNKNOWN_SIGMA = 0.2  # px, where too few corners, or only those of a line, can be compared
 LEAST_SIGMA, MOST_SIGMA = 0.02, 2.0  # px
+LEAST_DETERMINED = 1e-6
+"""Smallest singular value of a homography's equations, relative to the largest; less is rounding."""
 OFF_LAYOUT = 0.3
 """Tolerance in units of the distance between neighbouring points: a corner farther off is another one."""
 LEAST_ON_LAYOUT = 0.7
@@ -88,6 +90,9 @@ def corner_sigma(xy: Floats, uv: Floats) -> float:
         return UNKNOWN_SIGMA
     apart = np.linalg.norm(xy[:, None] - xy[None], axis=-1)
     near = np.argsort(apart, axis=1, kind="stable")[:, :count]
+    near = near[_determines_homography(xy[near])]
+    if not len(near):
+        return UNKNOWN_SIGMA
     left = _homography_residuals(xy[near], uv[near])
     variance = np.square(left).sum((1, 2)) / (2 * count - 8)
     # The median of chi-squared over its degrees of freedom is less than one.
@@ -96,20 +101,36 @@ def corner_sigma(xy: Floats, uv: Floats) -> float:
     return float(np.clip(np.sqrt(np.median(variance) / usual), LEAST_SIGMA, MOST_SIGMA))
 
 
+def _determines_homography(xy: Floats) -> NDArray[np.bool_]:
+    """Tell which sets of points (K, M, 2) determine a homography: (K,). Those on one line but for one do not."""
+    source, _ = _normalize(xy)
+    size = np.linalg.svd(_homography_equations(source, source), compute_uv=False)
+    return np.asarray(size[:, 7] > LEAST_DETERMINED * size[:, 0])
+
+
 def _homography_residuals(xy: Floats, uv: Floats) -> Floats:
     """Residuals of homographies (least squares, direct linear): (K, M, 2) and (K, M, 2) -> (K, M, 2) pixels."""
-    source = xy - xy.mean(1, keepdims=True)
-    source = source / np.sqrt(np.square(source).mean((1, 2), keepdims=True))
-    middle = uv.mean(1, keepdims=True)
-    scale = np.sqrt(np.square(uv - middle).mean((1, 2), keepdims=True)) + 1e-12
-    target = (uv - middle) / scale
+    source, _ = _normalize(xy)
+    target, scale = _normalize(uv)
+    matrix = np.linalg.svd(_homography_equations(source, target))[2][:, -1].reshape(-1, 3, 3)
+    mapped = np.concatenate((source, np.ones_like(source[..., :1])), -1) @ matrix.transpose(0, 2, 1)
+    return (mapped[..., :2] / mapped[..., 2:] - target) * scale
+
+
+def _normalize(points: Floats) -> tuple[Floats, Floats]:
+    """Centre sets of points (K, M, 2), and divide each by its size (K, 1, 1), which is returned, too."""
+    centred = points - points.mean(1, keepdims=True)
+    size = np.sqrt(np.square(centred).mean((1, 2), keepdims=True)) + 1e-12
+    return centred / size, size
+
+
+def _homography_equations(source: Floats, target: Floats) -> Floats:
+    """Linear equations (K, 2 M, 9) for homographies from points (K, M, 2) to others (K, M, 2)."""
     rows = np.concatenate((source, np.ones_like(source[..., :1])), -1)
     zero = np.zeros_like(rows)
     upper = np.concatenate((rows, zero, -target[..., :1] * rows), -1)
     lower = np.concatenate((zero, rows, -target[..., 1:] * rows), -1)
-    matrix = np.linalg.svd(np.concatenate((upper, lower), 1))[2][:, -1].reshape(-1, 3, 3)
-    mapped = rows @ matrix.transpose(0, 2, 1)
-    return (mapped[..., :2] / mapped[..., 2:] - target) * scale
+    return np.concatenate((upper, lower), 1)
 
 
 def _eight_bits(frame: Frame, board: Board) -> NDArray[np.uint8]:

@@ -8,7 +8,7 @@ import torch
 
 import imgcal
 from imgcal.detection import DetectionOptions, detect_snapshot
-from imgcal.detection.boards import corner_sigma
+from imgcal.detection.boards import UNKNOWN_SIGMA, corner_sigma
 from imgcal.errors import InputError
 from imgcal.synthesis import render_board, simulate_board
 from imgcal.types import CalibrationObject
@@ -49,6 +49,25 @@ def test_sigma_is_the_scatter_of_the_corners():
     uv = 100 * (xy @ [[0.9, 0.2], [-0.1, 0.8]]) / depth[:, None]
     found = [corner_sigma(xy, uv + 0.3 * random.standard_normal(uv.shape)) for _ in range(20)]
     assert np.mean(found) == pytest.approx(0.3, rel=0.15)
+
+
+@pytest.mark.parametrize("count", [6, 9, 14])
+@pytest.mark.parametrize("beside", [0, 1])
+def test_corners_on_one_line_do_not_tell_their_sigma(count, beside):
+    random = np.random.default_rng(count)
+    xy = 40.0 * np.concatenate((np.column_stack((np.zeros(count), np.arange(count))), np.ones((beside, 2))))
+    for noise in (0.0, 0.2):
+        uv = 100 + xy @ [[0.9, 0.2], [-0.1, 0.8]] + noise * random.standard_normal(xy.shape)
+        assert corner_sigma(xy, uv) == UNKNOWN_SIGMA
+
+
+def test_a_long_line_of_corners_beside_a_grid_does_not_change_its_sigma():
+    random = np.random.default_rng(4)
+    grid = np.stack(np.meshgrid(np.arange(4.0), np.arange(3.0)), -1).reshape(-1, 2)
+    xy = np.concatenate((grid, np.column_stack((np.zeros(30), 3.0 + np.arange(30)))))
+    uv = 30 * xy @ [[0.9, 0.2], [-0.1, 0.8]]
+    found = [corner_sigma(xy, uv + 0.1 * random.standard_normal(uv.shape)) for _ in range(20)]
+    assert np.mean(found) == pytest.approx(0.1, rel=0.2)
 
 
 @pytest.mark.parametrize(
