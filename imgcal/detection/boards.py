@@ -30,12 +30,19 @@ NEIGHBOURS = 9
 LEAST_POINTS = 4
 UNKNOWN_SIGMA = 0.2  # px, where too few corners, or only those of a line, can be compared
 LEAST_SIGMA, MOST_SIGMA = 0.02, 2.0  # px
+MANY_SIGMAS = 3.0
+"""Distance from its neighbours' homography, in sigmas, beyond which a corner is less certain than they are."""
 LEAST_DETERMINED = 1e-6
 """Smallest singular value of a homography's equations, relative to the largest; less is rounding."""
 OFF_LAYOUT = 0.3
 """Tolerance in units of the distance between neighbouring points: a corner farther off is another one."""
 LEAST_ON_LAYOUT = 0.7
 """Smallest share of the markers that must agree with the layout."""
+WINDOW = 0.8
+"""Half the side of the window in which a corner is refined, in units of the gap between the corner and its markers."""
+LEAST_WINDOW = 2  # px
+REFINED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-4)
+"""When the refinement of a corner ends: steps, px."""
 CONTRAST = 0.25
 """Contrast relative to that inside the board, from which the pattern continues beyond the grid's edge."""
 ALTERNATING = 0.8
@@ -61,7 +68,7 @@ def find_board(frame: Frame, board: Board) -> Blobs:
     if seen is None or len(seen.uv) < LEAST_POINTS:
         seen = _Seen(np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
     count = len(seen.uv)
-    sigma = np.full(count, corner_sigma(board.points[seen.fiducial, :2], seen.uv)) if count else np.zeros(0)
+    sigma = corner_sigma(board.points[seen.fiducial, :2], seen.uv)
     flags = np.full(count, int(BlobFlag.NONE), dtype=np.uint8)
     camera, radius = np.zeros(count, dtype=np.int64), np.full(count, np.nan)
     return Blobs(seen.uv, sigma, radius, flags, camera, np.ones(count), seen.fiducial)
@@ -78,27 +85,34 @@ def require_board(blobs: Sequence[Blobs], frames: Iterable[Frame], board: Board)
         raise InputError(f"frames: found no {board}" + (f": {why}" if why else ""))
 
 
-def corner_sigma(xy: Floats, uv: Floats) -> float:
-    """Standard deviation (px, each axis) of corners, from the residuals of homographies of their neighbourhoods.
+def corner_sigma(xy: Floats, uv: Floats) -> Floats:
+    """Standard deviation (K,) px, each axis, of corners, from the residuals of homographies of their neighbourhoods.
+
+    It is the same for all, except for corners that are off by many times that from the homography of their neighbours.
 
     Args:
         xy: (K, 2) positions on the board.
         uv: (K, 2) pixels.
     """
+    sigma = np.full(len(xy), UNKNOWN_SIGMA)
     count = min(NEIGHBOURS, len(xy))
     if count < 6:
-        return UNKNOWN_SIGMA
+        return sigma
     apart = np.linalg.norm(xy[:, None] - xy[None], axis=-1)
     near = np.argsort(apart, axis=1, kind="stable")[:, :count]
     near = near[_determines_homography(xy[near])]
     if not len(near):
-        return UNKNOWN_SIGMA
+        return sigma
     left = _homography_residuals(xy[near], uv[near])
-    variance = np.square(left).sum((1, 2)) / (2 * count - 8)
-    # The median of chi-squared over its degrees of freedom is less than one.
     freedom = 2 * count - 8
+    variance = np.square(left).sum((1, 2)) / freedom
+    # The median of chi-squared over its degrees of freedom is less than one.
     usual = (1 - 2 / (9 * freedom)) ** 3
-    return float(np.clip(np.sqrt(np.median(variance) / usual), LEAST_SIGMA, MOST_SIGMA))
+    sigma[:] = np.clip(np.sqrt(np.median(variance) / usual), LEAST_SIGMA, MOST_SIGMA)
+    # A fit takes its share of the residuals.
+    own = np.linalg.norm(left[:, 0], axis=1) * np.sqrt(2 * count / freedom)
+    sigma[near[:, 0]] = np.maximum(sigma[near[:, 0]], own / MANY_SIGMAS)
+    return sigma
 
 
 def _determines_homography(xy: Floats) -> NDArray[np.bool_]:
@@ -195,7 +209,23 @@ def _charuco(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
     layout = {int(k): np.asarray(p)[:, :2] for k, p in zip(made.getIds().ravel(), made.getObjPoints(), strict=True)}
     if not _matches_layout(marker_corners, marker_ids, layout, board.marker):
         return None
-    return _Seen(np.asarray(corners, dtype=np.float64).reshape(-1, 2), np.asarray(ids).ravel().astype(np.int64))
+    markers = np.asarray(marker_corners, dtype=np.float64).reshape(-1, 4, 2)
+    uv = _refine_saddles(grey, np.asarray(corners, dtype=np.float64).reshape(-1, 2), markers, board)
+    return _Seen(uv, np.asarray(ids).ravel().astype(np.int64))
+
+
+def _refine_saddles(grey: NDArray[np.uint8], uv: Floats, markers: Floats, board: Board) -> Floats:
+    """Refine inner corners (K, 2) of a ChArUco board, in windows that the nearest marker of (M, 4, 2) does not reach.
+
+    OpenCV's own windows contain corners of markers, and it stops within a tenth of a pixel.
+    """
+    nearest = np.linalg.norm(uv[:, None, None] - markers, axis=-1).min(2).argmin(1)
+    side = np.linalg.norm(markers - np.roll(markers, 1, axis=1), axis=-1).min(1)[nearest]
+    gap = side * (board.pitch - board.marker) / (2 * board.marker)
+    refined = uv.astype(np.float32).reshape(-1, 1, 1, 2)
+    for corner, half in zip(refined, np.maximum(LEAST_WINDOW, np.ceil(WINDOW * gap)).astype(int).tolist(), strict=True):
+        cv2.cornerSubPix(grey, corner, (half, half), (-1, -1), REFINED)
+    return refined.reshape(-1, 2).astype(np.float64)
 
 
 def _matches_layout(corners: Any, ids: Any, layout: dict[int, Any], size: float) -> bool:

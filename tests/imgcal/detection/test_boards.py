@@ -42,13 +42,34 @@ def test_finds_every_point_of_a_board_where_it_is(kind, inverted):
     assert np.abs(np.median(error, axis=0)).max() < 0.15  # no shift by half a pixel
 
 
+@pytest.mark.parametrize("seed", [2, 4, 10])
+def test_corners_between_markers_are_as_good_as_their_sigma(seed):
+    obj, rig = imgcal.load_object("charuco"), imgcal.load_rig("T4").select([0])
+    truth, frames = seen(obj, rig, seed)
+    found = detect_snapshot(frames, DetectionOptions(), board=obj.board)
+    error = found.uv - truth.uv[0, 0].numpy()[found.fiducial]
+    assert len(error) == obj.num_fiducials and np.abs(error).max() < 0.12
+    assert (np.linalg.norm(error, axis=1) < 5 * found.sigma).all()
+
+
 def test_sigma_is_the_scatter_of_the_corners():
     random = np.random.default_rng(0)
     xy = np.stack(np.meshgrid(np.arange(8.0), np.arange(6.0)), -1).reshape(-1, 2)
     depth = 1 + xy @ [0.02, 0.01]
     uv = 100 * (xy @ [[0.9, 0.2], [-0.1, 0.8]]) / depth[:, None]
-    found = [corner_sigma(xy, uv + 0.3 * random.standard_normal(uv.shape)) for _ in range(20)]
+    found = [np.median(corner_sigma(xy, uv + 0.3 * random.standard_normal(uv.shape))) for _ in range(20)]
     assert np.mean(found) == pytest.approx(0.3, rel=0.15)
+
+
+@pytest.mark.parametrize("wrong", [0, 3, 27])  # at a corner of the board, at its edge, inside
+def test_a_corner_off_its_neighbours_is_less_certain_than_they_are(wrong):
+    random = np.random.default_rng(wrong)
+    xy = np.stack(np.meshgrid(np.arange(8.0), np.arange(6.0)), -1).reshape(-1, 2)
+    uv = 40 * xy @ [[0.9, 0.2], [-0.1, 0.8]] + 0.04 * random.standard_normal(xy.shape)
+    uv[wrong] += [0.6, -0.5]
+    sigma = corner_sigma(xy, uv)
+    assert sigma[wrong] > 0.1 and sigma.argmax() == wrong
+    assert np.median(sigma) == pytest.approx(0.04, rel=0.5)
 
 
 @pytest.mark.parametrize("count", [6, 9, 14])
@@ -58,7 +79,7 @@ def test_corners_on_one_line_do_not_tell_their_sigma(count, beside):
     xy = 40.0 * np.concatenate((np.column_stack((np.zeros(count), np.arange(count))), np.ones((beside, 2))))
     for noise in (0.0, 0.2):
         uv = 100 + xy @ [[0.9, 0.2], [-0.1, 0.8]] + noise * random.standard_normal(xy.shape)
-        assert corner_sigma(xy, uv) == UNKNOWN_SIGMA
+        assert (corner_sigma(xy, uv) == UNKNOWN_SIGMA).all()
 
 
 def test_a_long_line_of_corners_beside_a_grid_does_not_change_its_sigma():
@@ -66,7 +87,7 @@ def test_a_long_line_of_corners_beside_a_grid_does_not_change_its_sigma():
     grid = np.stack(np.meshgrid(np.arange(4.0), np.arange(3.0)), -1).reshape(-1, 2)
     xy = np.concatenate((grid, np.column_stack((np.zeros(30), 3.0 + np.arange(30)))))
     uv = 30 * xy @ [[0.9, 0.2], [-0.1, 0.8]]
-    found = [corner_sigma(xy, uv + 0.1 * random.standard_normal(uv.shape)) for _ in range(20)]
+    found = [np.median(corner_sigma(xy, uv + 0.1 * random.standard_normal(uv.shape))) for _ in range(20)]
     assert np.mean(found) == pytest.approx(0.1, rel=0.2)
 
 
