@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from imgcal.detection.centroids import Blobs
 from imgcal.detection.checks import Frame
@@ -43,6 +44,17 @@ WINDOW = 0.8
 LEAST_WINDOW = 2  # px
 REFINED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-4)
 """When the refinement of a corner ends: steps, px."""
+SIDE = 40.0
+"""Longest part of a tag's side, px, from which its end is found: over more, lenses bend it."""
+SIDE_SAMPLES, PROFILE_SAMPLES = 24, 17
+"""Profiles across this part of a side, and grey values of each."""
+END = 0.08
+"""Share of this part, at both of its ends, where corners are too near."""
+MOST_REACH = 3.0  # px, of a profile to both sides of an edge
+REACH = 0.5
+"""The same, in units of the black border's or the white gap's width."""
+ROUNDS = 4
+"""Rounds in which the corners of tags are refined."""
 CONTRAST = 0.25
 """Contrast relative to that inside the board, from which the pattern continues beyond the grid's edge."""
 ALTERNATING = 0.8
@@ -178,8 +190,6 @@ def dictionaries() -> list[str]:
 def _parameters(board: Board) -> Any:
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = board.border
-    if board.kind == "aprilgrid":
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     return parameters
 
 
@@ -261,8 +271,36 @@ def _april_grid(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
         turned = np.roll(corners, turn, axis=1)
         if len(number) > 1 and _matches_layout(turned, number, layout, board.marker):
             fiducial = (4 * number[:, None] + np.arange(4)).ravel()
-            return _Seen(turned.reshape(-1, 2), fiducial)
+            return _Seen(_intersect_sides(grey, turned, board).reshape(-1, 2), fiducial)
     return None
+
+
+def _intersect_sides(grey: NDArray[np.uint8], corners: Floats, board: Board) -> Floats:
+    """Refine corners (K, 4, 2) of tags, clockwise: where lines meet that are fitted to both sides next to a corner.
+
+    Blur rounds corners that stand alone, and moves them inward; it leaves edges where they are. An edge is at the mean
+    place of the grey value's slope along a profile across it.
+    """
+    bits = _dictionary(board.dictionary).markerSize + 2 * board.border
+    margin = min(board.border / bits, board.pitch / board.marker - 1)  # of a side: black within it, white around it
+    shortest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).min(1)
+    reach = np.clip(REACH * margin * shortest, 1, MOST_REACH)[:, None, None, None]
+    share = np.linspace(END, 1 - END, SIDE_SAMPLES)
+    at_corner = np.linalg.pinv(np.vander(share, 2))[1]  # extrapolates a line to the corner
+    across = reach[..., None] * np.linspace(-1, 1, PROFILE_SAMPLES)
+    for _ in range(ROUNDS):
+        side = np.stack((np.roll(corners, -1, axis=1), np.roll(corners, 1, axis=1)), 2) - corners[:, :, None]
+        length = np.linalg.norm(side, axis=-1, keepdims=True)  # (K, 4, 2, 1): to the next corner, to the previous one
+        along = side / length
+        outward = np.stack((along[..., 1], -along[..., 0]), -1) * np.array([[1.0], [-1.0]])
+        edge = corners[:, :, None, None] + share[:, None] * (np.minimum(length, SIDE) * along)[..., None, :]
+        place = edge[..., None, :] + across[..., None] * outward[..., None, None, :]
+        value = map_coordinates(grey, [place[..., 1], place[..., 0]], np.float64, order=1, mode="nearest")
+        step, ends = value[..., -1] - value[..., 0], value[..., -1] + value[..., 0]
+        mean = (value.sum(-1) - ends / 2) / (PROFILE_SAMPLES - 1)
+        offset = reach * np.clip((ends - 2 * mean) / np.maximum(step, 1), -1, 1)
+        corners = corners + np.linalg.solve(outward, (offset @ at_corner)[..., None])[..., 0]
+    return corners
 
 
 def _markers(grey: NDArray[np.uint8], board: Board) -> tuple[Floats, Ints]:
