@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from imgcal.detection.centroids import Blobs
 from imgcal.detection.checks import Frame
@@ -28,12 +29,32 @@ Ints = NDArray[np.int64]
 NEIGHBOURS = 9
 """Points of a neighbourhood, including the point itself, to which a homography is fitted."""
 LEAST_POINTS = 4
-UNKNOWN_SIGMA = 0.2  # px, where there are too few corners for a comparison
+UNKNOWN_SIGMA = 0.2  # px, where too few corners, or only those of a line, can be compared
 LEAST_SIGMA, MOST_SIGMA = 0.02, 2.0  # px
+MANY_SIGMAS = 3.0
+"""Distance from its neighbours' homography, in sigmas, beyond which a corner is less certain than they are."""
+LEAST_DETERMINED = 1e-6
+"""Smallest singular value of a homography's equations, relative to the largest; less is rounding."""
 OFF_LAYOUT = 0.3
 """Tolerance in units of the distance between neighbouring points: a corner farther off is another one."""
 LEAST_ON_LAYOUT = 0.7
 """Smallest share of the markers that must agree with the layout."""
+WINDOW = 0.8
+"""Half the side of the window in which a corner is refined, in units of the gap between the corner and its markers."""
+LEAST_WINDOW = 2  # px
+REFINED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-4)
+"""When the refinement of a corner ends: steps, px."""
+SIDE = 40.0
+"""Longest part of a tag's side, px, from which its end is found: over more, lenses bend it."""
+SIDE_SAMPLES, PROFILE_SAMPLES = 24, 17
+"""Profiles across this part of a side, and grey values of each."""
+END = 0.08
+"""Share of this part, at both of its ends, where corners are too near."""
+MOST_REACH = 3.0  # px, of a profile to both sides of an edge
+REACH = 0.5
+"""The same, in units of the black border's or the white gap's width."""
+ROUNDS = 4
+"""Rounds in which the corners of tags are refined."""
 CONTRAST = 0.25
 """Contrast relative to that inside the board, from which the pattern continues beyond the grid's edge."""
 ALTERNATING = 0.8
@@ -59,7 +80,7 @@ def find_board(frame: Frame, board: Board) -> Blobs:
     if seen is None or len(seen.uv) < LEAST_POINTS:
         seen = _Seen(np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
     count = len(seen.uv)
-    sigma = np.full(count, corner_sigma(board.points[seen.fiducial, :2], seen.uv)) if count else np.zeros(0)
+    sigma = corner_sigma(board.points[seen.fiducial, :2], seen.uv)
     flags = np.full(count, int(BlobFlag.NONE), dtype=np.uint8)
     camera, radius = np.zeros(count, dtype=np.int64), np.full(count, np.nan)
     return Blobs(seen.uv, sigma, radius, flags, camera, np.ones(count), seen.fiducial)
@@ -76,40 +97,66 @@ def require_board(blobs: Sequence[Blobs], frames: Iterable[Frame], board: Board)
         raise InputError(f"frames: found no {board}" + (f": {why}" if why else ""))
 
 
-def corner_sigma(xy: Floats, uv: Floats) -> float:
-    """Standard deviation (px, each axis) of corners, from the residuals of homographies of their neighbourhoods.
+def corner_sigma(xy: Floats, uv: Floats) -> Floats:
+    """Standard deviation (K,) px, each axis, of corners, from the residuals of homographies of their neighbourhoods.
+
+    It is the same for all, except for corners that are off by many times that from the homography of their neighbours.
 
     Args:
         xy: (K, 2) positions on the board.
         uv: (K, 2) pixels.
     """
+    sigma = np.full(len(xy), UNKNOWN_SIGMA)
     count = min(NEIGHBOURS, len(xy))
     if count < 6:
-        return UNKNOWN_SIGMA
+        return sigma
     apart = np.linalg.norm(xy[:, None] - xy[None], axis=-1)
     near = np.argsort(apart, axis=1, kind="stable")[:, :count]
+    near = near[_determines_homography(xy[near])]
+    if not len(near):
+        return sigma
     left = _homography_residuals(xy[near], uv[near])
-    variance = np.square(left).sum((1, 2)) / (2 * count - 8)
-    # The median of chi-squared over its degrees of freedom is less than one.
     freedom = 2 * count - 8
+    variance = np.square(left).sum((1, 2)) / freedom
+    # The median of chi-squared over its degrees of freedom is less than one.
     usual = (1 - 2 / (9 * freedom)) ** 3
-    return float(np.clip(np.sqrt(np.median(variance) / usual), LEAST_SIGMA, MOST_SIGMA))
+    sigma[:] = np.clip(np.sqrt(np.median(variance) / usual), LEAST_SIGMA, MOST_SIGMA)
+    # A fit takes its share of the residuals.
+    own = np.linalg.norm(left[:, 0], axis=1) * np.sqrt(2 * count / freedom)
+    sigma[near[:, 0]] = np.maximum(sigma[near[:, 0]], own / MANY_SIGMAS)
+    return sigma
+
+
+def _determines_homography(xy: Floats) -> NDArray[np.bool_]:
+    """Tell which sets of points (K, M, 2) determine a homography: (K,). Those on one line but for one do not."""
+    source, _ = _normalize(xy)
+    size = np.linalg.svd(_homography_equations(source, source), compute_uv=False)
+    return np.asarray(size[:, 7] > LEAST_DETERMINED * size[:, 0])
 
 
 def _homography_residuals(xy: Floats, uv: Floats) -> Floats:
     """Residuals of homographies (least squares, direct linear): (K, M, 2) and (K, M, 2) -> (K, M, 2) pixels."""
-    source = xy - xy.mean(1, keepdims=True)
-    source = source / np.sqrt(np.square(source).mean((1, 2), keepdims=True))
-    middle = uv.mean(1, keepdims=True)
-    scale = np.sqrt(np.square(uv - middle).mean((1, 2), keepdims=True)) + 1e-12
-    target = (uv - middle) / scale
+    source, _ = _normalize(xy)
+    target, scale = _normalize(uv)
+    matrix = np.linalg.svd(_homography_equations(source, target))[2][:, -1].reshape(-1, 3, 3)
+    mapped = np.concatenate((source, np.ones_like(source[..., :1])), -1) @ matrix.transpose(0, 2, 1)
+    return (mapped[..., :2] / mapped[..., 2:] - target) * scale
+
+
+def _normalize(points: Floats) -> tuple[Floats, Floats]:
+    """Centre sets of points (K, M, 2), and divide each by its size (K, 1, 1), which is returned, too."""
+    centred = points - points.mean(1, keepdims=True)
+    size = np.sqrt(np.square(centred).mean((1, 2), keepdims=True)) + 1e-12
+    return centred / size, size
+
+
+def _homography_equations(source: Floats, target: Floats) -> Floats:
+    """Linear equations (K, 2 M, 9) for homographies from points (K, M, 2) to others (K, M, 2)."""
     rows = np.concatenate((source, np.ones_like(source[..., :1])), -1)
     zero = np.zeros_like(rows)
     upper = np.concatenate((rows, zero, -target[..., :1] * rows), -1)
     lower = np.concatenate((zero, rows, -target[..., 1:] * rows), -1)
-    matrix = np.linalg.svd(np.concatenate((upper, lower), 1))[2][:, -1].reshape(-1, 3, 3)
-    mapped = rows @ matrix.transpose(0, 2, 1)
-    return (mapped[..., :2] / mapped[..., 2:] - target) * scale
+    return np.concatenate((upper, lower), 1)
 
 
 def _eight_bits(frame: Frame, board: Board) -> NDArray[np.uint8]:
@@ -143,8 +190,6 @@ def dictionaries() -> list[str]:
 def _parameters(board: Board) -> Any:
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = board.border
-    if board.kind == "aprilgrid":
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     return parameters
 
 
@@ -174,7 +219,23 @@ def _charuco(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
     layout = {int(k): np.asarray(p)[:, :2] for k, p in zip(made.getIds().ravel(), made.getObjPoints(), strict=True)}
     if not _matches_layout(marker_corners, marker_ids, layout, board.marker):
         return None
-    return _Seen(np.asarray(corners, dtype=np.float64).reshape(-1, 2), np.asarray(ids).ravel().astype(np.int64))
+    markers = np.asarray(marker_corners, dtype=np.float64).reshape(-1, 4, 2)
+    uv = _refine_saddles(grey, np.asarray(corners, dtype=np.float64).reshape(-1, 2), markers, board)
+    return _Seen(uv, np.asarray(ids).ravel().astype(np.int64))
+
+
+def _refine_saddles(grey: NDArray[np.uint8], uv: Floats, markers: Floats, board: Board) -> Floats:
+    """Refine inner corners (K, 2) of a ChArUco board, in windows that the nearest marker of (M, 4, 2) does not reach.
+
+    OpenCV's own windows contain corners of markers, and it stops within a tenth of a pixel.
+    """
+    nearest = np.linalg.norm(uv[:, None, None] - markers, axis=-1).min(2).argmin(1)
+    side = np.linalg.norm(markers - np.roll(markers, 1, axis=1), axis=-1).min(1)[nearest]
+    gap = side * (board.pitch - board.marker) / (2 * board.marker)
+    refined = uv.astype(np.float32).reshape(-1, 1, 1, 2)
+    for corner, half in zip(refined, np.maximum(LEAST_WINDOW, np.ceil(WINDOW * gap)).astype(int).tolist(), strict=True):
+        cv2.cornerSubPix(grey, corner, (half, half), (-1, -1), REFINED)
+    return refined.reshape(-1, 2).astype(np.float64)
 
 
 def _matches_layout(corners: Any, ids: Any, layout: dict[int, Any], size: float) -> bool:
@@ -210,8 +271,36 @@ def _april_grid(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
         turned = np.roll(corners, turn, axis=1)
         if len(number) > 1 and _matches_layout(turned, number, layout, board.marker):
             fiducial = (4 * number[:, None] + np.arange(4)).ravel()
-            return _Seen(turned.reshape(-1, 2), fiducial)
+            return _Seen(_intersect_sides(grey, turned, board).reshape(-1, 2), fiducial)
     return None
+
+
+def _intersect_sides(grey: NDArray[np.uint8], corners: Floats, board: Board) -> Floats:
+    """Refine corners (K, 4, 2) of tags, clockwise: where lines meet that are fitted to both sides next to a corner.
+
+    Blur rounds corners that stand alone, and moves them inward; it leaves edges where they are. An edge is at the mean
+    place of the grey value's slope along a profile across it.
+    """
+    bits = _dictionary(board.dictionary).markerSize + 2 * board.border
+    margin = min(board.border / bits, board.pitch / board.marker - 1)  # of a side: black within it, white around it
+    shortest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).min(1)
+    reach = np.clip(REACH * margin * shortest, 1, MOST_REACH)[:, None, None, None]
+    share = np.linspace(END, 1 - END, SIDE_SAMPLES)
+    at_corner = np.linalg.pinv(np.vander(share, 2))[1]  # extrapolates a line to the corner
+    across = reach[..., None] * np.linspace(-1, 1, PROFILE_SAMPLES)
+    for _ in range(ROUNDS):
+        side = np.stack((np.roll(corners, -1, axis=1), np.roll(corners, 1, axis=1)), 2) - corners[:, :, None]
+        length = np.linalg.norm(side, axis=-1, keepdims=True)  # (K, 4, 2, 1): to the next corner, to the previous one
+        along = side / length
+        outward = np.stack((along[..., 1], -along[..., 0]), -1) * np.array([[1.0], [-1.0]])
+        edge = corners[:, :, None, None] + share[:, None] * (np.minimum(length, SIDE) * along)[..., None, :]
+        place = edge[..., None, :] + across[..., None] * outward[..., None, None, :]
+        value = map_coordinates(grey, [place[..., 1], place[..., 0]], np.float64, order=1, mode="nearest")
+        step, ends = value[..., -1] - value[..., 0], value[..., -1] + value[..., 0]
+        mean = (value.sum(-1) - ends / 2) / (PROFILE_SAMPLES - 1)
+        offset = reach * np.clip((ends - 2 * mean) / np.maximum(step, 1), -1, 1)
+        corners = corners + np.linalg.solve(outward, (offset @ at_corner)[..., None])[..., 0]
+    return corners
 
 
 def _markers(grey: NDArray[np.uint8], board: Board) -> tuple[Floats, Ints]:

@@ -96,7 +96,7 @@ def webcams(folder: Path) -> dict[str, Any]:
     for path in sorted((folder / "frames").glob("*.jpg")):
         number, _, camera = path.stem.split("_")
         corners = detect({"frame": read_frame(path)}, board=board.board)
-        sigma += corners.sigma[:1].tolist()
+        sigma += corners.sigma.tolist()
         for uv, n in zip(corners.uv, corners.fiducial.tolist(), strict=True):
             there = known.get((str(int(number)), f"cam_{camera}", n))
             apart += [] if there is None else [float(np.linalg.norm(uv - there))]

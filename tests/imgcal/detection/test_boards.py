@@ -8,7 +8,7 @@ import torch
 
 import imgcal
 from imgcal.detection import DetectionOptions, detect_snapshot
-from imgcal.detection.boards import corner_sigma
+from imgcal.detection.boards import UNKNOWN_SIGMA, corner_sigma
 from imgcal.errors import InputError
 from imgcal.synthesis import render_board, simulate_board
 from imgcal.types import CalibrationObject
@@ -37,9 +37,46 @@ def test_finds_every_point_of_a_board_where_it_is(kind, inverted):
     found = detect_snapshot(frames, DetectionOptions(), board=obj.board)
     assert len(found.fiducial) > 0.8 * obj.num_fiducials
     error = found.uv - truth.uv[0, 0].numpy()[found.fiducial]
-    # Blur rounds the corners of tags, which stand alone; those of a chessboard touch.
-    assert np.median(np.linalg.norm(error, axis=1)) < (0.8 if kind == "aprilgrid" else 0.3)
+    assert np.median(np.linalg.norm(error, axis=1)) < 0.3
     assert np.abs(np.median(error, axis=0)).max() < 0.15  # no shift by half a pixel
+
+
+@pytest.mark.parametrize("seed", [2, 4, 10])
+def test_corners_between_markers_are_as_good_as_their_sigma(seed):
+    obj, rig = imgcal.load_object("charuco"), imgcal.load_rig("T4").select([0])
+    truth, frames = seen(obj, rig, seed)
+    found = detect_snapshot(frames, DetectionOptions(), board=obj.board)
+    error = found.uv - truth.uv[0, 0].numpy()[found.fiducial]
+    assert len(error) == obj.num_fiducials and np.abs(error).max() < 0.12
+    assert (np.linalg.norm(error, axis=1) < 5 * found.sigma).all()
+
+
+@pytest.mark.parametrize("blur", [0.7, 1.5])
+@pytest.mark.parametrize("width", [1024, 2048])
+def test_blur_does_not_move_the_corners_of_tags(width, blur, monkeypatch):
+    monkeypatch.setattr("imgcal.synthesis.boards.BLUR", blur)
+    obj, rig = imgcal.load_object("aprilgrid"), imgcal.load_rig("T4").select([0])
+    rig = rig.resized(torch.tensor([width, width * 17 // 32]))
+    truth, frames = seen(obj, rig, 2)
+    found = detect_snapshot(frames, DetectionOptions(), board=obj.board)
+    error = (found.uv - truth.uv[0, 0].numpy()[found.fiducial]).reshape(-1, 4, 2)
+    assert len(error) > 6 and np.sqrt(np.square(error).mean()) < 0.05
+    assert np.abs(error.mean((0, 1))).max() < 0.02  # no shift by half a pixel
+    corners = found.uv.reshape(-1, 4, 2)
+    outward = corners - corners.mean(1, keepdims=True)
+    outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
+    assert abs((error * outward).sum(-1).mean()) < 0.02
+    assert np.median(found.sigma) < 0.06
+
+
+def test_sides_of_tags_that_a_lens_bends_do_not_move_their_corners():
+    board = replace(imgcal.load_object("aprilgrid").board, columns=2, rows=2, pitch=200.0, marker=155.0)
+    obj, rig = CalibrationObject.of_board(board), imgcal.load_rig("T4").select([0])
+    rig = replace(rig, distortion=torch.tensor([[-0.3, 0.1, 0.0, 0.0, 0.0]], dtype=torch.float64))
+    truth, frames = seen(obj, rig, 1)
+    found = detect_snapshot(frames, DetectionOptions(), board=obj.board)
+    error = found.uv - truth.uv[0, 0].numpy()[found.fiducial]
+    assert len(error) >= 8 and np.abs(error).max() < 0.12
 
 
 def test_sigma_is_the_scatter_of_the_corners():
@@ -47,8 +84,38 @@ def test_sigma_is_the_scatter_of_the_corners():
     xy = np.stack(np.meshgrid(np.arange(8.0), np.arange(6.0)), -1).reshape(-1, 2)
     depth = 1 + xy @ [0.02, 0.01]
     uv = 100 * (xy @ [[0.9, 0.2], [-0.1, 0.8]]) / depth[:, None]
-    found = [corner_sigma(xy, uv + 0.3 * random.standard_normal(uv.shape)) for _ in range(20)]
+    found = [np.median(corner_sigma(xy, uv + 0.3 * random.standard_normal(uv.shape))) for _ in range(20)]
     assert np.mean(found) == pytest.approx(0.3, rel=0.15)
+
+
+@pytest.mark.parametrize("wrong", [0, 3, 27])  # at a corner of the board, at its edge, inside
+def test_a_corner_off_its_neighbours_is_less_certain_than_they_are(wrong):
+    random = np.random.default_rng(wrong)
+    xy = np.stack(np.meshgrid(np.arange(8.0), np.arange(6.0)), -1).reshape(-1, 2)
+    uv = 40 * xy @ [[0.9, 0.2], [-0.1, 0.8]] + 0.04 * random.standard_normal(xy.shape)
+    uv[wrong] += [0.6, -0.5]
+    sigma = corner_sigma(xy, uv)
+    assert sigma[wrong] > 0.1 and sigma.argmax() == wrong
+    assert np.median(sigma) == pytest.approx(0.04, rel=0.5)
+
+
+@pytest.mark.parametrize("count", [6, 9, 14])
+@pytest.mark.parametrize("beside", [0, 1])
+def test_corners_on_one_line_do_not_tell_their_sigma(count, beside):
+    random = np.random.default_rng(count)
+    xy = 40.0 * np.concatenate((np.column_stack((np.zeros(count), np.arange(count))), np.ones((beside, 2))))
+    for noise in (0.0, 0.2):
+        uv = 100 + xy @ [[0.9, 0.2], [-0.1, 0.8]] + noise * random.standard_normal(xy.shape)
+        assert (corner_sigma(xy, uv) == UNKNOWN_SIGMA).all()
+
+
+def test_a_long_line_of_corners_beside_a_grid_does_not_change_its_sigma():
+    random = np.random.default_rng(4)
+    grid = np.stack(np.meshgrid(np.arange(4.0), np.arange(3.0)), -1).reshape(-1, 2)
+    xy = np.concatenate((grid, np.column_stack((np.zeros(30), 3.0 + np.arange(30)))))
+    uv = 30 * xy @ [[0.9, 0.2], [-0.1, 0.8]]
+    found = [np.median(corner_sigma(xy, uv + 0.1 * random.standard_normal(uv.shape))) for _ in range(20)]
+    assert np.mean(found) == pytest.approx(0.1, rel=0.2)
 
 
 @pytest.mark.parametrize(
