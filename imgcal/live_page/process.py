@@ -23,6 +23,8 @@ from imgcal.messages import shorten
 
 HEADER_SECONDS = 5.0
 """Within which the head of a request must have come, from its first byte or from the beginning of the connection."""
+STUCK_SECONDS = 20.0
+"""After which a connection is closed whose other side does not read what it is sent."""
 MOST_CONNECTIONS = 256
 MOST_OF_ONE_ADDRESS = 128
 POLITE = 5  # how much rather the loop runs than this
@@ -39,6 +41,7 @@ class Connection(H11Protocol):
         super().__init__(*given, **more)
         self.since = time.monotonic()
         self._due: asyncio.TimerHandle | None = None
+        self._stuck: asyncio.TimerHandle | None = None  # set while the other side does not read
 
     @property
     def waits(self) -> bool:
@@ -63,9 +66,20 @@ class Connection(H11Protocol):
         elif self._due is None:
             self._due = self.loop.call_later(HEADER_SECONDS, self._end)
 
+    def pause_writing(self) -> None:
+        """Begin to wait for the other side to read."""
+        super().pause_writing()
+        self._stuck = self.loop.call_later(STUCK_SECONDS, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        """Go on writing."""
+        self._stop_stuck()
+        super().resume_writing()
+
     def connection_lost(self, exc: Exception | None) -> None:
         """Stop waiting."""
         self._forget()
+        self._stop_stuck()
         super().connection_lost(exc)
 
     @property
@@ -82,6 +96,11 @@ class Connection(H11Protocol):
         if self._due is not None:
             self._due.cancel()
             self._due = None
+
+    def _stop_stuck(self) -> None:
+        if self._stuck is not None:
+            self._stuck.cancel()
+            self._stuck = None
 
     def _end(self) -> None:
         self._due = None

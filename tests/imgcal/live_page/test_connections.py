@@ -4,6 +4,9 @@ import contextlib
 import socket
 import time
 
+import pytest
+
+from imgcal.live_page import Address, LivePage, live_page
 from imgcal.live_page.process import HEADER_SECONDS, MOST_CONNECTIONS, MOST_OF_ONE_ADDRESS
 from tests.imgcal.live_page.pages import Stream
 
@@ -52,3 +55,14 @@ def test_a_head_that_comes_byte_by_byte_is_not_waited_for_and_a_second_request_i
                 alive = False
             time.sleep(0.2)
         assert not alive
+
+
+def test_a_connection_that_reads_none_of_its_answers_is_ended(o10, asymmetric8, monkeypatch):
+    code = "import imgcal.live_page.process as p; p.STUCK_SECONDS = 0.5; p.main({listening}, {pipe})"
+    monkeypatch.setattr(live_page, "SERVER", code)
+    with LivePage(o10, asymmetric8, Address(port=0)) as page, opened(page) as stuck:
+        requests = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{page.address.port}\r\n\r\n".encode() * 100
+        stuck.settimeout(10)
+        with pytest.raises(ConnectionError):
+            while True:
+                stuck.sendall(requests)
