@@ -62,8 +62,8 @@ def test_gradient_by_factory_values_and_spread(simulate) -> None:
     assert torch.autograd.gradcheck(solve, (step, logarithm), eps=1e-4, atol=1e-4, rtol=1e-3, fast_mode=True)
 
 
-@pytest.mark.parametrize("loss", ["huber", "cauchy"])
-def test_gradient_by_the_prior_needs_no_tighter_tolerance(simulate, loss: str) -> None:
+@pytest.mark.parametrize(("loss", "most"), [("huber", 0.02), ("cauchy", 0.1)])
+def test_gradient_by_the_prior_needs_no_tighter_tolerance(simulate, loss: str, most: float) -> None:
     """It is proportional to the offsets, of which an estimate that stops early knows the small ones poorly."""
     case = simulate(3, snapshots=3, cameras=4, noise=0.05)
     weights = torch.randn(3, 4, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -81,8 +81,8 @@ def test_gradient_by_the_prior_needs_no_tighter_tolerance(simulate, loss: str) -
     assert int(same.sum()) >= 2
     exact, usual = exact[same], usual[same]
     assert float((usual - exact).abs().max()) < 5e-3 * float(exact.abs().max())
-    small = exact.abs() > 1e-2 * exact.abs().max()
-    assert float(((usual - exact) / exact)[small].abs().max()) < 0.02
+    small = exact.abs() > 1e-4 * exact.abs().max()
+    assert float(((usual - exact) / exact)[small].abs().max()) < most
 
 
 def test_gradient_by_observations_when_snapshots_are_eliminated(simulate) -> None:
