@@ -146,7 +146,7 @@ def _minimize(scene: Scene, fits: Fits) -> _Compared:
 
 def _mirror(scene: Scene, poses: Poses) -> Poses:
     """Poses (K,) of a planar object that look almost alike from the camera: mirrored in depth about the view."""
-    points = scene.obj.points.double().numpy()
+    points = scene.known.points
     centroid = points.mean(0)
     normal = np.linalg.svd(points - centroid)[2][2]
     centre = poses.rotation @ centroid + poses.translation

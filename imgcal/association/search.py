@@ -81,7 +81,7 @@ class Search:
         """
         scene, gate = self.scene, self.bounds[1]
         ballots: list[_Ballot] = []
-        points = scene.obj.points.double().numpy()
+        points = scene.known.points
         for poses in self._poses(hypotheses, generator):
             self.hypotheses += len(poses) * scene.blobs.uv[..., 0].size * len(points) // VOTES_A_HYPOTHESIS
             if len(poses) == 0:

@@ -72,7 +72,7 @@ def fit_sticks(scene: Scene, seed: int) -> Fits | None:
     if not len(poses):
         return None
     pattern = scene.known.spread.at(away)
-    focal, points = float(scene.rig.focal_length.mean()), scene.obj.points.double().numpy()
+    focal, points = scene.known.focal_length, scene.known.points
     tolerance = max(3.0, float(np.hypot(2.5 * pattern.shape, BEND)) * focal * scene.obj.size / away)
     gate = max(10.0, REACH * 2**0.5 * float(pattern.shift.max()))
     predicted = predict_ideal(scene.rig, points, poses)
@@ -104,7 +104,7 @@ def _eyes(scene: Scene) -> tuple[_Eyes, float]:
 
 def _candidates(scene: Scene, eyes: _Eyes, distance: float, generator: np.random.Generator) -> tuple[Poses, float]:
     """Poses from all pairs of cameras, and their usual distance from the cameras: mm."""
-    points = scene.obj.points.double().numpy()
+    points = scene.known.points
     alike = len(scene.obj.symmetries) > 1 and len(points) == 2
     poses, meetings = Poses(np.empty((0, 3, 3)), np.empty((0, 3))), _meetings(eyes)
     portion = np.cumsum(np.bincount(meetings.pair) ** 2)[meetings.pair] // MOST_COMPARED

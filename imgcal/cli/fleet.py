@@ -74,7 +74,7 @@ class Fleet(arguments.Fleet):
         kinds = rig_kinds(dataset)
         for name in self.covariates if kinds else ():
             if not any(name in (*kind.given, *kind.lacking) for kind in kinds):
-                kinds[0].learn((name,))  # says which there are
+                kinds[0].covariate(name)  # raises, and names those that there are
         for kind in kinds:
             try:
                 taught.append((kind, kind.learn(self.covariates, by_camera=self.by_camera), ""))

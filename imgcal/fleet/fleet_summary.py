@@ -52,14 +52,21 @@ class KindOfRig:
             InputError: a covariate that not every device has.
             RefusedError: too few devices.
         """
-        for name in covariates:
-            if name in self.lacking:
-                raise InputError(f"--covariates {name}: {self.explain_lacking(name)}")
-            if name not in self.given:
-                known = list_names(self.given) or "there are none"
-                raise InputError(f"--covariates: found {name}, expected numbers that every row has: {known}")
-        chosen = {name: self.given[name] for name in covariates}
+        chosen = {name: self.covariate(name) for name in covariates}
         return learn_prior(self.drift, hours=self.given.get(HOURS), covariates=chosen, by_camera=by_camera)
+
+    def covariate(self, name: str) -> NDArray[np.float64]:
+        """Return the numbers (D) of this name.
+
+        Raises:
+            InputError: not every device has one.
+        """
+        if name in self.lacking:
+            raise InputError(f"--covariates {name}: {self.explain_lacking(name)}")
+        if name not in self.given:
+            known = list_names(self.given) or "there are none"
+            raise InputError(f"--covariates: found {name}, expected numbers that every row has: {known}")
+        return self.given[name]
 
     def explain_lacking(self, name: str) -> str:
         """Say which devices lack a number that others have."""

@@ -100,7 +100,7 @@ def calibrate(
     case = _Case(detections, rig, obj, options, may_be_misread=_is_solid(obj) and sight is None)
     if case.may_be_misread and not detections.labelled.any() and lines_of_sight_miss(detections, rig):
         # Identity takes minutes to find nothing in a long capture.
-        case.try_conventions("identity: the cameras' lines of sight to the object do not meet")
+        case.try_conventions(RefusedError("identity: the cameras' lines of sight to the object do not meet"))
         case = replace(case, may_be_misread=False)  # images and rig follow our conventions
     try:
         with require_solvable():
@@ -122,7 +122,7 @@ def calibrate(
         raise
     used, given = len(fit.labelled.used), len(detections.snapshot_names)
     if case.may_be_misread and used < LEAST_USED * given:
-        case.try_conventions(f"identity: only {used} of {given} snapshots could be used")
+        case.try_conventions(RefusedError(f"identity: only {used} of {given} snapshots could be used"))
     seconds = {
         "detection": found - started,
         "identity": identified - found,
@@ -167,7 +167,7 @@ class _Case:
                 require_matching_images(error, self.detections, labelled, self.rig, self.obj)
                 require_same_moments(error, self.detections, labelled, self.rig, self.obj, self.options)
 
-    def try_conventions(self, doubt: RefusedError | str) -> None:
+    def try_conventions(self, error: RefusedError) -> None:
         """Replace a refusal if images or rig follow other conventions; see `require_conventions`."""
         options = replace(self.options, blind_cameras=True)
 
@@ -178,7 +178,6 @@ class _Case:
                 raise RefusedError("identity: the object was found in few of the snapshots")
             return float(found.rms)
 
-        error = RefusedError(doubt) if isinstance(doubt, str) else doubt
         require_conventions(error, self.detections, self.rig, fit)
 
 
