@@ -118,6 +118,13 @@ class _Fit:
         return _additive_noise(self.squared[self.seen], self.variance[self.seen], taken)
 
     @property
+    def noise_of_residuals(self) -> NDArray[np.floating]:
+        """What outliers are judged by: the noise of the fit, as a coarse one cannot detect fine outliers, or that of its
+        residuals, as blobs may be far noisier than they say: (S, C, N) px^2.
+        """
+        return np.maximum(self.noise, self.variance + self.additive_noise**2)
+
+    @property
     def converged(self) -> bool:
         """Whether a minimum was found."""
         return bool(self.solution.converged)
@@ -170,9 +177,7 @@ def estimate_variance_components(
             if free is not None:
                 (problem, state), kept = free, labels
                 continue
-        # Use the sigma of this fit, because a coarse fit cannot detect fine outliers. A removed fiducial has no
-        # residual, so it stays out.
-        kept = seen & (fit.squared <= options.outlier**2 * fit.noise)
+        kept = seen & (fit.squared <= options.outlier**2 * fit.noise_of_residuals)
         if (kept != seen).any():
             require_poses(kept, problem.points, problem.part_of)
         if later and not (fit.converged and (kept == labels).all()):

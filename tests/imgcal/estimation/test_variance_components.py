@@ -130,6 +130,31 @@ def test_ordinary_captures_come_to_rest_in_a_few_fits(o10, asymmetric8, monkeypa
     assert max(counts) <= 6
 
 
+def noisier_than_it_says(rig, obj, noise):
+    """A capture whose blobs are said to have a tenth of a pixel, with some wrong labels, and how many these are."""
+    truth = simulate_truth(rig, obj, 12, torch.Generator().manual_seed(1), PhysicalDrift())
+    table, random = true_detections(truth), np.random.default_rng(1)
+    table.sigma[:] = 0.1
+    table.uv[:] += noise * random.standard_normal(table.uv.shape)
+    wrong = random.choice(len(table), len(table) // 50, replace=False)
+    table.uv[wrong] += 30 * noise * np.array([0.6, -0.8])
+    return table, len(wrong)
+
+
+@pytest.mark.parametrize("noise", [0.3, 0.9])
+def test_blobs_far_noisier_than_they_say_are_no_outliers(noise, o10, asymmetric8) -> None:
+    table, wrong = noisier_than_it_says(o10, asymmetric8, noise)
+    found = calibrate(table, o10, asymmetric8)
+    assert found.outliers == pytest.approx(wrong, abs=3)
+    assert np.hypot(0.1, found.additive_noise) == pytest.approx(noise, rel=0.1)
+
+
+def test_more_noise_than_is_allowed_is_called_noise(o10, asymmetric8) -> None:
+    table, _ = noisier_than_it_says(o10, asymmetric8, 1.5)
+    with pytest.raises(RefusedError, match=r"of which 1\.5\d px are not noise of the blobs, expected at most 1"):
+        calibrate(table, o10, asymmetric8)
+
+
 def test_a_solution_of_another_problem_is_not_returned(o10, asymmetric8, monkeypatch) -> None:
     """The last check projects with the rig that is about to be returned."""
     table, _ = two_captures(o10, asymmetric8)
