@@ -98,12 +98,12 @@ def fits_made(monkeypatch) -> list[int]:
 
 
 def test_what_does_not_come_to_rest_is_refused_after_forty_fits(monkeypatch) -> None:
-    """Captures whose labels leave and come back without end (of four hundred like these, three need 38 fits or more).
+    """Captures whose labels leave and come back without end (of four hundred like these, a few need 38 fits or more).
 
     Which ones they are hangs on the last digits: most of these three, on any machine.
     """
     counts, endless = fits_made(monkeypatch), 0
-    for seed in (501, 572, 645):
+    for seed in (493, 590, 645):
         rig, obj, table = hard(seed)
         with pytest.raises(RefusedError) as refusal:
             calibrate(table, rig, obj)
