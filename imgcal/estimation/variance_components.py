@@ -119,8 +119,10 @@ class _Fit:
 
     @property
     def noise_of_residuals(self) -> NDArray[np.floating]:
-        """What outliers are judged by: the noise of the fit, as a coarse one cannot detect fine outliers, or that of its
-        residuals, as blobs may be far noisier than they say: (S, C, N) px^2.
+        """What outliers are judged by: (S, C, N) px^2.
+
+        At least the noise of the fit, because a coarse fit cannot detect fine outliers; more where its residuals show
+        more, because blobs may be far noisier than they say.
         """
         return np.maximum(self.noise, self.variance + self.additive_noise**2)
 

@@ -59,7 +59,7 @@ def find_alarm(
     if screened.max() >= suspicion:
         ages.add(int(SCREENED_AGES[int(screened.max(1).argmax())]))
     for age in sorted(ages):
-        scores = recent.test(age).scores()
+        scores = recent.test_each(age).scores()
         kind = max(scores, key=lambda name: float(scores[name].max()))
         camera = int(scores[kind].argmax())
         if float(scores[kind][camera]) < ALARM_CHI2:
@@ -122,7 +122,7 @@ def changed_cameras(
     free, evidence, passing = dict(known), dict[int, float](), set[int]()
     while len(free) + len(passing) < len(test.pixels):
         given = test.condition_on(free) if free else test
-        scores = given.scores()
+        scores = given.each.scores()
         others = {
             camera: max(float(score[camera]) for score in scores.values())
             for camera in range(len(test.pixels))
@@ -149,7 +149,7 @@ def _may_pass(recent: RecentSnapshots, age: int, free: Mapping[int, str | None],
         return True
     starts = [*range(0, age - episode, math.ceil(episode / EPISODE_STEPS)), age - episode]
     tests = (recent.test(age, without=range(start, start + episode)).condition_on(free) for start in starts)
-    return any(max(float(score[camera]) for score in test.scores().values()) < REMAINING_CHI2 for test in tests)
+    return any(max(float(score[camera]) for score in test.each.scores().values()) < REMAINING_CHI2 for test in tests)
 
 
 def _largest_shift(test: ChangeTest, camera: int) -> float:

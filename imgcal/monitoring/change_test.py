@@ -86,8 +86,67 @@ def camera_change_errors(rig: CameraRig, unit: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
+class OwnTest:
+    """The gradient left over for each camera's own parameters, with its covariance: those blocks of r and G that the
+    scores need.
+    """
+
+    pull: Tensor  # (C, K)
+    learnt: Tensor  # (C, K, K) its covariance if nothing has changed
+    pixels: Tensor  # (C, K) see `pixel_changes`
+    lasting: Tensor | float = MODEL_ERROR  # (C,) px: persistent error of each image without any change
+
+    @classmethod
+    def of(
+        cls,
+        information: Tensor,
+        brought: Tensor,
+        pull: Tensor,
+        change: Tensor,
+        pixels: Tensor,
+        lasting: Tensor | float = MODEL_ERROR,
+    ) -> OwnTest:
+        """Prepare the tests; arguments and errors as for `ChangeTest.of`, which does three times the work."""
+        cameras, wide = len(change), pixels.numel()
+        half = _whiten_by_all(information, brought, pull, wide)
+        each = half[:, :-1].unflatten(1, (cameras, -1)).movedim(1, 0)  # (C, D, K)
+        blocks = brought[:wide, :wide].unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
+        own = blocks.diagonal(dim1=0, dim2=2).movedim(-1, 0) - each.mT @ each
+        left = (pull[:wide] - half[:, :-1].mT @ half[:, -1]).unflatten(0, (cameras, -1))
+        learnt = change.mT @ own @ change
+        return cls((change.mT @ left[..., None])[..., 0], 0.5 * (learnt + learnt.mT), pixels, lasting)
+
+    def scores(self) -> dict[str, Tensor]:
+        """Test each camera for each kind of change: (C,) for each of `CHANGES`.
+
+        If nothing has changed, a score is chi-squared with at most as many degrees of freedom as the kind has
+        parameters.
+        """
+        error = torch.as_tensor(self.lasting, dtype=self.pixels.dtype)[..., None] * self.pixels
+        found = _Own.of(_by_kind(self.pull), _by_kind(self.learnt, 2)).score(_by_kind(error).square())
+        return dict(zip(CHANGES, found, strict=True))
+
+    def model_error(self, kind: str) -> Tensor:
+        """Change in a kind with k parameters that a camera model error may imitate: (C, k) for each camera."""
+        return torch.as_tensor(self.lasting, dtype=self.pixels.dtype)[..., None] * self.pixels[:, CHANGES[kind]]
+
+    def change(self, kind: str, variance: Tensor) -> tuple[Tensor, Tensor]:
+        """Estimate a change of each camera in a kind with k parameters that also take a random walk.
+
+        Args:
+            kind: of `CHANGES`.
+            variance: (C, k) of the random walk beyond the assumed rate; negative values are possible.
+
+        Returns:
+            Its information (C, k, k) and its gradient (C, k).
+        """
+        part = CHANGES[kind]
+        return _Own.of(self.pull[:, part], self.learnt[:, part, part]).change(variance)
+
+
+@dataclass(frozen=True)
 class ChangeTest:
-    """The gradient left over for every camera's own parameters: r and G, which all tests use."""
+    """The gradient left over for the own parameters of all cameras together: r and G, which all tests use."""
 
     pull: Tensor  # (K C,)
     learnt: Tensor  # (K C, K C) its covariance if nothing has changed
@@ -117,51 +176,21 @@ class ChangeTest:
         Raises:
             RefusedError: nothing is known about the rig.
         """
-        cameras = len(change)
-        wide = pixels.numel()
-        factor, failed = torch.linalg.cholesky_ex(information + brought)
-        if bool(failed):
-            raise RefusedError("estimation: these observations do not determine the rig")
-        half = torch.linalg.solve_triangular(factor, torch.cat((brought[:, :wide], pull[:, None]), 1), upper=False)
+        cameras, wide = len(change), pixels.numel()
+        half = _whiten_by_all(information, brought, pull, wide)
         left = torch.cat((brought[:wide, :wide], pull[:wide, None]), 1) - half[:, :wide].mT @ half
         own = torch.einsum("cij,cik->cjk", change, left.unflatten(0, (cameras, -1)))  # (C, K, K C + 1)
         learnt = own[..., :-1].unflatten(-1, (cameras, -1))
         learnt = torch.einsum("cidj,djk->cidk", learnt, change).reshape(wide, wide)
         return cls(own[..., -1].flatten(), 0.5 * (learnt + learnt.mT), pixels, lasting)
 
-    def scores(self) -> dict[str, Tensor]:
-        """Test each camera for each kind of change: (C,) for each of `CHANGES`.
-
-        If nothing has changed, a score is chi-squared with at most as many degrees of freedom as the kind has
-        parameters.
-        """
+    @property
+    def each(self) -> OwnTest:
+        """The test of each camera alone."""
         cameras = len(self.pixels)
-        pull = self.pull.unflatten(0, (cameras, -1))
         learnt = self.learnt.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
-        own = learnt.diagonal(dim1=0, dim2=2).movedim(-1, 0)  # (C, K, K)
-        return {
-            kind: _Own.of(pull[:, part], own[:, part, part]).score(self.model_error(kind).square())
-            for kind, part in CHANGES.items()
-        }
-
-    def model_error(self, kind: str) -> Tensor:
-        """Change in a kind with k parameters that a camera model error may imitate: (C, k) for each camera."""
-        return torch.as_tensor(self.lasting, dtype=self.pixels.dtype)[..., None] * self.pixels[:, CHANGES[kind]]
-
-    def change(self, kind: str, variance: Tensor) -> tuple[Tensor, Tensor]:
-        """Estimate a change of each camera in a kind with k parameters that also take a random walk.
-
-        Args:
-            kind: of `CHANGES`.
-            variance: (C, k) of the random walk beyond the assumed rate; negative values are possible.
-
-        Returns:
-            Its information (C, k, k) and its gradient (C, k).
-        """
-        cameras, part = len(self.pixels), CHANGES[kind]
-        pull = self.pull.unflatten(0, (cameras, -1))[:, part]
-        learnt = self.learnt.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
-        return _Own.of(pull, learnt.diagonal(dim1=0, dim2=2).movedim(-1, 0)[:, part, part]).change(variance)
+        own = learnt.diagonal(dim1=0, dim2=2).movedim(-1, 0)
+        return OwnTest(self.pull.unflatten(0, (cameras, -1)), own, self.pixels, self.lasting)
 
     def odds(self, changes: Mapping[int, str | None]) -> float:
         """Log odds of the given changes (None = of any kind) against no change."""
@@ -200,36 +229,53 @@ class ChangeTest:
         return scaled, factor, pull
 
 
+def _whiten_by_all(information: Tensor, brought: Tensor, pull: Tensor, wide: int) -> Tensor:
+    """L^-1 (A, g) of the cameras' `wide` columns of A, where L L^T = S: (D, wide + 1); arguments as `ChangeTest.of`."""
+    factor, failed = torch.linalg.cholesky_ex(information + brought)
+    if bool(failed):
+        raise RefusedError("estimation: these observations do not determine the rig")
+    return torch.linalg.solve_triangular(factor, torch.cat((brought[:, :wide], pull[:, None]), 1), upper=False)
+
+
+def _by_kind(values: Tensor, axes: int = 1) -> Tensor:
+    """Divide the last axes, of K parameters each, by kind: (kinds, C, 3) or (kinds, C, 3, 3), filled with zeros."""
+    most = max(part.stop - part.start for part in CHANGES.values())
+    parted = values.new_zeros(len(CHANGES), len(values), *axes * (most,))
+    for kind, part in enumerate(CHANGES.values()):
+        parted[kind, :, *axes * (slice(part.stop - part.start),)] = values[:, *axes * (part,)]
+    return parted
+
+
 @dataclass(frozen=True)
 class _Own:
     """The gradient left over for a few parameters of each camera, along directions that have been observed."""
 
-    along: Tensor  # (C, k) in standard deviations without a change; zero in unobserved directions
-    spread: Tensor  # (C, k, k) its derivative by a change of each parameter
+    along: Tensor  # (*B, k) in standard deviations without a change; zero in unobserved directions
+    spread: Tensor  # (*B, k, k) its derivative by a change of each parameter
 
     @classmethod
     def of(cls, pull: Tensor, learnt: Tensor) -> _Own:
-        """Take gradients (C, k) and their covariance (C, k, k)."""
+        """Take gradients (*B, k) and their covariance (*B, k, k)."""
         scale = learnt.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30).sqrt()
-        values, vectors = torch.linalg.eigh(learnt / (scale[:, :, None] * scale[:, None, :]))
+        values, vectors = torch.linalg.eigh(learnt / (scale[..., :, None] * scale[..., None, :]))
         known = values > LEAST_LEARNT
         root = torch.where(known, values, 1.0).sqrt()
         along = torch.where(known, (vectors.mT @ (pull / scale)[..., None])[..., 0] / root, 0.0)
-        return cls(along, scale[:, :, None] * vectors * torch.where(known, root, 0.0)[:, None, :])
+        return cls(along, scale[..., :, None] * vectors * torch.where(known, root, 0.0)[..., None, :])
 
     def score(self, variance: Tensor) -> Tensor:
-        """Squared norms (C,), whitened by a covariance that includes changes of a variance (C, k)."""
+        """Squared norms (*B), whitened by a covariance that includes changes of a variance (*B, k)."""
         values, vectors = self._add_changes(variance)
         return ((vectors.mT @ self.along[..., None])[..., 0].square() / values).sum(-1)
 
     def change(self, variance: Tensor) -> tuple[Tensor, Tensor]:
-        """Information (C, k, k) and gradient (C, k) of a change, in addition to changes of a variance (C, k)."""
+        """Information (*B, k, k) and gradient (*B, k) of a change, in addition to changes of a variance (*B, k)."""
         values, vectors = self._add_changes(variance)
-        spread = self.spread @ vectors / values.sqrt()[:, None, :]
+        spread = self.spread @ vectors / values.sqrt()[..., None, :]
         along = (vectors.mT @ self.along[..., None])[..., 0] / values.sqrt()
         return spread @ spread.mT, (spread @ along[..., None])[..., 0]
 
     def _add_changes(self, variance: Tensor) -> tuple[Tensor, Tensor]:
-        """Variances (C, k) with changes added, and their directions (C, k, k)."""
-        values, vectors = torch.linalg.eigh(self.spread.mT @ (variance[:, :, None] * self.spread))
+        """Variances (*B, k) with changes added, and their directions (*B, k, k)."""
+        values, vectors = torch.linalg.eigh(self.spread.mT @ (variance[..., :, None] * self.spread))
         return (1 + values).clamp_min(LEAST_VARIANCE), vectors

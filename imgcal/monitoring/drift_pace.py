@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation import error_between
-from imgcal.monitoring.change_test import CHANGES, MODEL_ERROR, ChangeTest, camera_change_errors, pixel_changes
+from imgcal.monitoring.change_test import CHANGES, MODEL_ERROR, ChangeTest, OwnTest, camera_change_errors, pixel_changes
 from imgcal.monitoring.recent_snapshots import RecentSnapshots
 from imgcal.monitoring.rig_belief import RigBelief, age_belief, widen
 from imgcal.monitoring.rig_filter import RigFilter
@@ -114,11 +114,11 @@ class DriftPaces:
         test = stretch.test(walk * self.of_parameters(walk.shape[1]))
         for kept in (self.information, self.pull):
             kept[1:] = kept[:-1].clone()
-        self.information[0], self.pull[0] = self._measure_drift(test, walk, stretch.seconds)
-        model = self._model(test, walk)
+        self.information[0], self.pull[0] = self._measure_drift(test.each, walk, stretch.seconds)
+        model = self._model(test.each, walk)
         leader = int(self._ratios(model).amax((0, 2, 3)).argmax())
         # A camera that creeps affects all others.
-        rest = self._measure_drift(test.condition_on({leader: None}), walk, stretch.seconds)
+        rest = self._measure_drift(test.condition_on({leader: None}).each, walk, stretch.seconds)
         others = torch.arange(len(self.squared)) != leader
         self.information[0, others], self.pull[0, others] = rest[0][others], rest[1][others]
         ratios, was = self._ratios(model), self.squared
@@ -134,7 +134,7 @@ class DriftPaces:
             variance[:, part] = lacking[:, number, None] * walk[:, part].square() * (stretch.seconds / 3600)
         return variance
 
-    def _measure_drift(self, test: ChangeTest, walk: Tensor, seconds: float) -> tuple[Tensor, Tensor]:
+    def _measure_drift(self, test: OwnTest, walk: Tensor, seconds: float) -> tuple[Tensor, Tensor]:
         """Information (C, kinds, 3, 3) and gradient (C, kinds, 3) of each value's drift, in random walk steps."""
         information, pull = torch.zeros_like(self.information[0]), torch.zeros_like(self.pull[0])
         for number, (kind, part) in enumerate(CHANGES.items()):
@@ -146,7 +146,7 @@ class DriftPaces:
             pull[:, number, :size] = found[1] * step
         return information, pull
 
-    def _model(self, test: ChangeTest, walk: Tensor) -> Tensor:
+    def _model(self, test: OwnTest, walk: Tensor) -> Tensor:
         """Variance (C, kinds, 3) of camera model errors, in steps of the walk; zero where nothing wanders."""
         variance = torch.zeros_like(self.pull[0])
         for number, (kind, part) in enumerate(CHANGES.items()):

@@ -155,7 +155,7 @@ class PendingChange:
                 continue
             kinds[camera], kind = found
             size = (math.nan, math.nan) if kind is None else self.size(test, camera, kind)
-            scores = test.condition_on(self.others(camera)).scores()
+            scores = test.condition_on(self.others(camera)).each.scores()
             evidence = max(float(scores[name][camera]) for name in ([kind] if kind else CHANGES))
             decided.append(Change(camera, change.since, kind or "unknown", *size, decided=True, evidence=evidence))
         return tuple(decided), kinds

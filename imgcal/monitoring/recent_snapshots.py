@@ -22,10 +22,10 @@ from imgcal.errors import RefusedError
 from imgcal.estimation import displace
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring.case import Snapshot
-from imgcal.monitoring.change_test import CHANGES, MODEL_ERROR, ChangeTest, camera_change_errors, pixel_changes
+from imgcal.monitoring.change_test import CHANGES, MODEL_ERROR, ChangeTest, OwnTest, camera_change_errors, pixel_changes
 from imgcal.monitoring.recent_screening import add_error, add_row, put, screen
 from imgcal.monitoring.rig_arrays import RigArrays
-from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, error_covariance
+from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
 from imgcal.monitoring.snapshot_information import SnapshotInformation, add_blocks
 from imgcal.types import CameraRig, Observations
 
@@ -227,19 +227,30 @@ class RecentSnapshots:
         Raises:
             RefusedError: nothing is known about the rig.
         """
+        return ChangeTest.of(*self._compare(age, aged, without), self._change, self._pixels, self.lasting)
+
+    def test_each(self, age: int) -> OwnTest:
+        """Test each camera for a change before the latest `age` snapshots, allowing for all drift since then at once.
+
+        Raises:
+            RefusedError: nothing is known about the rig.
+        """
+        return OwnTest.of(*self._compare(age), self._change, self._pixels, self.lasting)
+
+    def _compare(self, age: int, aged: bool = True, without: range = range(0)) -> tuple[Tensor, Tensor, Tensor]:
+        """Information (D, D) before the latest snapshots and in them, and their gradient (D,); arguments as `test`."""
         number = self._next - age
         information, factor, at = self._belief_before(number)
         brought, weighted = self._sums(number, self._next)
         if without:
             left_out = self._sums(number + without.start, number + without.stop)
             brought, weighted = brought - left_out[0], weighted - left_out[1]
-        pull = weighted - brought @ at
         variance = self.walk.square() * (self.seconds(age) / 3600)
         if aged and bool(variance.any()):
             covariance = torch.cholesky_inverse(factor)
-            add_blocks(covariance, error_covariance(self._belief, variance))
+            add_blocks(covariance, (self._change * variance[:, None, :]) @ self._change.mT)
             information = torch.cholesky_inverse(_cholesky(covariance))
-        return ChangeTest.of(information, brought, pull, self._change, self._pixels, self.lasting)
+        return information, brought, weighted - brought @ at
 
     def score_without_episode(self, age: int, camera: int, kind: str, episode: int) -> tuple[float, float]:
         """Score a camera's change without the episode that supports it most, treating everything else as known.

@@ -200,7 +200,8 @@ def age_belief(belief: RigBelief, seconds: float, rate: DriftRate | Tensor) -> R
 def widen(belief: RigBelief, variance: Tensor) -> RigBelief:
     """Add variances (C, K) to some parameters, in the units and order of `CameraRig.parameter_names`."""
     covariance = torch.cholesky_inverse(belief.factor)
-    add_blocks(covariance, error_covariance(belief, variance))
+    change = camera_change_errors(belief.rig, belief.unit)
+    add_blocks(covariance, (change * variance[:, None, :]) @ change.mT)
     return belief.with_covariance(covariance)
 
 
@@ -211,12 +212,6 @@ def widen_along(belief: RigBelief, steps: Tensor) -> RigBelief:
     wide = error.shape[1]
     covariance[:wide, :wide] += error.mT @ error
     return belief.with_covariance(covariance)
-
-
-def error_covariance(belief: RigBelief, variance: Tensor) -> Tensor:
-    """Covariance (C, K, K) of errors in units, from variances (C, K) of a camera's own parameters."""
-    change = camera_change_errors(belief.rig, belief.unit)
-    return change @ torch.diag_embed(variance) @ change.mT
 
 
 def cholesky_factor(matrix: Tensor) -> Tensor:

@@ -52,7 +52,7 @@ def test_chance_triggers_no_more_tests_of_a_rig_with_many_cameras(cameras: int, 
         def screen(self) -> np.ndarray:
             return np.full((len(SCREENED_AGES), cameras), 22.0)
 
-        def test(self, age: int) -> None:
+        def test_each(self, age: int) -> None:
             asked.append(age)
             raise RefusedError("asked")
 

@@ -13,6 +13,7 @@ from imgcal.monitoring import (
     CHANGES,
     ChangeTest,
     MeasurementUpdate,
+    OwnTest,
     RigBelief,
     absorb,
     camera_change_errors,
@@ -53,6 +54,19 @@ def against(later: MeasurementUpdate, before: RigBelief | None = None) -> Change
     return ChangeTest.of(before.information, information, pull, change, pixel_changes(before.rig))
 
 
+def test_each_camera_alone_is_tested_like_all_together(followed) -> None:
+    later = bumped(followed, 2, slice(0, 3), [1e-3, 0, 0], 11)
+    before, brought = later.before, later.brought
+    information = brought.information()
+    pull = brought.pull.sum(0) - information @ brought.distance_from(before.rig, before.object_offset)
+    lasting = torch.tensor([0.02, 0.1, 0.02, 0.5], dtype=torch.float64)
+    change, pixels = camera_change_errors(before.rig, before.unit), pixel_changes(before.rig)
+    given = (before.information, information, pull, change, pixels, lasting)
+    alone, together = OwnTest.of(*given).scores(), ChangeTest.of(*given).each.scores()
+    for kind in CHANGES:
+        torch.testing.assert_close(alone[kind], together[kind], rtol=1e-6, atol=1e-9)
+
+
 def bumped(
     followed, camera: int, part: slice, step: list[float], seed: int, first: int = 20, last: int = 26
 ) -> MeasurementUpdate:
@@ -69,13 +83,13 @@ def test_scores_of_a_steady_rig_are_chi_squared_and_those_of_a_bumped_camera_are
     steady = []
     for number, first in enumerate(range(20, 60, 2)):
         later = bumped(followed, 0, slice(0, 0), [], 100 + number, first, first + 2)
-        steady.append(torch.stack(list(against(later).scores().values())))
+        steady.append(torch.stack(list(against(later).each.scores().values())))
     scores = torch.stack(steady)  # (20, kinds, C)
     for number, part in enumerate(CHANGES.values()):
         freedom = part.stop - part.start
         mean = float(scores[:, number].mean())
         assert 0.5 * freedom < mean < freedom + 4 * math.sqrt(2 * freedom / 80)  # model errors make it smaller
-    found = against(bumped(followed, 2, slice(8, 9), [1.0], 5)).scores()
+    found = against(bumped(followed, 2, slice(8, 9), [1.0], 5)).each.scores()
     assert int(found["principal_point"].argmax()) == 2
     assert float(found["principal_point"][2]) > 100
 
@@ -91,7 +105,7 @@ def test_the_kind_of_a_change_is_the_most_probable_one(followed, kind: str) -> N
     odds = {name: test.odds({1: name}) for name in CHANGES}
     assert max(odds, key=lambda name: odds[name]) == kind
     assert test.odds({1: kind}) > test.odds({0: kind})
-    assert max(float(scores[[0, 2, 3]].max()) for scores in test.condition_on({1: None}).scores().values()) < 40
+    assert max(float(scores[[0, 2, 3]].max()) for scores in test.condition_on({1: None}).each.scores().values()) < 40
     change, covariance = test.jump(1, kind)
     error = change - torch.tensor([size, -0.5 * size, 0.3 * size], dtype=torch.float64)[: len(change)]
     assert float(error @ torch.linalg.solve(covariance, error)) < 25

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import imgcal
-from imgcal.monitoring import CHANGES, ChangeTest, RigBelief, RigFilter, RigMonitor, camera_change_errors, pixel_changes
+from imgcal.monitoring import CHANGES, OwnTest, RigBelief, RigFilter, RigMonitor, camera_change_errors, pixel_changes
 from imgcal.monitoring.drift_pace import ADDED_TOGETHER, STRETCH_SECONDS, DriftLearning, DriftPaces, Stretch
 from imgcal.types import CameraRig, DriftRate
 from scripts.benchmarks.rig_streams import Conditions, Stream
@@ -62,7 +62,7 @@ def test_what_is_added_up_is_what_the_snapshots_say() -> None:
     test = other.test(STEADY)
     assert torch.allclose(test.learnt, whole.test(STEADY).learnt)
     wider = whole.test(DriftRate(rotation=1.0))  # whatever it turned may have been drift
-    assert bool((wider.scores()["rotation"] < test.scores()["rotation"]).all())
+    assert bool((wider.each.scores()["rotation"] < test.each.scores()["rotation"]).all())
 
 
 def test_changes_of_a_camera_are_estimated_beside_what_wanders() -> None:
@@ -70,7 +70,7 @@ def test_changes_of_a_camera_are_estimated_beside_what_wanders() -> None:
     root = torch.randn(15, 30, generator=generator, dtype=torch.float64)
     learnt, pull = root @ root.mT, torch.randn(15, generator=generator, dtype=torch.float64)
     rig = imgcal.load_rig("T4").to(torch.float64).select([0])
-    test, part = ChangeTest(pull, learnt, pixel_changes(rig)), CHANGES["position"]
+    test, part = OwnTest(pull[None], learnt[None], pixel_changes(rig)), CHANGES["position"]
     variance = torch.tensor([[0.3, 0.01, 2.0]], dtype=torch.float64)
     own = learnt[part, part]
     expected = torch.linalg.inv(torch.linalg.inv(own) + variance[0].diag())
