@@ -117,14 +117,14 @@ class _Fit:
         taken = float(self.problem.pose_freedom) + float((1 - self.remaining).sum())
         return _additive_noise(self.squared[self.seen], self.variance[self.seen], taken)
 
-    @property
-    def noise_of_residuals(self) -> NDArray[np.floating]:
-        """What outliers are judged by: (S, C, N) px^2.
+    def find_inliers(self, outlier: float) -> NDArray[np.bool_]:
+        """Find labels (S, C, N) within `outlier` standard deviations. What was left out has no residual, and stays out.
 
-        At least the noise of the fit, because a coarse fit cannot detect fine outliers; more where its residuals show
-        more, because blobs may be far noisier than they say.
+        They are judged by the noise of the fit, because a coarse fit cannot detect fine outliers, or by that of its
+        residuals if this is more, because blobs may be far noisier than they say.
         """
-        return np.maximum(self.noise, self.variance + self.additive_noise**2)
+        noise = np.maximum(self.noise, self.variance + self.additive_noise**2)
+        return np.asarray(self.seen & (self.squared <= outlier**2 * noise))
 
     @property
     def converged(self) -> bool:
@@ -159,64 +159,16 @@ def estimate_variance_components(
         RefusedError: no minimum was found, or noise, outliers, object and prior do not converge.
         UndeterminedPosesError: without outliers, some snapshots do not determine the object's pose.
     """
-    start, *later = starts
-    state, additive_noise, known = start.state, start.additive_noise, start.solution
-    prior_scale: dict[str, float] = {}
-    kept, unexamined, shape = labels, question is not ObjectQuestion.NONE, None
-    nearer, needed = start.nearer, 0.0
+    for start in starts:
+        rounds = _Rounds(problem, start, variance, labels, options, question)
+        if start is starts[-1] or rounds.all_labels_fit():
+            break
     for _ in range(ROUNDS):
-        fit, known = _fit(problem, state, additive_noise, variance, kept, options, known), None
-        if not (fit.converged or later):
-            fit = _continue(fit, options)
-        problem, solution, seen = fit.problem, fit.solution, fit.seen
-        if unexamined and not later and fit.converged and not fit.is_clean(options.outlier):
-            # Test before removing outliers, because they may include all labels of a misplaced fiducial.
-            unexamined = False
-            if (softer := _bend(fit, options)) is not None:
-                problem, state, kept, unexamined = softer, solution.state, labels, True
-                continue
-            shape, free = _examine(fit, options, GROSS_SCALE, question)
-            if free is not None:
-                (problem, state), kept = free, labels
-                continue
-        kept = seen & (fit.squared <= options.outlier**2 * fit.noise_of_residuals)
-        if (kept != seen).any():
-            require_poses(kept, problem.points, problem.part_of)
-        if later and not (fit.converged and (kept == labels).all()):
-            start, *later = later
-            state, additive_noise, known, kept = start.state, start.additive_noise, start.solution, labels
-            nearer = start.nearer
-            continue
-        later = []
-        if not fit.converged:
-            rms = float(np.sqrt(fit.squared[seen].mean()))
-            raise RefusedError(f"estimation: no minimum after {solution.iterations} iterations (RMS {rms:.3g} px)")
-        state, nearer = nearer or solution.state, None
-        previous, additive_noise = additive_noise, fit.additive_noise
-        # Barely significant noise appears when none is assumed, and vanishes when it is: keep it.
-        if previous == 0:
-            needed = additive_noise
-        if additive_noise == 0 and (kept == seen).all():
-            additive_noise = min(needed, previous)
-        if abs(additive_noise - previous) > 0.02 * previous or (kept != seen).any():
-            continue
-        if question is not ObjectQuestion.NONE:
-            unexamined = False
-            if (softer := _bend(fit, options)) is not None:
-                problem, state = softer, solution.state
-                continue
-            shape, free = _examine(fit, options, 0.0, question)
-            if free is not None:
-                (problem, state), kept = free, labels
-                continue
-        state = solution.state
-        too_narrow = _find_narrow_priors(state.offset[0].numpy(), fit.remaining)
-        if not too_narrow or max(prior_scale.values(), default=1.0) > options.widest_prior:
-            modes = mode_evidence(problem, solution, make_loss(options.estimation))
-            sigma = np.sqrt(fit.noise)
-            return VarianceComponents(problem, solution, sigma, seen, additive_noise, prior_scale, shape, modes)
-        prior_scale |= {kind: prior_scale.get(kind, 1.0) * factor for kind, factor in too_narrow.items()}
-        problem, state = _widen(problem, state, too_narrow)
+        rounds.fit_again()
+        if not (
+            rounds.correct_gross_object() or rounds.correct_noise() or rounds.correct_object() or rounds.correct_prior()
+        ):
+            return rounds.result()
     raise RefusedError(
         f"estimation: noise, outliers and prior do not converge in {ROUNDS} fits: the rig has changed far "
         "more than its prior allows, or many labels are wrong",
@@ -225,10 +177,122 @@ def estimate_variance_components(
     )
 
 
-def _bend(fit: _Fit, options: FitOptions) -> Problem | None:
-    """Apply the step of the object's modes; None = they have converged."""
-    asked = mode_evidence(fit.problem, fit.solution, make_loss(options.estimation))
-    return None if asked is None or asked.at_rest else bend_object(fit.problem, asked)
+class _Rounds:
+    """Fits that follow one another. Each `correct_` method changes what the next fit assumes, or returns False."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        start: Start,
+        variance: NDArray[np.floating],
+        labels: NDArray[np.bool_],
+        options: FitOptions,
+        question: ObjectQuestion,
+    ) -> None:
+        """Begin with all labels; arguments as for `estimate_variance_components`."""
+        self.problem, self.state, self.additive_noise = problem, start.state, start.additive_noise
+        self.known, self.nearer = start.solution, start.nearer
+        self.variance, self.labels, self.options, self.question = variance, labels, options, question
+        self.kept = labels
+        self.needed = 0.0  # additive noise (px) of a fit that assumed none
+        self.examined = question is ObjectQuestion.NONE
+        self.shape: ShapeEvidence | ScaleEvidence | None = None
+        self.prior_scale: dict[str, float] = {}
+
+    def all_labels_fit(self) -> bool:
+        """Check that the start leads to a minimum without outliers."""
+        fit = self._fit()
+        self.known = fit.solution
+        return fit.converged and bool((fit.find_inliers(self.options.outlier) == self.labels).all())
+
+    def fit_again(self) -> None:
+        """Fit with what is assumed now."""
+        fit, self.known = self._fit(), None
+        self.fit = fit if fit.converged else _continue(fit, self.options)
+
+    def correct_gross_object(self) -> bool:
+        """Correct the object before outliers are removed, which may include all labels of a misplaced fiducial."""
+        if self.examined or not self.fit.converged or self.fit.is_clean(self.options.outlier):
+            return False
+        if self._bend():
+            return True
+        self.examined = True
+        return self._free_fiducials(GROSS_SCALE)
+
+    def correct_noise(self) -> bool:
+        """Take noise and outliers from the residuals.
+
+        Raises:
+            RefusedError: the fit has no minimum.
+            UndeterminedPosesError: without outliers, some snapshots do not determine the object's pose.
+        """
+        fit, solution = self.fit, self.fit.solution
+        self.kept = fit.find_inliers(self.options.outlier)
+        fewer = bool((self.kept != fit.seen).any())
+        if fewer:
+            require_poses(self.kept, fit.problem.points, fit.problem.part_of)
+        if not fit.converged:
+            rms = float(np.sqrt(fit.squared[fit.seen].mean()))
+            raise RefusedError(f"estimation: no minimum after {solution.iterations} iterations (RMS {rms:.3g} px)")
+        self.state, self.nearer = self.nearer or solution.state, None
+        previous, self.additive_noise = self.additive_noise, fit.additive_noise
+        # Barely significant noise appears when none is assumed, and vanishes when it is: keep it.
+        if previous == 0:
+            self.needed = self.additive_noise
+        if self.additive_noise == 0 and not fewer:
+            self.additive_noise = min(self.needed, previous)
+        return fewer or abs(self.additive_noise - previous) > 0.02 * previous
+
+    def correct_object(self) -> bool:
+        """Bend the object, or free misplaced fiducials."""
+        if self.question is ObjectQuestion.NONE:
+            return False
+        self.examined = True
+        return self._bend() or self._free_fiducials(0.0)
+
+    def correct_prior(self) -> bool:
+        """Widen the prior of values that have drifted more than it allows."""
+        self.state = self.fit.solution.state
+        too_narrow = _find_narrow_priors(self.state.offset[0].numpy(), self.fit.remaining)
+        if not too_narrow or max(self.prior_scale.values(), default=1.0) > self.options.widest_prior:
+            return False
+        self.prior_scale |= {kind: self.prior_scale.get(kind, 1.0) * factor for kind, factor in too_narrow.items()}
+        self.problem, self.state = _widen(self.fit.problem, self.state, too_narrow)
+        return True
+
+    def result(self) -> VarianceComponents:
+        """The latest fit, which has changed nothing."""
+        fit = self.fit
+        modes = mode_evidence(fit.problem, fit.solution, make_loss(self.options.estimation))
+        sigma = np.sqrt(fit.noise)
+        return VarianceComponents(
+            fit.problem, fit.solution, sigma, fit.seen, self.additive_noise, self.prior_scale, self.shape, modes
+        )
+
+    def _fit(self) -> _Fit:
+        """Fit the kept labels with the blobs' variance plus the additive noise, unless the minimum is known."""
+        noise = self.variance + self.additive_noise**2
+        root_weight = torch.from_numpy(np.where(self.kept, noise**-0.5, 0.0)).to(self.problem.uv)
+        problem = replace(self.problem, root_weight=root_weight[None])
+        solution = self.known or minimize(problem, self.state, self.options.estimation)
+        return _Fit(problem, solution, noise, self.kept, self.variance)
+
+    def _bend(self) -> bool:
+        """Take the step of the object's modes, unless they have converged."""
+        fit = self.fit
+        asked = mode_evidence(fit.problem, fit.solution, make_loss(self.options.estimation))
+        if asked is None or asked.at_rest:
+            return False
+        self.problem, self.state = bend_object(fit.problem, asked), fit.solution.state
+        return True
+
+    def _free_fiducials(self, least_scale: float) -> bool:
+        """Give misplaced fiducials tolerances; see `_examine`."""
+        self.shape, free = _examine(self.fit, self.options, least_scale, self.question)
+        if free is None:
+            return False
+        (self.problem, self.state), self.kept = free, self.labels
+        return True
 
 
 def _examine(
@@ -309,22 +373,6 @@ def _require_scale(shape: ShapeEvidence | ScaleEvidence, fit: _Fit, least: float
             command=f"measure it again, check its unit, or give its scale a tolerance (now {granted:g}): "
             "--object-scale-tolerance",
         )
-
-
-def _fit(
-    problem: Problem,
-    state: State,
-    additive_noise: float,
-    variance: NDArray[np.floating],
-    seen: NDArray[np.bool_],
-    options: FitOptions,
-    known: Solution | None,
-) -> _Fit:
-    """Fit labels `seen` (S, C, N) with the blobs' variance (px^2) plus noise (px), unless the solution is known."""
-    noise = variance + additive_noise**2
-    root_weight = torch.from_numpy(np.where(seen, noise**-0.5, 0.0)).to(problem.uv)
-    problem = replace(problem, root_weight=root_weight[None])
-    return _Fit(problem, known or minimize(problem, state, options.estimation), noise, seen, variance)
 
 
 def _continue(fit: _Fit, options: FitOptions) -> _Fit:

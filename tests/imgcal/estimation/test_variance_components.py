@@ -82,7 +82,7 @@ def test_a_calibration_reports_the_residuals_of_the_rig_that_it_returns(seed) ->
 def fits_made(monkeypatch) -> list[int]:
     """Number of fits of each calibration from now on, the latest last."""
     counts: list[int] = []
-    estimate_variance_components, fit = fitting.estimate_variance_components, variance_components._fit
+    estimate_variance_components, fit = fitting.estimate_variance_components, variance_components._Rounds._fit
 
     def counted(*args, **kwargs):
         counts[-1] += 1
@@ -92,7 +92,7 @@ def fits_made(monkeypatch) -> list[int]:
         counts.append(0)
         return estimate_variance_components(*args, **kwargs)
 
-    monkeypatch.setattr(variance_components, "_fit", counted)
+    monkeypatch.setattr(variance_components._Rounds, "_fit", counted)
     monkeypatch.setattr(fitting, "estimate_variance_components", started)
     return counts
 
