@@ -95,6 +95,10 @@ class PipelineOptions:
         estimation = replace(self.estimation, threshold=max(self.estimation.threshold, BOARD_THRESHOLD))
         return replace(self, outlier=max(self.outlier, BOARD_OUTLIER), estimation=estimation)
 
+    def begin_at(self, pose: RigidTransform | None) -> PipelineOptions:
+        """Options for snapshots that begin later: the object's approximate pose in their first one, None = not known."""
+        return self if self.start_pose is None else replace(self, start_pose=pose)
+
 
 def orient(identity: Identity, obj: CalibrationObject, given: RigidTransform) -> Identity:
     """Choose, among the labellings that the object's symmetry allows, the one whose orientation is nearest to a given

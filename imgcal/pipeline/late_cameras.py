@@ -11,8 +11,9 @@ from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
 from imgcal.pipeline.clock_offset import LateCamera, find_late_camera, suspects
 from imgcal.pipeline.fitting import fit_labelled
-from imgcal.pipeline.label_counts import LabelCounts, count_labels
+from imgcal.pipeline.label_counts import LabelCounts
 from imgcal.pipeline.labelled_capture import arrange_labels
+from imgcal.pipeline.motion_check import count_fitting_labels
 from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError
 
 
@@ -35,8 +36,7 @@ def require_same_moments(
         options: how certain a result must be.
     """
     arranged = arrange_labels(labelled, rig, obj)
-    labels = arranged.observations.seen.numpy()
-    counts = count_labels(arranged.labelled, labels, arranged.poses, rig, obj)
+    counts = count_fitting_labels(arranged, rig, obj, options)
     moves = error.moved if isinstance(error, MovedError) else ()
     moved = tuple((move.camera, detections.snapshot_names.index(move.snapshot)) for move in moves)
     for slipped in find_late_cameras(detections, counts, rig, obj, options, moved, arranged.labelled):
@@ -77,7 +77,8 @@ def find_late_cameras(
         detections, obj = _select_part(detections, obj, int(counts_of_parts.argmax()))
 
     def others(blobs: Detections) -> tuple[list[int], RigidTransform]:
-        fit = fit_labelled(associate(blobs, rig, obj, options), rig, obj, replace(options, blind_cameras=True))
+        lenient = replace(options, blind_cameras=True)
+        fit = fit_labelled(associate(blobs, rig, obj, options.begin_at(None)), rig, obj, lenient)
         return fit.labelled.used, fit.rig_from_object
 
     found = (find_late_camera(detections, rig, obj, camera, around, others) for camera, around in asked.items())

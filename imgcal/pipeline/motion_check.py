@@ -24,6 +24,7 @@ from imgcal.estimation import (
     pose_at,
     rig_at,
 )
+from imgcal.geometry import RigidTransform
 from imgcal.pipeline.label_counts import LabelCounts, count_labels
 from imgcal.pipeline.labelled_capture import LabelledCapture, arrange_labels
 from imgcal.types import CalibrationObject, CameraRig, Detections, MovedCamera, MovedError
@@ -75,10 +76,11 @@ def steady_part(
     total, first, names = len(detections.snapshot_names), 0, detections.snapshot_names
     for _ in range(MOST_MOVES):
         first = max(names.index(move.snapshot) for move in found if move.snapshot is not None)
-        explained = _are_explained(found, detections, first, rig, obj, options)
+        later = options.begin_at(_pose_from(labelled, first))
+        explained = _are_explained(found, detections, first, rig, obj, (options, later))
         if not (options.after_last_move and explained):
             raise MovedError(moved, len(set(names[first:])), len(set(names)), explained, labelled.detections)
-        part = associate(detections.of_snapshots(first, total), rig, obj, options)
+        part = associate(detections.of_snapshots(first, total), rig, obj, later)
         found = list_moves(part, rig, obj, options)
         if not found:
             return SteadyPart(arrange_labels(_prepend_earlier(part, labelled, names[first]), rig, obj), tuple(moved))
@@ -86,9 +88,15 @@ def steady_part(
     raise MovedError(moved, len(set(names[first:])), len(set(names)), labelled=labelled.detections)
 
 
+def _pose_from(labelled: Associations, first: int) -> RigidTransform | None:
+    """The object's pose in the first snapshot from a number on in which it is known."""
+    poses = (snapshot.rig_from_object for snapshot in labelled.snapshots[first:])
+    return next((pose for pose in poses if pose is not None), None)
+
+
 def _are_explained(
     moves: tuple[MovedCamera, ...], detections: Detections, first: int, rig: CameraRig, obj: CalibrationObject,
-    options: PipelineOptions,
+    options: tuple[PipelineOptions, PipelineOptions],
 ) -> bool:  # fmt: skip
     """Tell whether cameras that were lost at a moment fit the others before and after it, each part by itself.
 
@@ -101,13 +109,13 @@ def _are_explained(
         first: number of the first snapshot after the last move.
         rig: the factory calibration.
         obj: the calibration object.
-        options: how certain identification must be.
+        options: how certain identification must be, before and after it.
     """
     lost = [rig.camera_names.index(move.camera) for move in moves if move.size is None]
-    for begin, end in ((0, first), (first, len(detections.snapshot_names))) if lost else ():
+    parts = (detections.of_snapshots(0, first), detections.of_snapshots(first, len(detections.snapshot_names)))
+    for part, own in zip(parts, options, strict=True) if lost else ():
         try:
-            part = arrange_labels(associate(detections.of_snapshots(begin, end), rig, obj, options), rig, obj)
-            counts = _fit(part, rig, obj, options).tally
+            counts = count_fitting_labels(arrange_labels(associate(part, rig, obj, own), rig, obj), rig, obj, own)
         except RefusedError:
             return False
         if (counts.unexplained > counts.kept)[:, lost].sum() > MOST_MIXED * (counts.usable > 0)[:, lost].sum():
@@ -176,6 +184,13 @@ class _Fit:
     fits: tuple[Solution, ...]  # with the noise for identification, with that of the residuals
 
 
+def count_fitting_labels(
+    arranged: LabelledCapture, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> LabelCounts:
+    """Count the labels, with those kept that one rig fits."""
+    return _fit(arranged, rig, obj, options).tally
+
+
 def _fit(arranged: LabelledCapture, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> _Fit:
     """Estimate one rig from all labels, with the noise that the residuals show.
 
@@ -216,7 +231,7 @@ def _label_again(
     try:
         given = labelled.by_moment() if obj.parts else detections
         given = replace(given.select(rows), fiducial=np.full(len(rows), -1))
-        again = associate(given, rig, obj, options).detections
+        again = associate(given, rig, obj, options.begin_at(None)).detections
     except RefusedError:
         return labelled
     old, new = detections.fiducial[rows], again.fiducial

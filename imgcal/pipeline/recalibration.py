@@ -169,7 +169,7 @@ class _Case:
 
     def try_conventions(self, error: RefusedError) -> None:
         """Replace a refusal if images or rig follow other conventions; see `require_conventions`."""
-        options = replace(self.options, blind_cameras=True)
+        options = replace(self.options, blind_cameras=True).begin_at(None)
 
         def fit(some: Detections, rig: CameraRig) -> float:
             with require_solvable():
