@@ -30,10 +30,10 @@ def settle_turns(detections: Detections, rig: CameraRig, obj: CalibrationObject)
     rotation = rig.cam_from_rig.rotation.double().mT @ cam_from_object.rotation.double()  # board in the rig frame
     fiducial = detections.fiducial.copy()
     angles = [angle for angle, _ in obj.board.turns]
-    for snapshot in range(len(known)):
-        cameras = np.flatnonzero(known[snapshot])
+    for row, snapshot in enumerate(np.unique(detections.snapshot)):
+        cameras = np.flatnonzero(known[row])
         for camera in cameras[1:].tolist():
-            between = rotation[snapshot, cameras[0]].mT @ rotation[snapshot, camera]
+            between = rotation[row, cameras[0]].mT @ rotation[row, camera]
             turn = float(torch.atan2(between[1, 0], between[0, 0]))
             away = [abs(np.angle(np.exp(1j * (turn - angle)))) for angle in angles]
             motion = obj.board.turns[int(np.argmin(away))][1]

@@ -23,7 +23,8 @@ def test_images_that_do_not_say_the_turn_of_a_board_agree_about_it():
     for image, (s, c) in enumerate(np.unique(np.stack((seen.snapshot, seen.camera), 1), axis=0)):
         rows = (seen.snapshot == s) & (seen.camera == c)
         turned[rows] = obj.board.turns[image % 4][1][turned[rows]]
-    found = settle_turns(replace(seen, fiducial=turned), rig, obj)
+    there = seen.snapshot != 1  # no camera sees the board there
+    found = settle_turns(replace(seen, fiducial=turned).select(there), rig, obj)
     assert float(calibrate(found, rig, obj).rms) < 0.01
     with pytest.raises(RefusedError, match="looks the same when turned"):
         calibrate_from_scratch(found, rig, obj)
