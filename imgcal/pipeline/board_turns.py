@@ -14,17 +14,20 @@ from torch import Tensor
 from imgcal.association import PipelineOptions, to_observations
 from imgcal.errors import RefusedError
 from imgcal.estimation import (
+    EstimationOptions,
     ObjectQuestion,
     Start,
+    estimate,
     estimate_variance_components,
     evidence_by_snapshot,
+    has_poses,
     initial_state,
     make_loss,
     make_problem,
     single_camera_poses,
 )
 from imgcal.pipeline.labelled_capture import LabelledCapture
-from imgcal.types import Board, CalibrationObject, CameraRig, Detections
+from imgcal.types import Board, CalibrationObject, CameraRig, Detections, Observations
 
 CLEAR = 5.0
 """Logarithm of the odds from which a snapshot is turned; one that shows little of the bend stays as it is."""
@@ -103,6 +106,38 @@ def settle_bend(
             break
         arranged = arranged.relabel(np.flatnonzero(turned), place, rig, obj)
     return arranged
+
+
+def settle_labels(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> Detections:
+    """Do what `settle_turns` does with a rig that is known, and turn each snapshot as the board's known bend shows it.
+
+    Args:
+        detections: points of a board, with an arbitrary orientation in each image.
+        rig: stays fixed.
+        obj: the object; one without a board, or whose images show its orientation, is left alone.
+    """
+    settled, board = settle_turns(detections, rig, obj), obj.board
+    place = None if board is None or board.bend[0] == board.bend[1] else _quarter_turn(board)
+    if place is None:
+        return settled
+    turned = replace(settled, fiducial=np.where(settled.fiducial >= 0, place[settled.fiducial], -1))
+    as_is, exchanged = (_pose_costs(labelled, rig, obj) for labelled in (settled, turned))
+    better = np.unique(settled.snapshot)[as_is - exchanged > CLEAR]
+    return replace(settled, fiducial=np.where(np.isin(settled.snapshot, better), turned.fiducial, settled.fiducial))
+
+
+def _pose_costs(labelled: Detections, rig: CameraRig, obj: CalibrationObject) -> NDArray[np.float64]:
+    """Cost of the best pose in each snapshot, with a fixed rig: (S,); 0 = its labels determine none."""
+    observations = to_observations(labelled, rig, obj)
+    known = torch.from_numpy(has_poses(observations.seen.numpy(), obj.points))
+    costs = observations.uv.new_zeros(len(known))
+    if bool(known.any()):
+        uv, sigma, seen = (part[known][:, None] for part in (observations.uv, observations.sigma, observations.seen))
+        fixed = uv.new_zeros(rig.num_cameras, rig.num_parameters)
+        rigs, robust = rig.expand(len(uv)), EstimationOptions(loss="cauchy")
+        fit = estimate(Observations(uv, sigma, seen), rigs, obj.as_exact(), prior_std=fixed, options=robust)
+        costs[known] = 0.5 * fit.chi2
+    return costs.numpy()
 
 
 def _quarter_turn(board: Board) -> NDArray[np.int64] | None:

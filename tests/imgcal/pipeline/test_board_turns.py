@@ -8,7 +8,7 @@ import torch
 
 import imgcal
 from imgcal.errors import RefusedError
-from imgcal.pipeline import calibrate, calibrate_from_scratch
+from imgcal.pipeline import calibrate, calibrate_from_scratch, score
 from imgcal.pipeline.board_turns import find_exchanged, settle_turns
 from imgcal.synthesis import PhysicalDrift, simulate_board, true_detections
 from imgcal.types import Board, CalibrationObject
@@ -65,6 +65,14 @@ def test_a_known_bend_decides_the_turn_of_every_snapshot(warp):
     expected, found = calibrate(seen, rig, obj), calibrate(turned, rig, obj)
     assert float(found.rms) == pytest.approx(float(expected.rms), rel=1e-3)
     torch.testing.assert_close(found.rig.focal_length, expected.rig.focal_length, rtol=1e-5, atol=0)
+
+
+def test_a_score_takes_a_known_bend_the_right_way_round():
+    board = Board("circles", 7, 7, 20.0, bend=(1.0, -0.5))
+    rig, seen, turned = bend_at_random(board, 6, drift=None)
+    obj = CalibrationObject.of_board(board)
+    expected, found = score(seen, rig, obj), score(turned, rig, obj)
+    assert float(found.distances.max()) == pytest.approx(float(expected.distances.max()), rel=1e-3)
 
 
 def test_snapshots_that_do_not_show_a_bend_keep_their_labels():
