@@ -54,6 +54,7 @@ from .rig_from_points import PointStart, cold_start_from_points, move_to_pair_fr
 from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens, robust_std, single_camera_poses
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion, uncertainty_over
 from .robust_losses import cauchy, squared
+from .shape_modes import evidence_by_snapshot
 from .snapshot_scatter import BlockScatter, block_scatter
 from .variance_components import BENT, ObjectQuestion, Start, estimate_variance_components
 
@@ -104,6 +105,7 @@ __all__ = [
     "error_by_step",
     "estimate",
     "estimate_variance_components",
+    "evidence_by_snapshot",
     "find_moves",
     "fit_pose",
     "flat_std",

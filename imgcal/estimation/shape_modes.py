@@ -7,6 +7,7 @@ poses and tolerances marginalized. A Gauss-Newton step of the modes alone follow
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,9 @@ from torch import Tensor
 from imgcal.estimation.levenberg_marquardt import Factorization, Solution
 from imgcal.estimation.linearization import (
     POSE_PARAMETERS,
+    Jacobian,
     Problem,
+    State,
     Step,
     append_scale,
     jacobian_at,
@@ -54,19 +57,11 @@ def direction_evidence(
     if bool(factorization.reduced.failed.any()):
         return None
     count, prior_std = len(directions), problem.object_prior_std
-    unit = problem.uv.new_ones(1, 3 * len(problem.points) + 1)
     own, pull = problem.uv.new_zeros(count, count), problem.uv.new_zeros(count)
     each, camera, poses = problem.uv.new_zeros(len(problem.points), 3), [], []
-    border = torch.zeros_like(unit).expand(count, -1).clone()
-    together = max(1, POINTS_AT_ONCE // problem.uv[0, 0, :, 0].numel())
-    for first in range(0, problem.uv.shape[1], together):
-        rows = slice(first, first + together)
-        std = unit if prior_std is None else prior_std
-        some = replace(problem, uv=problem.uv[:, rows], root_weight=problem.root_weight[:, rows], object_prior_std=std)
-        at = jacobian_at(some, replace(state, rotation=state.rotation[:, rows], centre=state.centre[:, rows]))
+    border = problem.uv.new_zeros(count, 3 * len(problem.points) + 1)
+    for some, at, weight, along in _along(problem, state, loss, directions):
         assert at.by_fiducial is not None
-        weight = robust_weight(some, at, loss)[0].unsqueeze(-2)  # (S, C, 1, N)
-        along = torch.einsum("scirn,kni->kscrn", at.by_fiducial[0], directions)  # (K, S, C, 2, N)
         heavy = along * weight
         own = own + torch.einsum("kscrn,lscrn->kl", heavy, along)
         pull = pull - (heavy * at.residual[0]).sum((1, 2, 3, 4))
@@ -88,6 +83,48 @@ def direction_evidence(
             own[k] -= border @ step.object
     follow = -torch.stack([step.camera for step in taken])
     return DirectionEvidence(0.5 * (own + own.mT), pull, follow, float(each.max()))
+
+
+def evidence_by_snapshot(
+    problem: Problem, state: State, loss: NamedLoss, directions: Tensor
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Compute the evidence of each of S snapshots on directions (K, N, 3) mm, one rig (B = 1), which stays fixed.
+
+    Returns:
+        Information (S, K, K), with the pose marginalized, and pull (S, K); see `DirectionEvidence`.
+    """
+    information, pull = [], []
+    for _, at, weight, along in _along(problem, state, loss, directions):
+        pose, residual = at.by_rig[0, :, :, -POSE_PARAMETERS - 1 : -1], at.residual[0]  # (S, C, 6, 2, N)
+        heavy, heavy_pose = along * weight, pose * weight.unsqueeze(-3)
+        across = torch.einsum("scirn,kscrn->ski", pose, heavy)
+        taken = torch.linalg.solve(torch.einsum("scirn,scjrn->sij", heavy_pose, pose), across.mT).mT  # (S, K, 6)
+        own = torch.einsum("kscrn,lscrn->skl", heavy, along)
+        information.append(own - taken @ across.mT)
+        gradient = torch.einsum("scirn,scrn->si", heavy_pose, residual)
+        pull.append((taken @ gradient[..., None])[..., 0] - torch.einsum("kscrn,scrn->sk", heavy, residual))
+    return torch.cat(information).numpy(), torch.cat(pull).numpy()
+
+
+def _along(
+    problem: Problem, state: State, loss: NamedLoss, directions: Tensor
+) -> Iterator[tuple[Problem, Jacobian, Tensor, Tensor]]:
+    """Differentiate the pixels of a few snapshots at a time.
+
+    Yields:
+        The problem of S snapshots, the derivatives of its pixels, their weights (S, C, 1, N) px^-2, and the derivatives
+        along directions (K, N, 3) mm: (K, S, C, 2, N).
+    """
+    unit, prior_std = problem.uv.new_ones(1, 3 * len(problem.points) + 1), problem.object_prior_std
+    together = max(1, POINTS_AT_ONCE // problem.uv[0, 0, :, 0].numel())
+    for first in range(0, problem.uv.shape[1], together):
+        rows = slice(first, first + together)
+        std = unit if prior_std is None else prior_std
+        some = replace(problem, uv=problem.uv[:, rows], root_weight=problem.root_weight[:, rows], object_prior_std=std)
+        at = jacobian_at(some, replace(state, rotation=state.rotation[:, rows], centre=state.centre[:, rows]))
+        assert at.by_fiducial is not None
+        along = torch.einsum("scirn,kni->kscrn", at.by_fiducial[0], directions)
+        yield some, at, robust_weight(some, at, loss)[0].unsqueeze(-2), along
 
 
 def _solve(factorization: Factorization, right: Step) -> Step:

@@ -77,6 +77,7 @@ class ObjectQuestion(Enum):
     """What to test about the object."""
 
     NONE = "nothing"
+    MODES = "its modes alone"
     SHAPE = "its shape; misplaced fiducials are freed"
     SHAPE_OF_TURNS = "its shape, but labels may differ by a symmetry: misplaced fiducials cannot be identified"
 
@@ -307,6 +308,8 @@ def _examine(
     Raises:
         RefusedError: the object has another scale, or it is bent and symmetric.
     """
+    if question is ObjectQuestion.MODES:
+        return None, None
     shape = object_evidence(fit.problem, fit.solution, make_loss(options.estimation))
     if shape is None:
         return None, None

@@ -19,6 +19,7 @@ from imgcal.online.light_labels import label_lights
 from imgcal.online.object_checks import object_event
 from imgcal.online.prediction_labels import near_prediction
 from imgcal.online.snapshot_update import test_clocks, test_object
+from imgcal.pipeline import settle_labels
 from imgcal.types import Detections
 
 MOST_VAIN = 64
@@ -54,6 +55,7 @@ def label_snapshot(
     """
     if memory.lights is not None:
         return Labelled(*label_lights(memory, memory.lights, usable))
+    usable = settle_labels(usable, memory.belief.rig, memory.obj_now)
     coded = usable.fiducial.copy() if (usable.fiducial >= 0).any() else None
     followed = None if coded is not None else _follow(memory, labelling, usable)
     if followed is not None:

@@ -1,3 +1,4 @@
+from .board_turns import settle_labels
 from .calibration import Calibration
 from .camera_motion import MOVED, Motion, motion_since_factory
 from .capture_detection import capture_sight, detect_capture, read_masks
@@ -51,5 +52,6 @@ __all__ = [
     "read_masks",
     "rms_length",
     "score",
+    "settle_labels",
     "unit_doubt",
 ]

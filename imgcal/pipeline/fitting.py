@@ -23,6 +23,7 @@ from imgcal.estimation import (
     make_problem,
     object_prior_std,
 )
+from imgcal.pipeline.board_turns import settle_bend
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.initialization import Initialization, Initializer, prediction_residual
 from imgcal.pipeline.label_counts import count_labels
@@ -146,9 +147,13 @@ def _fit_once(
     arranged: LabelledCapture, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions, known: _Known
 ) -> Calibration:
     """Fit, unless some snapshots do not determine the object's pose without outliers."""
-    labelled, observations, latest = arranged.labelled, arranged.observations, known.latest
+    latest = known.latest
+    require_cameras(arranged.observations.seen.numpy(), rig, options)
+    prior = (rig.prior or RigPrior()).std(rig) if known.prior_std is None else known.prior_std
+    if latest is None and (settled := settle_bend(arranged, rig, obj, prior, options)) is not arranged:
+        arranged, known = settled, replace(known, fits=())
+    labelled, observations = arranged.labelled, arranged.observations
     variance, labels = observations.sigma.numpy() ** 2, observations.seen.numpy()
-    require_cameras(labels, rig, options)
     alike = labelled.identity == "ambiguous" and len(labelled.used) > 1
     if alike and bool(object_prior_std(obj)[:-1].any()):
         raise RefusedError(
@@ -157,7 +162,6 @@ def _fit_once(
             python="give labels (Detections.fiducial), use an object without symmetry, or one without tolerances",
             command="give labels (a column `fiducial`), use an object without symmetry, or one without tolerances",
         )
-    prior = (rig.prior or RigPrior()).std(rig) if known.prior_std is None else known.prior_std
     problem = make_problem(observations, rig, _adopt_tolerances(obj, latest), prior)
     guess = None if known.initializer is None else known.initializer.guess(observations, rig, obj)
     guess_used = guess is not None and _is_nearer(guess, Prediction(rig, arranged.poses), observations, obj)

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from imgcal.association import Associations, accepted_observations, drop_merged, drop_snapshots
 from imgcal.estimation import UNPOSED, UndeterminedPosesError, initial_pose, require_poses
 from imgcal.geometry import RigidTransform
@@ -24,6 +27,19 @@ class LabelledCapture:
     ) -> LabelledCapture:
         """Refuse some of the used snapshots, by their index among these."""
         return arrange_labels(drop_snapshots(self.labelled, rows, reason), rig, obj)
+
+    def relabel(
+        self, rows: NDArray[np.int64], fiducial: NDArray[np.int64], rig: CameraRig, obj: CalibrationObject
+    ) -> LabelledCapture:
+        """Replace each fiducial by `fiducial` (N,) of it in some of the used snapshots, by their index among these."""
+        numbers = np.array(self.labelled.used)[rows]
+        detections, snapshots = self.labelled.detections, list(self.labelled.snapshots)
+        there = np.isin(detections.snapshot, numbers) & (detections.fiducial >= 0)
+        labels = np.where(there, fiducial[detections.fiducial], detections.fiducial)
+        for number in self.labelled.used:  # poses are found anew
+            snapshots[number] = replace(snapshots[number], rig_from_object=None)
+        table = replace(detections, fiducial=labels)
+        return arrange_labels(replace(self.labelled, detections=table, snapshots=tuple(snapshots)), rig, obj)
 
 
 def arrange_labels(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> LabelledCapture:

@@ -19,7 +19,7 @@ from imgcal.association import (
 )
 from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
-from imgcal.pipeline.board_turns import settle_turns
+from imgcal.pipeline.board_turns import settle_labels
 from imgcal.pipeline.lights import FoundLights, find_lights
 from imgcal.pipeline.sources import Frames, as_one, as_unknown_marker, find_blobs
 from imgcal.pipeline.units import require_solvable, require_units
@@ -114,7 +114,7 @@ def score(
     """
     obj = as_one(obj)
     rig, options = rig.to(torch.float64), options.of_object(obj)
-    detections = settle_turns(find_blobs(source, rig, obj, detection), rig, obj)
+    detections = settle_labels(find_blobs(source, rig, obj, detection), rig, obj)
     obj = as_unknown_marker(obj, detections)
     if obj.unknown_markers:
         with require_solvable():

@@ -80,14 +80,13 @@ class Board:
     @cached_property
     def points(self) -> NDArray[np.float64]:
         """Fiducials of the flat board with its known bend: (N, 3) mm."""
-        flat = self._flat
-        return flat + np.tensordot(np.array(self.bend), self._deflections(flat), 1)
+        return self._flat + np.tensordot(np.array(self.bend), self.deflections, 1)
 
     @property
     def modes(self) -> NDArray[np.float64]:
         """Displacements (2, N, 3) mm of fiducials by one standard deviation of each deflection; (0, N, 3) if exact."""
-        flat, std = self._flat, self.warp_std
-        return std * self._deflections(flat) if std > 0 else np.zeros((0, *flat.shape))
+        std = self.warp_std
+        return std * self.deflections if std > 0 else self.deflections[:0]
 
     @property
     def warp_std(self) -> float:
@@ -114,12 +113,13 @@ class Board:
         share = (xy - low) / extent
         return 4 * (share * (1 - share)) @ np.array(self.bend)
 
-    @staticmethod
-    def _deflections(flat: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Displacements (2, N, 3) by a deflection of 1 mm along x and y.
+    @property
+    def deflections(self) -> NDArray[np.float64]:
+        """Displacements (2, N, 3) of fiducials by a deflection of 1 mm along x and y.
 
         Source: mrcal, "board deformation": z = 4 wx s (1 - s) + 4 wy t (1 - t), s and t from 0 to 1 over the fiducials.
         """
+        flat = self._flat
         share = (flat[:, :2] - flat[:, :2].min(0)) / np.maximum(np.ptp(flat[:, :2], axis=0), 1e-300)
         result = np.zeros((2, *flat.shape))
         result[..., 2] = (4 * share * (1 - share)).T

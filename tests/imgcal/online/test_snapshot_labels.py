@@ -4,9 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+import imgcal
 from imgcal.errors import RefusedError
+from imgcal.online import RigKeeper
 from imgcal.online.snapshot_labels import MOST_VAIN
+from imgcal.synthesis import simulate_board, true_detections
+from imgcal.types import Board, CalibrationObject
 from scripts.benchmarks.rig_streams import Conditions
 from tests.imgcal.online.memories import Remembered
 
@@ -59,3 +64,18 @@ def test_labels_that_fit_nowhere_are_refused_until_the_rig_is_given_up() -> None
         made.labelled(wrong)
     assert memory.monitor.filter.count == 0
     assert [event.kind for event in memory.pending] == ["restart"]
+
+
+@pytest.mark.parametrize("board", [Board("circles", 7, 6, 20.0), Board("circles", 7, 7, 20.0, bend=(1.0, -0.5))])
+def test_images_that_do_not_say_the_turn_of_a_board_are_learnt_from(board: Board) -> None:
+    rig, obj, random = imgcal.load_rig("T4"), CalibrationObject.of_board(board), np.random.default_rng(0)
+    seen = true_detections(simulate_board(rig, obj, 5, torch.Generator().manual_seed(5), None))
+    seen = replace(seen, uv=seen.uv + 0.1 * random.standard_normal(seen.uv.shape), sigma=np.full(len(seen), 0.1))
+    place = np.stack([place for _, place in board.turns])
+    turn = random.integers(len(place), size=(5, rig.num_cameras))
+    turned = replace(seen, fiducial=place[turn[seen.snapshot, seen.camera], seen.fiducial])
+    keeper = RigKeeper(rig, obj)
+    for s in range(5):
+        assert keeper.update(turned.of_snapshots(s, s + 1), time=float(s)).refused is None
+    assert keeper.noise < 0.05
+    assert float((keeper.belief.rig.positions - rig.positions).norm(dim=-1).max()) < 0.5
