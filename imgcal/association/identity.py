@@ -96,7 +96,7 @@ class PipelineOptions:
         return replace(self, outlier=max(self.outlier, BOARD_OUTLIER), estimation=estimation)
 
     def begin_at(self, pose: RigidTransform | None) -> PipelineOptions:
-        """Options for snapshots that begin later: the object's approximate pose in their first one, None = not known."""
+        """Options for later snapshots: the object's approximate pose in the first of them; None = not known."""
         return self if self.start_pose is None else replace(self, start_pose=pose)
 
 

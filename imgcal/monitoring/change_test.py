@@ -240,10 +240,8 @@ def _whiten_by_all(information: Tensor, brought: Tensor, pull: Tensor, wide: int
 def _by_kind(values: Tensor, axes: int = 1) -> Tensor:
     """Divide the last axes, of K parameters each, by kind: (kinds, C, 3) or (kinds, C, 3, 3), filled with zeros."""
     most = max(part.stop - part.start for part in CHANGES.values())
-    parted = values.new_zeros(len(CHANGES), len(values), *axes * (most,))
-    for kind, part in enumerate(CHANGES.values()):
-        parted[kind, :, *axes * (slice(part.stop - part.start),)] = values[:, *axes * (part,)]
-    return parted
+    own = [(values[(slice(None), *axes * (part,))], most - part.stop + part.start) for part in CHANGES.values()]
+    return torch.stack([torch.nn.functional.pad(block, axes * (0, lacking)) for block, lacking in own])
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,18 @@ def test_a_slip_is_named_with_camera_and_snapshot(first, by, words):
     assert words in str(refused.value) and "--without cam03" in refused.value.for_command
 
 
+def test_a_slip_is_named_where_labels_are_given_and_the_object_jumps():
+    """No motion links one snapshot to the next; most of the camera's labels are then refused."""
+    rig, obj = read_rig("O6"), load_object("asymmetric8")
+    blobs = true_detections(simulate_truth(rig, obj, 24, torch.Generator().manual_seed(11), PhysicalDrift()))
+    noise = 0.05 * np.random.default_rng(0).standard_normal(blobs.uv.shape)
+    late = (blobs.camera == 3) & (blobs.snapshot >= 10)
+    shown = np.where(late, blobs.snapshot + 1, blobs.snapshot)
+    blobs = replace(blobs, uv=blobs.uv + noise, sigma=np.full(len(blobs), 0.05), snapshot=shown).select(shown < 24)
+    with pytest.raises(RefusedError, match=r"camera cam04: from snapshot 00011 on, its frames show .* earlier"):
+        calibrate(blobs, rig, obj)
+
+
 def test_a_slip_near_the_end_is_said_beside_the_result():
     rig, obj, blobs = moving_object(first=11, by=1)
     result = calibrate(blobs, rig, obj)

@@ -1,11 +1,15 @@
 """Cameras that move during a capture are named, with the time, the kind and the size; steady ones are not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from imgcal.association import PipelineOptions, associate
 from imgcal.errors import RefusedError
+from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.io import load_object
 from imgcal.pipeline import calibrate, score
 from imgcal.pipeline.motion_check import list_moves
 from imgcal.synthesis import Truth
@@ -67,6 +71,26 @@ def test_the_kind_of_a_move_is_told(change, kind, size):
     (move,) = found.value.moved
     assert (move.kind, move.snapshot) == (kind, "00020")
     assert abs(move.size - size) < 5 * move.sigma + 0.03 * size
+
+
+def test_the_pose_at_the_start_says_nothing_of_the_object_after_a_move():
+    """By then it has turned so far that another of its symmetric orientations is nearer to the first pose."""
+    cube = load_object("cube8")
+    rig, _, truth = damage.object_before_a_ring(28, 1)
+    count, first = len(truth.uv), 16
+    turn = rotation_from_vector(torch.tensor([0.0, 0.0, 1.0]) * 0.055 * torch.arange(count).double()[:, None])
+    rotation, centre = truth.rig_from_object.rotation[:1] @ turn, cube.points.double().mean(0)
+    place = truth.rig_from_object.apply(centre[None, None].expand(count, 1, 3))[:1, 0] - rotation @ centre
+    poses = RigidTransform(rotation, place)
+    image = truth.rig.expand(count).project(poses.apply(cube.points.double()), cube.radius)
+    truth = Truth(truth.rig, poses, image.uv, image.visible)
+    bumped = damage.changed_from(truth, cube, CAMERA, first, lambda r: damage.turned(r, CAMERA, 0.5))
+    coded = damage.blobs(bumped, 1, clutter=0.0, labelled=True)
+    options = replace(AFTER, start_pose=poses[0])
+    found = calibrate(replace(coded, fiducial=np.full(len(coded), -1)), rig, cube, options).labelled.detections
+    labelled = found.fiducial >= 0
+    assert labelled.sum() > 600
+    np.testing.assert_array_equal(found.fiducial[labelled], coded.fiducial[labelled])
 
 
 @pytest.mark.parametrize("degrees", [0.1, 1.0])
