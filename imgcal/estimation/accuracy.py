@@ -23,6 +23,8 @@ MAP_SIZE = (16, 24)
 """Rows and columns of each camera's error map, which covers the whole image."""
 MAP_DEPTHS = (0.05, 0.5, 0.95)
 """Depths of the maps, as quantiles of the depths at which a camera sees the working volume."""
+SAME_DISTANCE = 1.5
+"""Ratio of distances within which a place is at the cameras' working distance."""
 
 EXCEPTIONAL = 2.0
 """Multiple of the median camera's error beyond which a camera is an exception."""
@@ -252,15 +254,30 @@ def working_volume(calibration: Estimate) -> WorkingVolume:
 
     Returns:
         The box that holds the object, in any orientation, about every place where it was seen. If the rig has a working
-        distance, the place at that distance counts, too; a single snapshot then gives a useful box.
+        distance, the place at that distance counts, too, unless the rig's frame is another than the convention says; a
+        single snapshot then gives a useful box.
     """
     problem, rig = calibration.problem, detach_double(calibration.rig)
     pose = calibration.rig_from_object.to(torch.float64)
     centres = rotate(pose.rotation.detach(), problem.centroid.detach().to(pose.rotation)) + pose.translation.detach()
-    if rig.working_distance is not None:
-        centres = torch.cat((centres, centres.new_tensor([[0.0, 0.0, rig.working_distance]])))
+    if (usual := _usual_place(rig)) is not None:
+        centres = torch.cat((centres, usual[None]))
     reach = float(problem.points.norm(dim=-1).max())
     return WorkingVolume(centres.amin(0) - reach, centres.amax(0) + reach)
+
+
+def _usual_place(rig: CameraRig) -> Tensor | None:
+    """Where a rig's working distance puts the object: (3,) mm. None = it has none, or its frame is not of that kind.
+
+    By convention the cameras are near the origin and look along z: then they see this place, and are as far from it.
+    """
+    if rig.working_distance is None:
+        return None
+    place = rig.positions.new_tensor((0.0, 0.0, rig.working_distance))
+    distance = float((rig.positions - place).norm(dim=-1).median())
+    as_far = 1 / SAME_DISTANCE < distance / rig.working_distance < SAME_DISTANCE
+    seen = rig.project(place[None]).visible.to(place).mean()
+    return place if as_far and float(seen) > 0.5 else None
 
 
 def _maps(uncertainty: RigUncertainty, volume: WorkingVolume, depths: Tensor) -> ErrorMaps:

@@ -158,7 +158,7 @@ class CameraRig:
     image_size: Tensor  # (C, 2) pixels: width, height
     camera_names: tuple[str, ...]  # C
     name: str = "rig"
-    working_distance: float | None = None  # mm, from the rig's origin to the object
+    working_distance: float | None = None  # mm, from the rig's origin along z to the object
     prior: RigPrior | None = None
     drift_rate: DriftRate | None = None  # None = the defaults
     volume: ConvexVolume | None = None  # working volume, in the rig frame

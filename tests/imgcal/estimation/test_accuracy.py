@@ -9,7 +9,7 @@ from imgcal import InputError, PipelineOptions, calibrate, estimate, predicted_e
 from imgcal.cli.common import select_cameras
 from imgcal.estimation import MAP_DEPTHS, MAP_SIZE, WorkingVolume
 from imgcal.estimation.accuracy import GRID, joint_covariance, working_volume
-from imgcal.geometry import undistort
+from imgcal.geometry import RigidTransform, undistort
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from imgcal.types import Observations
 
@@ -98,6 +98,18 @@ def test_the_working_volume_holds_the_object_and_its_place(calibration, asymmetr
     nowhere = replace(calibration, rig=replace(calibration.rig, working_distance=None))
     reach = (asymmetric8.points - asymmetric8.points.mean(0)).norm(dim=1).max()
     assert (working_volume(nowhere).high - working_volume(nowhere).low >= 2 * reach - 1e-9).all()
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 850.0), (2000.0, 1500.0, 0.0)])  # at the object, in a corner of the room
+def test_a_working_distance_from_another_origin_says_nothing_of_the_volume(origin, o10, asymmetric8):
+    back = RigidTransform(torch.eye(3, dtype=F64), torch.tensor(origin, dtype=F64))
+    moved = replace(o10, cam_from_rig=o10.cam_from_rig.to(F64) @ back)
+    table = captured(o10, asymmetric8, 5)
+    usual, elsewhere = (calibrate(table, rig, asymmetric8).estimate for rig in (o10, moved))
+    low, high = (getattr(working_volume(elsewhere), name) + back.translation for name in ("low", "high"))
+    around = working_volume(replace(usual, rig=replace(usual.rig, working_distance=None)))
+    torch.testing.assert_close(low, around.low, atol=1.0, rtol=0)
+    torch.testing.assert_close(high, around.high, atol=1.0, rtol=0)
 
 
 def test_a_volume_of_ones_own(calibration, predicted):
