@@ -108,7 +108,7 @@ def _convert_to_ours(rig: ForeignRig, name: str, limit: float, hold_distortion: 
     notes: list[str] = []
     beside: str | None = None
     if made.posterior is not None:
-        posterior = None if hold_distortion else made.posterior()
+        posterior = None if hold_distortion else made.posterior().of_cameras(made.camera_names)
         if posterior is not None and posterior.belongs_to(made):
             beside = f"{name}{POSTERIOR}"
             files[beside] = posterior_bytes(posterior)

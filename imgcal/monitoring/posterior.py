@@ -77,15 +77,16 @@ def _about_cameras(posterior: RigPosterior, obj: CalibrationObject) -> RigBelief
 
 
 def calibration_posterior(rig: CameraRig) -> RigPosterior | None:
-    """Load the posterior of the calibration that made a rig; None = there is none, or the rig was changed since.
+    """Load the posterior of the calibration that made a rig, or these cameras of it.
+
+    Returns:
+        None = there is none, or values were changed since.
 
     Raises:
         InputError: the posterior's file cannot be used.
     """
-    if rig.posterior is None:
-        return None
-    posterior = rig.posterior()
-    return posterior if posterior.belongs_to(rig) else None
+    posterior = None if rig.posterior is None else rig.posterior().of_cameras(rig.camera_names)
+    return posterior if posterior is not None and posterior.belongs_to(rig) else None
 
 
 def _same(points: torch.Tensor, others: torch.Tensor) -> bool:

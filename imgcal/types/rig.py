@@ -416,6 +416,10 @@ class CameraRig:
         return replace(moved, image_size=self.image_size.to(device=device))
 
 
+SINGLE = 5e-7
+"""Relative difference of values that were kept in single precision."""
+
+
 @dataclass(frozen=True)
 class RigPosterior:
     """Joint posterior of a rig's values and the object's shape, in the form of `monitoring.RigBelief`.
@@ -433,14 +437,28 @@ class RigPosterior:
     snapshots: int  # number of snapshots that it is based on
     time: float | None = None  # s since the epoch, when it was made; None = unknown
 
+    def of_cameras(self, names: Sequence[str]) -> RigPosterior | None:
+        """Keep some cameras, in this order, whatever the others' values are; None = it does not know all of them."""
+        known, (cameras, size) = self.rig.camera_names, self.unit.shape
+        if tuple(names) == known:
+            return self
+        if not set(names) <= set(known):
+            return None
+        index = [known.index(name) for name in names]
+        rows = torch.arange(cameras * size).view(cameras, size)[index].flatten()
+        rows = torch.cat((rows, torch.arange(cameras * size, len(self.factor))))
+        covariance = torch.cholesky_inverse(self.factor)[rows][:, rows]
+        factor = torch.linalg.cholesky(torch.cholesky_inverse(torch.linalg.cholesky(covariance)))
+        return replace(self, rig=self.rig.select(index), factor=factor, unit=self.unit[index])
+
     def belongs_to(self, rig: CameraRig) -> bool:
-        """Tell whether this describes a rig with exactly these values, not one that has been changed since."""
+        """Tell whether this describes a rig with these values, to single precision, not one changed since."""
         mine, others = (
             (one.cam_from_rig.rotation, one.cam_from_rig.translation, one.focal_length, one.principal_point,
              one.distortion)
             for one in (self.rig, rig)
         )  # fmt: skip
         return all(
-            a.shape == b.shape and bool((a.double() - b.double()).abs().max() <= 1e-9 * (1 + a.double().abs().max()))
+            a.shape == b.shape and bool((a.double() - b.double()).abs().max() <= SINGLE * (1 + a.double().abs().max()))
             for a, b in zip(mine, others, strict=True)
         )

@@ -70,3 +70,21 @@ def test_a_rig_that_was_changed_has_no_posterior() -> None:
     assert posterior.snapshots == 4
     assert calibration_posterior(replace(result.rig, focal_length=result.rig.focal_length + 0.1)) is None
     assert calibration_posterior(factory) is None
+
+
+def test_some_cameras_in_another_order_and_in_single_precision_keep_what_is_known_of_them(made) -> None:
+    _, obj, _, _ = made
+    fit = batch(made, 6)
+    posterior = make_posterior(fit, obj)
+    rig, order = replace(posterior.rig, posterior=lambda: posterior), [2, 0, 3]
+    whole = belief_from_posterior(posterior, obj).covariance()
+    kept = calibration_posterior(rig.select(order))
+    assert kept is not None and kept.rig.camera_names == rig.select(order).camera_names
+    size = posterior.unit.shape[1]
+    rows = torch.arange(len(whole)).view(-1, size)[order].flatten()
+    found, expected = belief_from_posterior(kept, obj).covariance(), whole[rows][:, rows]
+    scale = expected.diagonal().sqrt()
+    assert torch.allclose(found / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-6)
+    assert calibration_posterior(rig.to(torch.float32)) is posterior
+    renamed = replace(rig, camera_names=("left", *rig.camera_names[1:]))
+    assert calibration_posterior(renamed) is None
