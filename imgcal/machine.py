@@ -4,6 +4,7 @@ import contextlib
 import gc
 import os
 from collections.abc import Iterator
+from functools import cache
 
 
 def usable_cores() -> int:
@@ -30,7 +31,13 @@ def without_garbage_collection() -> Iterator[None]:
     try:
         yield
     finally:
-        if not gc.get_freeze_count():
-            gc.freeze()
+        _exempt_once()
         if enabled:
             gc.enable()
+
+
+@cache
+def _exempt_once() -> None:
+    """Exempt what there is from garbage collection, unless that has been done already, as the tests do."""
+    if not gc.get_freeze_count():  # goes through all that is exempt, which takes a while
+        gc.freeze()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -49,7 +50,7 @@ def fit_lens(lens: Lens, image_size: tuple[int, int], holds: Holds) -> Fit:
     if holds.stores_exactly(lens):
         return Fit(replace(lens, model="opencv") if lens.model == "to_ideal" else lens, 0.0, 0.0, True)
     uv = pixel_grid(image_size, GRID)
-    rays = lens.rays(uv)
+    rays = grid_rays(lens, image_size, GRID)
     if not np.isfinite(rays).all():
         return Fit(lens, np.inf, np.inf, False)
     tried = [_opencv(lens, uv, rays, holds.opencv[-1])] if holds.opencv else []
@@ -65,11 +66,19 @@ def pixel_grid(image_size: tuple[int, int], count: int) -> Array:
     return np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
 
 
+@lru_cache(maxsize=64)  # a rig is written, read and compared with the same lenses
+def grid_rays(lens: Lens, image_size: tuple[int, int], count: int) -> Array:
+    """Find the rays of `pixel_grid`: (count^2, 3) with z = 1, read-only; nan where the lens has none."""
+    rays = lens.rays(pixel_grid(image_size, count))
+    rays.setflags(write=False)
+    return rays
+
+
 def _judge(lens: Lens, candidate: Lens, image_size: tuple[int, int]) -> Fit:
     """Compare on a finer grid than the fit's, with its own points between."""
     uv = pixel_grid(image_size, 2 * GRID)
-    away = np.linalg.norm(candidate.project(lens.rays(uv)) - uv, axis=-1)
-    back = candidate.rays(pixel_grid(image_size, 9))  # its fold must lie outside
+    away = np.linalg.norm(candidate.project(grid_rays(lens, image_size, 2 * GRID)) - uv, axis=-1)
+    back = grid_rays(candidate, image_size, 9)  # its fold must lie outside
     if not np.isfinite(away).all() or not np.isfinite(back).all():
         return Fit(candidate, np.inf, np.inf, False)
     return Fit(candidate, float(away.max()), float(np.sqrt((away**2).mean())), False)
@@ -95,7 +104,7 @@ def fit_lens_like(
     if like.model == lens.model and lens.length <= count and sayable and not lens.skew:
         return Fit(replace(lens, coefficients=tuple(lens.pad(count))), 0.0, 0.0, True)
     uv = pixel_grid(image_size, GRID)
-    rays = lens.rays(uv)
+    rays = grid_rays(lens, image_size, GRID)
     if not np.isfinite(rays).all():
         return Fit(lens, np.inf, np.inf, False)
     if like.model == "to_ideal":

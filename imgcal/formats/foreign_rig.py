@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from imgcal.errors import InputError
-from imgcal.formats.fitting import pixel_grid
+from imgcal.formats.fitting import grid_rays
 from imgcal.formats.lens import Array, Lens
 from imgcal.io import RigCovariance
 from imgcal.types import CameraRig
@@ -110,7 +110,7 @@ def known_points(rig: ForeignRig) -> list[Array]:
     found = []
     for camera in rig.cameras:
         assert camera.image_size is not None
-        rays = camera.lens.rays(pixel_grid(camera.image_size, SIDE))
+        rays = grid_rays(camera.lens, camera.image_size, SIDE)
         rays = rays[np.isfinite(rays).all(axis=-1)]
         points_cam = np.concatenate([rays * depth * size for depth in DEPTHS])
         found.append((points_cam - camera.translation) @ camera.rotation)

@@ -14,6 +14,7 @@ Model = Literal["opencv", "fisheye", "to_ideal"]
 
 STEPS = 24  # from the principal point outwards, so that each solution is near the one before
 NEWTON = 12
+NEAR = 1e-9  # on the z = 1 plane
 TINY = 1e-30
 CLOSE = 1e-11  # of what a pixel is asked to be, on the z = 1 plane
 STEEPEST = np.deg2rad(89.5)  # from the optical axis: beyond, a ray meets no plane z = 1
@@ -158,13 +159,16 @@ def undistort(wanted: Array, coefficients: list[float]) -> Array:
             target = centre + (wanted - centre) * (step / STEPS)
             for _ in range(NEWTON if step == STEPS else 4):
                 x, y = at.T
-                u_x, v_x = distort(x + 1j * tiny, y, coefficients)
-                u_y, v_y = distort(x, y + 1j * tiny, coefficients)
+                # Both derivatives in one call.
+                u, v = distort(np.concatenate((x + 1j * tiny, x)), np.concatenate((y, y + 1j * tiny)), coefficients)
+                (u_x, u_y), (v_x, v_y) = u.reshape(2, -1), v.reshape(2, -1)
                 a, b, c, d = u_x.imag / tiny, u_y.imag / tiny, v_x.imag / tiny, v_y.imag / tiny
                 determinant = a * d - b * c
                 miss_u, miss_v = u_x.real - target[:, 0], v_x.real - target[:, 1]
                 move = np.stack((d * miss_u - b * miss_v, a * miss_v - c * miss_u), axis=-1) / determinant[:, None]
                 at = at - move
+                if not (np.abs(move).max(axis=-1) > NEAR)[sound].any():  # the next step would move it by the square
+                    break
             sound &= (determinant > 0) & (a + d > 0)
         miss = np.abs(np.stack(distort(at[:, 0], at[:, 1], coefficients), axis=-1) - wanted).max(axis=-1)
         sound &= miss < CLOSE * (1 + np.abs(wanted).max(axis=-1))

@@ -49,7 +49,8 @@ def warm_up(all_lenses: bool = False) -> None:
         all_lenses: also compile what rigs need with a camera of any lens but the usual one.
     """
     usual = read_rig(RIG).resized(torch.tensor(SIZE))
-    for rig in (usual, replace_lenses(usual)) if all_lenses else (usual,):
+    # The others first: a process beside this one may be compiling for the usual one.
+    for rig in (replace_lenses(usual), usual) if all_lenses else (usual,):
         _warm_up(rig)
 
 

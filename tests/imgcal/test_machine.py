@@ -3,6 +3,7 @@ import os
 
 import pytest
 
+from imgcal import machine
 from imgcal.machine import usable_cores, without_garbage_collection
 
 
@@ -20,6 +21,7 @@ def test_a_system_that_does_not_say_lets_all_cores_be_used(monkeypatch):
 def test_garbage_is_collected_again_after_a_pause(enabled):
     before = gc.isenabled()
     gc.unfreeze()
+    machine._exempt_once.cache_clear()
     (gc.enable if enabled else gc.disable)()
     try:
         with pytest.raises(ImportError), without_garbage_collection():

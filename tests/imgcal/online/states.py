@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import torch
@@ -14,10 +15,17 @@ from imgcal.online import RigState
 from imgcal.types import Detections
 
 NOISE = 0.1
+RIG, OBJECT = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+BELIEF = RigBelief.of_prior(RIG, OBJECT)
 
 
+def expose_together(camera: int) -> float:
+    return 0.0
+
+
+@cache  # many tests look at the same states
 def state_at(
-    number: int, seconds: float, late: Callable[[int], float] = lambda camera: 0.0, bump: float = 0.0
+    number: int, seconds: float, late: Callable[[int], float] = expose_together, bump: float = 0.0
 ) -> RigState:
     """What a rig of four cameras sees of an object that is waved about.
 
@@ -27,7 +35,6 @@ def state_at(
         late: seconds by which each camera exposes later.
         bump: pixels by which the image of camera 1 is shifted.
     """
-    rig, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
     noise = np.random.default_rng(number)
 
     def pose_at(t: float) -> RigidTransform:
@@ -35,10 +42,10 @@ def state_at(
             torch.tensor([0.3 * np.sin(2.1 * t), 0.2 * np.sin(2.9 * t), 0.1], dtype=torch.float64)
         )
         away = torch.tensor([60 * np.sin(3.0 * t), 50 * np.cos(2.3 * t), 40 * np.sin(1.7 * t)], dtype=torch.float64)
-        return RigidTransform(turn, away + torch.tensor([0.0, 0.0, rig.working_distance or 1000.0]))
+        return RigidTransform(turn, away + torch.tensor([0.0, 0.0, RIG.working_distance or 1000.0]))
 
     def seen(t: float) -> np.ndarray:
-        return rig.expand(1).project_values(pose_at(t).apply(obj.points)[None], None).uv[0].numpy()
+        return RIG.expand(1).project_values(pose_at(t).apply(OBJECT.points)[None], None).uv[0].numpy()
 
     there = np.stack([seen(seconds + late(camera))[camera] for camera in range(4)])
     there = there + NOISE * noise.standard_normal(there.shape)
@@ -46,13 +53,13 @@ def state_at(
     camera, fiducial = np.divmod(np.arange(32), 8)
     blobs = Detections(
         there.reshape(-1, 2), np.full(32, NOISE), camera, np.zeros(32, dtype=np.int64), fiducial, np.full(32, 5.0),
-        np.zeros(32, dtype=np.uint8), rig.camera_names, (str(number),),
+        np.zeros(32, dtype=np.uint8), RIG.camera_names, (str(number),),
     )  # fmt: skip
-    depth = rig.expand(1).project_values(pose_at(seconds).apply(obj.points)[None], None).depth[0].numpy()
+    depth = RIG.expand(1).project_values(pose_at(seconds).apply(OBJECT.points)[None], None).depth[0].numpy()
     radius = 6.0 * 1500.0 / depth.reshape(-1) * np.exp(0.02 * noise.standard_normal(32))
     blobs = Detections(**{**vars(blobs), "radius": radius})
     return RigState(
-        time=seconds, snapshot=number, belief=RigBelief.of_prior(rig, obj), factory=rig, cameras={}, sentence="",
+        time=seconds, snapshot=number, belief=BELIEF, factory=RIG, cameras={}, sentence="",
         refused=None, detections=blobs, lag=np.zeros((32, 2)), predicted=seen(seconds), residual=np.zeros(4),
         rig_from_object=pose_at(seconds),
         events=(), clock_offset=np.full(4, np.nan), clock_offset_sigma=np.full(4, np.nan),

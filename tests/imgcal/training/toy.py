@@ -1,5 +1,7 @@
 """Tiny networks with the interface of the real ones; `python -m tests.imgcal.training.toy train ...` trains them."""
 
+import shutil
+
 import torch
 from torch import nn
 
@@ -98,8 +100,10 @@ def train(experiment, folder, resume=False, should_stop=lambda: False):
 
 
 def save_and_compare(run, told):
-    """Save, and make sure that all processes hold the same weights."""
+    """Save, keep a copy of the folder as it is now, and make sure that all processes hold the same weights."""
     save(run, told)
+    if run.accelerator.is_main_process:
+        shutil.copytree(told.folder, f"{told.folder}-{run.step}")
     copies = run.accelerator.gather(run.plain.head.weight.detach()[None].clone())
     assert (copies == copies[0]).all()
 
