@@ -173,7 +173,7 @@ class Watch(arguments.Watch):
     def _conclude(
         self, said: str, loop: Loop, intake: SourceReader, source: Source, refusals: FirstRefusals, interrupted: bool
     ) -> str:
-        """Add to what was said at the end whether anything was learned.
+        """Return the last line: `said`, and what had been read before.
 
         Raises:
             KeyboardInterrupt: Ctrl-C ended it.

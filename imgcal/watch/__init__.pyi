@@ -1,7 +1,7 @@
 from .bags import Bag
 from .earlier_run import EarlierRun, Known, Progress
 from .event_log import EventLog, forget_after
-from .exposures import CameraBlobs, Exposure, Item, Source, Unreadable, check_exposure
+from .exposures import CameraBlobs, Exposure, FileStamp, Item, Source, Unreadable, check_exposure
 from .first_refusals import FirstRefusals
 from .folder import Folder
 from .hook import Hook
@@ -58,6 +58,7 @@ __all__ = [
     "EarlierRun",
     "EventLog",
     "Exposure",
+    "FileStamp",
     "FirstRefusals",
     "Folder",
     "Hook",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from imgcal.errors import InputError
 from imgcal.io import read_json
-from imgcal.watch.exposures import Source
+from imgcal.watch.exposures import FileStamp, Source
 from imgcal.watch.folder import Folder
 from imgcal.watch.learning import adapted_networks
 from imgcal.watch.recordings import BlobTable
@@ -24,6 +25,7 @@ class Progress:
     logged: int | None = None  # size of events.jsonl at that time, in bytes
     source: str | None = None  # identity of the source; None = unknown
     rate: float | None = None  # snapshots per second of a source without times
+    files: Mapping[str, FileStamp] = field(default_factory=dict)  # of the last snapshot, by camera, if it has files
 
     @classmethod
     def load(cls, folder: Path) -> Progress | None:
@@ -45,7 +47,11 @@ class Progress:
                 raise ValueError("a name is not text")
             if not (logged is None or isinstance(logged, int)):
                 raise ValueError("the length is not a number")
-            return cls(time, name, logged, source, None if rate is None else float(rate))
+            files = {
+                camera: FileStamp(str(file), int(changed), int(size))
+                for camera, (file, changed, size) in dict(entry.get("files", ())).items()
+            }
+            return cls(time, name, logged, source, None if rate is None else float(rate), files)
         except (ValueError, TypeError, KeyError, OverflowError) as error:
             raise InputError(f"{path}: found something that imgcal watch did not write") from error
 
@@ -109,7 +115,8 @@ class EarlierRun:
         if progress is None:
             return run
         same = progress.source in (None, identity)  # earlier versions did not note it
-        if isinstance(source, Folder):  # skips files by their names
+        if isinstance(source, Folder):  # skips files by their names; it may have been moved
+            same = same or (len(progress.files) > 0 and source.holds(progress.files))
             return replace(run, after=progress.name, logged=progress.logged) if same else run
         if source.live and not keep_all:  # nothing comes twice: what it sent since the last save is lost
             return run

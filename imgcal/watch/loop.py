@@ -194,7 +194,8 @@ class Watch:
         self.tally.latest = state
         for exposure in snapshot.exposures.values():
             self.tally.count_time_stamp(exposure.camera, exposure.time - snapshot.time)
-        self._progress = Progress(snapshot.time, snapshot.name, source=self._source, rate=self._rate)
+        files = {name: exposure.file for name, exposure in snapshot.exposures.items() if exposure.file is not None}
+        self._progress = Progress(snapshot.time, snapshot.name, source=self._source, rate=self._rate, files=files)
         self._unsaved = True
         for event in state.events:
             self.publish_event(event)

@@ -1,4 +1,6 @@
 import json
+import os
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -7,8 +9,22 @@ import torch
 
 from imgcal.errors import InputError
 from imgcal.synthesis import simulate_truth, true_detections
-from imgcal.watch import ADAPTED, ADAPTED_CARD, LEARNING, BlobTable, EarlierRun, Folder, Known, Progress
-from tests.imgcal.watch.states import OBJECT, RIG
+from imgcal.watch import (
+    ADAPTED,
+    ADAPTED_CARD,
+    LEARNING,
+    BlobTable,
+    CameraBlobs,
+    EarlierRun,
+    Exposure,
+    FileStamp,
+    Folder,
+    Known,
+    Progress,
+    TimedSnapshot,
+    Watch,
+)
+from tests.imgcal.watch.states import OBJECT, RIG, KeeperOfStates
 
 SOURCE = "/data/capture"
 
@@ -101,10 +117,75 @@ def test_adapted_networks_are_found_whatever_the_source(tmp_path):
 
 @pytest.mark.parametrize(
     "text",
-    ["", "{}", "[1]", '{"progress": {"time": "x", "name": null}}', '{"progress": {"time": 1, "name": 2}}', "[" * 5000],
+    [
+        "",
+        "{}",
+        "[1]",
+        '{"progress": {"time": "x", "name": null}}',
+        '{"progress": {"time": 1, "name": 2}}',
+        "[" * 5000,
+        '{"progress": {"time": 1, "name": "a", "files": [1]}}',
+        '{"progress": {"time": 1, "name": "a", "files": {"cam01": [1]}}}',
+    ],
 )
 def test_progress_that_is_none_of_ours(text, tmp_path):
     (tmp_path / "state.json").write_text(text)
     for load in (Progress.load, lambda folder: EarlierRun.find(folder, Recording(), SOURCE)):
         with pytest.raises(InputError, match=r"state\.json: found"):
             load(tmp_path)
+
+
+def fill(folder, names=("9", "10", "11"), content=b"frame"):
+    for camera in RIG.camera_names:
+        (folder / "frames" / camera).mkdir(parents=True)
+        for name in names:
+            path = folder / "frames" / camera / f"{name}.png"
+            path.write_bytes(content + camera.encode())
+            os.utime(path, ns=(10**18, 1_700_000_000_123_456_789 + int(name)))
+    return folder
+
+
+def leave_after_reading(folder, out):
+    """Leave what a run has noted that read a folder of frames up to snapshot 10."""
+    paths = {name: folder / "frames" / name / "10.png" for name in RIG.camera_names[1:]}  # that of one came late
+    stamps = {name: FileStamp.of(path.name, path.stat()) for name, path in paths.items()}
+    out.mkdir()
+    return leave(out, source=str(folder), files=stamps)
+
+
+@pytest.mark.parametrize("copied", [False, True])
+def test_a_folder_that_was_moved_is_the_same_source(copied, tmp_path):
+    there, out, here = fill(tmp_path / "there"), tmp_path / "out", tmp_path / "here"
+    state = leave_after_reading(there, out)
+    shutil.copytree(there, here) if copied else there.rename(here)
+    assert EarlierRun.find(out, Folder(here, RIG), str(here)) == EarlierRun(state, after="10", logged=300)
+
+
+def change_time(path):
+    os.utime(path, ns=(10**18, path.stat().st_mtime_ns + 1))
+
+
+@pytest.mark.parametrize("change", [change_time, lambda path: path.write_bytes(b"another"), Path.unlink])
+def test_a_folder_that_only_has_the_same_names_is_another_source(change, tmp_path):
+    there, out, here = fill(tmp_path / "there"), tmp_path / "out", tmp_path / "here"
+    state = leave_after_reading(there, out)
+    there.rename(here)
+    assert EarlierRun.find(out, Folder(here, RIG), str(here)).after == "10"
+    change(here / "frames" / RIG.camera_names[-1] / "10.png")
+    assert EarlierRun.find(out, Folder(here, RIG), str(here)) == EarlierRun(state)
+
+
+def test_a_folder_is_another_source_where_its_files_were_not_noted(tmp_path):
+    state = leave(tmp_path)
+    assert EarlierRun.find(tmp_path, Folder(fill(tmp_path / "here"), RIG), "/here") == EarlierRun(state)
+
+
+def test_the_loop_notes_the_files_of_the_last_snapshot(tmp_path):
+    stamp = FileStamp("7.png", 1_700_000_000_123_456_789, 5)
+    exposures = {
+        "cam01": Exposure("cam01", 1.0, CameraBlobs.of([]), "7", stamp),
+        "cam02": Exposure("cam02", 1.0, CameraBlobs.of([]), "7"),
+    }
+    with Watch(KeeperOfStates(), tmp_path) as loop:
+        loop.process(TimedSnapshot(1.0, exposures, "7"))
+    assert Progress.load(tmp_path) == Progress(1.0, "7", 0, files={"cam01": stamp})
