@@ -1,4 +1,4 @@
-"""Ctrl-C during imports, and SIGTERM beside worker processes; this module is light, so that it is loaded first."""
+"""Ctrl-C and SIGTERM: during imports, beside worker processes, in a loop. Light, since it is loaded first."""
 
 import contextlib
 import os
@@ -6,6 +6,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
+from typing import Any
 
 Handler = Callable[[int, FrameType | None], object] | signal.Handlers
 
@@ -22,6 +23,39 @@ def unwind_at_termination() -> Iterator[None]:
     """Let SIGTERM raise KeyboardInterrupt, so that worker processes are ended and the command says one line."""
     with _handler(signal.SIGTERM, signal.SIG_DFL, _unwind):
         yield
+
+
+class Stopped(threading.Event):
+    """Set by Ctrl-C, or by SIGTERM."""
+
+    interrupted = False  # by Ctrl-C
+
+
+@contextlib.contextmanager
+def stop_at_signals() -> Iterator[Stopped]:
+    """Let SIGINT and SIGTERM set an event, so that a loop ends cleanly; a second one does not wait.
+
+    Yields:
+        The event.
+    """
+    stopped = Stopped()
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        if stopped.is_set():
+            raise KeyboardInterrupt
+        stopped.interrupted = number == signal.SIGINT
+        stopped.set()
+
+    before: dict[signal.Signals, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if signal.getsignal(number) != signal.SIG_IGN:  # in the background of a shell, Ctrl-C is not for us
+                before[number] = signal.signal(number, stop)
+    try:
+        yield stopped
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

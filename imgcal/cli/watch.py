@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 import torch
 from rich.console import Console
@@ -19,70 +15,49 @@ from rich.console import Console
 from imgcal.association import Proposer
 from imgcal.cli import arguments
 from imgcal.cli.common import RESULT, check_folder, check_inputs_survive, open_rig
+from imgcal.cli.interruption import stop_at_signals
 from imgcal.cli.watch_display import Display
+from imgcal.cli.watch_poses import check_pose_outputs, open_pose_outputs
+from imgcal.cli.watch_sources import identify_source, open_source
 from imgcal.errors import InputError, RefusedError
-from imgcal.extras import advice, missing
-from imgcal.io import Fiducials, holding, load_objects, open_input
-from imgcal.live_page import parse_address
+from imgcal.io import holding, load_objects
+from imgcal.live_page import Address, parse_address
 from imgcal.messages import plural, shorten
 from imgcal.online import Event, RigKeeper
 from imgcal.pipeline import DETECTORS, DetectorName, LearnedMeasurer, choose_proposer
-from imgcal.types import CalibrationObject, CameraRig, Detections, object_difference, rig_difference
+from imgcal.types import CalibrationObject, CameraRig, object_difference, rig_difference
 from imgcal.watch import (
     CURRENT,
     EVENTS,
     LEARNING,
     STATE,
     SUBJECTS,
-    Bag,
     BlobTable,
+    EarlierRun,
     FirstRefusals,
     Folder,
     Hook,
     JsonLines,
-    Known,
     LabStreaming,
     Learning,
     LearningPlan,
     LearningTask,
-    MarkerFile,
     Metrics,
-    OpenIGTLink,
-    PoseFile,
-    PosePublisher,
-    Poses,
-    PoseSink,
+    Page,
     Progress,
     Qualisys,
     Source,
     SourceReader,
     Tally,
     Timing,
-    Videos,
-    ZeroMQ,
-    adapted_networks,
     forget_after,
-    holds_videos,
-    listening_address,
     put_aside,
     run_networks,
 )
 from imgcal.watch import Watch as Loop
 
-MARKER_SUFFIXES, TABLE_SUFFIXES = (".c3d", ".trc"), (".csv", ".jsonl")
-POSE_OUTPUTS = "FILE.csv, FILE.jsonl, FILE.c3d, FILE.trc, tcp://HOST:PORT, ipc://PATH or igtl://[HOST:]PORT"
 BLOBS_ONLY = (BlobTable, JsonLines, LabStreaming, Qualisys)
 LEARNING_CODE = "from imgcal.cli.learning_process import main; main()"
-USUAL_RATE = 30.0  # snapshots a second of a table of blobs
-
-# What kind of input an option is for.
-ONLY_FOR = {
-    "rate": "a table of blobs",
-    "topic": "a recording",
-    "videos-differ": "a folder of videos",
-    "until-idle": "a folder of frames",
-    "remove": "a folder of frames",
-}
 
 
 class Watch(arguments.Watch):
@@ -92,7 +67,7 @@ class Watch(arguments.Watch):
         """Watch until the end."""
         rig, given = open_rig(self.rig), load_objects(self.object)
         self._check_out()
-        _check_poses(self.poses, given.as_unknown(), self.out)
+        check_pose_outputs(self.poses, given.as_unknown(), self.out)
         if self.learn:
             self._check_learning(given)
         detector = self._detector()
@@ -100,95 +75,124 @@ class Watch(arguments.Watch):
             self._watch(rig, given, detector, folder)
 
     def _watch(self, rig: CameraRig, given: CalibrationObject, detector: DetectorName | Proposer, folder: Path) -> None:
+        """Open the input, then the outputs; follow the input to its end, and say what came of it."""
         obj = given.as_unknown()
         page_at = None if self.serve is None else parse_address(self.serve)
         metrics_at = None if self.metrics is None else parse_address(self.metrics, "--metrics", None)
-        with _explain_unusable_state():
-            progress = None if self.fresh else Progress.load(folder)
-        source, origin = self._source(rig, given.rows, progress), self._origin()
-        if self.learn and isinstance(source, BLOBS_ONLY):
-            raise InputError(f"--learn: found blobs without frames ({shorten(self.input)}), expected frames of cameras")
+        source, earlier = self._open_source(rig, given, folder)
         rate = source.rate if isinstance(source, BlobTable) else None
-        goes_on = source.live and not self.keep_all  # what came since the last state is gone
-        knows = goes_on or isinstance(source, Folder)  # a folder knows which files have been read
-        known = None if progress is None or knows else self._find_progress(folder, progress, source)
-        intake = SourceReader(source, rig, Timing(self.tolerance, self.patience), self.keep_all, known=known)
+        intake = SourceReader(source, rig, Timing(self.tolerance, self.patience), self.keep_all, known=earlier.known)
         hook = None if self.hook is None else Hook(self.hook)
         display = Display(Console(file=sys.stdout, soft_wrap=True), intake, hook)
+        refusals = FirstRefusals(rig, obj)
         with contextlib.ExitStack() as stack:
-            keeper, restored = self._keeper(folder, rig, obj, detector)
-            stack.enter_context(keeper)
+            keeper = stack.enter_context(self._open_keeper(earlier.state, rig, obj, detector))
             stack.enter_context(intake).wait_until_open()  # before anything is written
             if len(given.points) > 1 and obj is not given:
                 note = f"note: markers of {given.name} are followed one by one; where their distances fit, they count"
                 print(note, file=sys.stderr)
-            poses = [
-                stack.enter_context(Poses(name, _pose_sink(name, rig, obj)))
-                for name in sorted(self.poses, key=_is_table)
-            ]
-            learning = None
-            if self.learn:
-                running = (None if self.fresh else adapted_networks(folder)) or SUBJECTS
-                task = LearningTask(folder, obj, self.detection, LearningPlan(), running)
-                learning = stack.enter_context(Learning(task, LEARNING_CODE))
-                if running != SUBJECTS:
-                    keeper.use_proposer(run_networks(running))
-                print(f"learning from the frames of this rig: {folder / LEARNING}")
-            page = None
-            if page_at is not None:
-                from imgcal.live_page import LivePage  # brings a server along, which is not in the core
-
-                page = stack.enter_context(LivePage(rig, obj, page_at, problem=display.warn))
-                print(page.notice)
+            poses = stack.enter_context(open_pose_outputs(self.poses, rig, obj))
+            learning = stack.enter_context(self._learning(keeper, obj, folder, earlier.networks))
+            page = stack.enter_context(_serve(page_at, rig, obj, display))
             loop = Loop(
-                keeper, folder, hook, page, display.show_event, display.warn, _make_remover(source), source=origin,
-                rate=rate,
-                poses=poses, learning=learning,
+                keeper, folder, hook, page, display.show_event, display.warn, _make_remover(source),
+                source=identify_source(self.input), rate=rate, poses=poses, learning=learning,
             )  # fmt: skip
             if metrics_at is not None:
                 stack.enter_context(Metrics(loop.tally, intake, hook, metrics_at))
-            logged = None if progress is None else progress.logged
-            if not (goes_on or self.fresh or logged is None or self._is_another(progress)):
-                forget_after(folder / EVENTS, logged)  # what came after will come again
-            anew = self.fresh and put_aside(folder)
+            restart = self._prepare(folder, earlier)
             stack.enter_context(loop)
-            stopped = stack.enter_context(_stop_at_signals())
+            stopped = stack.enter_context(stop_at_signals())
             stack.enter_context(display.show_tally(loop.tally))
-            if restored or anew:
-                how = "resumed from the saved state" if restored else "started anew from the factory calibration"
-                loop.publish_event(Event(time.time(), 0, "restart", message=how))
+            if restart is not None:
+                loop.publish_event(Event(time.time(), 0, "restart", message=restart))
             if rate is not None and self.rate is None:
                 print(f"note: {rate:g} snapshots a second are assumed; --rate says otherwise", file=sys.stderr)
-            refusals = FirstRefusals(rig, obj)
 
             def looked() -> None:
                 display.draw()
-                if cause := refusals.add(loop.tally.latest, restored or loop.tally.learnt > 0):
+                learned = earlier.state is not None or loop.tally.learnt > 0
+                if cause := refusals.add(loop.tally.latest, learned):
                     display.warn(f"nothing could be learned yet: {cause}")
 
             loop.run(intake, stopped, looked)
-        tally = loop.tally
-        said = display.result(self.out / CURRENT)
-        if lost := [f"{output.name}: {plural(output.lost, 'pose')}" for output in poses if output.lost]:
-            said = f"{said} | not written: {'; '.join(lost)}"
-        if learning is not None:
-            said = f"{said} | {learning.summary}"
-        if loop.unwritten:
-            said = f"{said} | not written: {'; '.join(loop.unwritten.values())}"
-        if stopped.interrupted:
+        said = " | ".join([display.result(self.out / CURRENT), *_describe_outputs(loop)])
+        print(self._conclude(said, loop, intake, source, refusals, stopped.interrupted))
+
+    def _open_source(self, rig: CameraRig, given: CalibrationObject, folder: Path) -> tuple[Source, EarlierRun]:
+        """Open the input, and find out what an earlier run left of it in the output folder."""
+        source = open_source(self, rig, given.rows)
+        if self.learn and isinstance(source, BLOBS_ONLY):
+            raise InputError(f"--learn: found blobs without frames ({shorten(self.input)}), expected frames of cameras")
+        if self.fresh:
+            return source, EarlierRun()
+        with _explain_unusable_state():
+            earlier = EarlierRun.find(folder, source, identify_source(self.input), self.keep_all)
+        return replace(source, after=earlier.after) if isinstance(source, Folder) else source, earlier
+
+    def _open_keeper(
+        self, state: Path | None, rig: CameraRig, obj: CalibrationObject, detector: DetectorName | Proposer
+    ) -> RigKeeper:
+        """Begin with the factory rig, or resume from the state of an earlier run if it is of this rig and object."""
+        if state is None:
+            return RigKeeper(rig, obj, detection=self.detection, detector=detector)
+        with _explain_unusable_state():
+            keeper = RigKeeper.restore(state, detection=self.detection, detector=detector)
+        for option, difference in (
+            (f"--rig {self.rig}", _rig_difference(rig, keeper.given)),
+            (f"--object {' '.join(self.object)}", _object_difference(obj, keeper.obj)),
+        ):
+            if difference is not None:
+                known = f"{state}: found a state that does not belong to {option}"
+                raise InputError(f"{known} ({difference}); --fresh starts over")
+        return keeper
+
+    @contextlib.contextmanager
+    def _learning(
+        self, keeper: RigKeeper, obj: CalibrationObject, folder: Path, adapted: tuple[str, str] | None
+    ) -> Iterator[Learning | None]:
+        """With `--learn`, adapt networks in a process of its own; begin with those that an earlier run has adapted."""
+        if not self.learn:
+            yield None
+            return
+        task = LearningTask(folder, obj, self.detection, LearningPlan(), adapted or SUBJECTS)
+        with Learning(task, LEARNING_CODE) as learning:
+            if task.running != SUBJECTS:
+                keeper.use_proposer(run_networks(task.running))
+            print(f"learning from the frames of this rig: {folder / LEARNING}")
+            yield learning
+
+    def _prepare(self, folder: Path, earlier: EarlierRun) -> str | None:
+        """Remove from the output folder what this run does not continue, and say how it starts after an earlier one."""
+        if earlier.logged is not None:
+            forget_after(folder / EVENTS, earlier.logged)
+        if self.fresh and put_aside(folder):
+            return "started anew from the factory calibration"
+        return None if earlier.state is None else "resumed from the saved state"
+
+    def _conclude(
+        self, said: str, loop: Loop, intake: SourceReader, source: Source, refusals: FirstRefusals, interrupted: bool
+    ) -> str:
+        """Return the last line: `said`, and what had been read before.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C ended it.
+            InputError: something could not be written.
+            RefusedError: nothing could be learned from what came.
+        """
+        if interrupted:
             there = "the last state that was written" if STATE in loop.unwritten else "there"
             raise KeyboardInterrupt(f"interrupted after {said}; the same command resumes from {there}")
         if loop.unwritten:
             raise InputError(f"watch: {said}")
+        tally = loop.tally
         before = intake.known_before + (source.count_processed() if isinstance(source, Folder) else 0)
         if tally.snapshots == 0 and before:
             read = f"all {plural(before, 'snapshot')} of {self.input} had been read before"
-            said = f"{read}; --fresh starts from the factory rig | {said}"
-        elif tally.latest is None or tally.learnt == 0:
+            return f"{read}; --fresh starts from the factory rig | {said}"
+        if tally.latest is None or tally.learnt == 0:
             raise RefusedError(_explain_no_learning(tally, intake, refusals))
-        elif before:
-            said = f"{said} | {before:,} had been read before"
-        print(said)
+        return f"{said} | {before:,} had been read before" if before else said
 
     def _check_out(self) -> None:
         """The inputs must survive, and a calibration."""
@@ -196,73 +200,6 @@ class Watch(arguments.Watch):
         check_inputs_survive(self.out, (CURRENT,), [("--rig", Path(self.rig))])
         if (self.out / RESULT).exists():
             raise InputError(f"--out: {self.out} holds a calibration ({RESULT}), expected another folder")
-
-    def _origin(self) -> str:
-        """Which source it is, wherever the command is run."""
-        return self.input if self.input == "-" or "://" in self.input else str(Path(self.input).resolve())
-
-    def _is_another(self, progress: Progress | None) -> bool:
-        """Whether INPUT is another one than before; what a version noted that did not note it is taken for the same."""
-        return progress is not None and progress.source not in (None, self._origin())
-
-    def _find_progress(self, folder: Path, progress: Progress, source: Source) -> Known:
-        """How far an earlier run has worked on this recording, or that it was another one."""
-        another = self._is_another(progress)
-        rate = source.rate if isinstance(source, BlobTable) else None
-        if not another and rate is not None and progress.rate not in (None, rate):
-            expected = f"{progress.rate:g} as in {folder / STATE}"
-            raise InputError(f"--rate: found {rate:g}, expected {expected}; --fresh starts over")
-        gone = isinstance(source, BlobTable) and progress.name not in source.blobs.snapshot_names
-        return Known(progress.time, None if gone else progress.name, another)
-
-    def _source(self, rig: CameraRig, labels: Fiducials, progress: Progress | None) -> Source:
-        """Find out what INPUT is; tables call the fiducials by `labels`."""
-        if self.input == "-":
-            self._check_options("standard input")
-            return JsonLines(sys.stdin.fileno())
-        if "://" in self.input:
-            self._check_options("an address")
-            if self.input.startswith("qtm://"):
-                return Qualisys(self.input, rig)
-            if self.input.startswith("lsl://"):
-                self._require("pylsl", "an address")
-                return LabStreaming(self.input)
-            if not self.input.startswith(("tcp://", "ipc://")):
-                known = "tcp://host:port, ipc://path, qtm://host or lsl://name"
-                raise InputError(f"{shorten(self.input)}: expected an address {known}")
-            self._require("zmq", "an address")
-            return ZeroMQ((self.input,))
-        path = Path(self.input)
-        if path.suffix.lower() == ".mcap" or (path / "metadata.yaml").is_file():
-            self._check_options("a recording")
-            self._require("rosbags", "a recording")
-            return Bag(path, rig, _topics(self.topic))
-        if path.is_dir() and not holds_videos(path):
-            self._check_options("a folder of frames")
-            name = None if progress is None or self._is_another(progress) else progress.name
-            return Folder(path, rig, self.remove, name, self.until_idle)
-        if path.is_dir():
-            self._check_options("a folder of videos")
-            return Videos(path, rig, self.videos_differ)
-        if path.exists():
-            self._check_options("a table of blobs")
-        rate = USUAL_RATE if self.rate is None else self.rate
-        if not 0 < rate < 1e6:
-            raise InputError(f"--rate: found {rate:g}, expected more than 0 and less than 1e6 snapshots per second")
-        source = open_input(path, rig, labels)
-        assert isinstance(source, Detections)  # folders are seen to above
-        return BlobTable(source, rate)
-
-    def _check_options(self, kind: str) -> None:
-        """Refuse options that have no effect on this kind of input.
-
-        Raises:
-            InputError: names the first of them, and what it is for.
-        """
-        for option, meant in ONLY_FOR.items():
-            given = getattr(self, option.replace("-", "_"))
-            if meant != kind and not (given is None or given is False or given == ()):
-                raise InputError(f"--{option}: needs {meant}, found {kind} ({shorten(self.input)})")
 
     def _detector(self) -> DetectorName | Proposer:
         """Combine the network of `--detector` with `--measurer`.
@@ -294,28 +231,6 @@ class Watch(arguments.Watch):
             found = f"found {shorten(obj.name)}"
             raise InputError(f"--learn: {found}, expected one object whose markers keep their distances")
 
-    def _keeper(
-        self, folder: Path, rig: CameraRig, obj: CalibrationObject, detector: DetectorName | Proposer
-    ) -> tuple[RigKeeper, bool]:
-        """Begin, or go on with what an earlier run knew; says whether it did."""
-        path = folder / STATE
-        if self.fresh or not path.is_file():
-            return RigKeeper(rig, obj, detection=self.detection, detector=detector), False
-        with _explain_unusable_state():
-            keeper = RigKeeper.restore(path, detection=self.detection, detector=detector)
-        for option, difference in (
-            (f"--rig {self.rig}", _rig_difference(rig, keeper.given)),
-            (f"--object {' '.join(self.object)}", _object_difference(obj, keeper.obj)),
-        ):
-            if difference is not None:
-                known = f"{path}: found a state that does not belong to {option}"
-                raise InputError(f"{known} ({difference}); --fresh starts over")
-        return keeper, True
-
-    def _require(self, library: str, what: str) -> None:
-        if missing(library):
-            raise InputError(f"{shorten(self.input)}: {what} {advice(library)}")
-
 
 def _rig_difference(rig: CameraRig, known: CameraRig) -> str | None:
     """Say in what a rig differs from the one that was begun with: also in its prior, and how fast it drifts."""
@@ -338,6 +253,18 @@ def _object_difference(obj: CalibrationObject, known: CalibrationObject) -> str 
     return difference
 
 
+def _describe_outputs(loop: Loop) -> list[str]:
+    """Say what could not be written, and what came of `--learn`."""
+    parts = []
+    if lost := [f"{output.name}: {plural(output.lost, 'pose')}" for output in loop.poses if output.lost]:
+        parts.append(f"not written: {'; '.join(lost)}")
+    if loop.learning is not None:
+        parts.append(loop.learning.summary)
+    if loop.unwritten:
+        parts.append(f"not written: {'; '.join(loop.unwritten.values())}")
+    return parts
+
+
 def _explain_no_learning(tally: Tally, intake: SourceReader, refusals: FirstRefusals) -> str:
     """Say why nothing was learned."""
     if tally.latest is not None:
@@ -356,99 +283,22 @@ def _make_remover(source: Source) -> Callable[[Progress], None]:
 
 
 @contextlib.contextmanager
+def _serve(address: Address | None, rig: CameraRig, obj: CalibrationObject, display: Display) -> Iterator[Page | None]:
+    """With `--serve`, show the live page at this address."""
+    if address is None:
+        yield None
+        return
+    from imgcal.live_page import LivePage  # brings a server along, which is not in the core
+
+    with LivePage(rig, obj, address, problem=display.warn) as page:
+        print(page.notice)
+        yield page
+
+
+@contextlib.contextmanager
 def _explain_unusable_state() -> Iterator[None]:
     """Say what to do where what an earlier run left cannot be used."""
     try:
         yield
     except InputError as error:
         raise InputError(f"{error}; --fresh starts over") from error
-
-
-class _Stopped(threading.Event):
-    """Set by Ctrl-C, or by SIGTERM."""
-
-    interrupted = False
-
-
-@contextlib.contextmanager
-def _stop_at_signals() -> Iterator[_Stopped]:
-    """End cleanly at SIGINT and SIGTERM; a second Ctrl-C does not wait."""
-    stopped = _Stopped()
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        if stopped.is_set():
-            raise KeyboardInterrupt
-        stopped.interrupted = number == signal.SIGINT
-        stopped.set()
-
-    before: dict[signal.Signals, Any] = {}
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            if signal.getsignal(number) != signal.SIG_IGN:  # in the background of a shell, Ctrl-C is not for us
-                before[number] = signal.signal(number, stop)
-    try:
-        yield stopped
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _check_poses(names: tuple[str, ...], obj: CalibrationObject, out: Path) -> None:
-    """Refuse outputs of poses that cannot be, before anything is written.
-
-    Raises:
-        InputError: names the first of them, and what it could be.
-    """
-    for number, name in enumerate(names):
-        path, (scheme, separator, _) = Path(name), name.partition("://")
-        is_file, suffix = not separator, path.suffix.lower()
-        if name in names[:number]:
-            raise InputError(f"--poses: found {shorten(name)} twice, expected each output once")
-        if not is_file and scheme not in ("tcp", "ipc", "igtl"):
-            raise InputError(f"--poses: found {shorten(name)!r}, expected {POSE_OUTPUTS}")
-        if is_file and suffix not in (*MARKER_SUFFIXES, *TABLE_SUFFIXES):
-            raise InputError(f"--poses: found {shorten(name)!r}, expected {POSE_OUTPUTS}")
-        if obj.pose_rank == 3 and not (is_file and suffix in MARKER_SUFFIXES):
-            found = f"found {shorten(name)!r} with {shorten(obj.name or 'a light')}, which has no pose"
-            raise InputError(f"--poses: {found}, expected FILE.c3d or FILE.trc: points")
-        if is_file and path.is_dir():
-            raise InputError(f"--poses: {shorten(name)}: found a folder, expected a file")
-        if is_file and not (path.parent.is_dir() or out.resolve().is_relative_to(path.parent.resolve())):
-            raise InputError(f"--poses: {shorten(name)}: found no folder {path.parent}, expected one")
-        if is_file and path.parent.is_dir() and not os.access(path.parent, os.W_OK):
-            raise InputError(f"--poses: {shorten(name)}: no permission to write to {path.parent}")
-
-
-def _is_table(name: str) -> bool:
-    """Whether opening this output makes a file; those come last, when all others are known to work."""
-    return "://" not in name and Path(name).suffix.lower() in TABLE_SUFFIXES
-
-
-def _pose_sink(name: str, rig: CameraRig, obj: CalibrationObject) -> PoseSink:
-    """Open what poses are to go to, by its name.
-
-    Raises:
-        InputError: it cannot be opened.
-    """
-    scheme, separator, _ = name.partition("://")
-    if not separator and Path(name).suffix.lower() in MARKER_SUFFIXES:
-        return MarkerFile(Path(name), rig, obj)
-    if not separator:
-        return PoseFile(Path(name))
-    if scheme == "igtl":
-        return OpenIGTLink(*listening_address(name))
-    if missing("zmq"):
-        raise InputError(f"--poses: {shorten(name)} {advice('zmq')}")
-    return PosePublisher(name)
-
-
-def _topics(given: tuple[str, ...]) -> dict[str, str]:
-    pairs = [text.partition("=") for text in given]
-    wrong = [camera for camera, _, topic in pairs if not camera or not topic]
-    if wrong:
-        raise InputError(f"--topic: found {shorten(wrong[0])!r}, expected CAMERA=TOPIC")
-    cameras = [camera for camera, _, _ in pairs]
-    twice = [camera for camera in dict.fromkeys(cameras) if cameras.count(camera) > 1]
-    if twice:
-        raise InputError(f"--topic: found camera {shorten(twice[0])} twice, expected one topic per camera")
-    return {camera: topic for camera, _, topic in pairs}

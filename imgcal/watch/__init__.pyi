@@ -1,6 +1,7 @@
 from .bags import Bag
+from .earlier_run import EarlierRun, Known, Progress
 from .event_log import EventLog, forget_after
-from .exposures import CameraBlobs, Exposure, Item, Source, Unreadable, check_exposure
+from .exposures import CameraBlobs, Exposure, FileStamp, Item, Source, Unreadable, check_exposure
 from .first_refusals import FirstRefusals
 from .folder import Folder
 from .hook import Hook
@@ -24,7 +25,7 @@ from .learning import (
     run_networks,
     send,
 )
-from .loop import EVENTS, Keeper, Page, Progress, Watch
+from .loop import EVENTS, Keeper, Page, Watch
 from .marker_files import MarkerFile
 from .metrics import Metrics, Tally
 from .open_igt_link import OpenIGTLink, listening_address
@@ -34,7 +35,7 @@ from .poses import PoseRecord, Poses, PoseSink
 from .qualisys import Qualisys
 from .recordings import BlobTable, Videos, holds_videos
 from .rig_files import CURRENT, STATE, RigFiles, put_aside
-from .source_reader import Known, SourceReader
+from .source_reader import SourceReader
 from .synchronization import COUNTS, Synchronizer, TimedSnapshot
 from .timing import Timing
 from .zeromq import ZeroMQ
@@ -54,8 +55,10 @@ __all__ = [
     "Bag",
     "BlobTable",
     "CameraBlobs",
+    "EarlierRun",
     "EventLog",
     "Exposure",
+    "FileStamp",
     "FirstRefusals",
     "Folder",
     "Hook",

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +68,19 @@ class CameraBlobs:
             raise InputError(f"{name}: found {values[wrong][0]:g}, expected {plausible}")
 
 
+class FileStamp(NamedTuple):
+    """What tells a file from another of the same name, wherever its folder lies."""
+
+    name: str
+    changed: int  # ns since the epoch
+    size: int  # bytes
+
+    @classmethod
+    def of(cls, name: str, found: os.stat_result) -> FileStamp:
+        """Make it from what the file system says of a file of this name."""
+        return cls(name, found.st_mtime_ns, found.st_size)
+
+
 @dataclass(frozen=True)
 class Exposure:
     """A frame, or the blobs of one, with its time stamp."""
@@ -75,6 +89,7 @@ class Exposure:
     time: float  # s since the epoch (or the start of a recording), by the camera's clock
     content: Frame | CameraBlobs
     snapshot: str | None = None  # name of its snapshot, if the source knows; None = match by time
+    file: FileStamp | None = None  # its file, if it has one of its own
 
 
 @dataclass(frozen=True)

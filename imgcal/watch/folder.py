@@ -6,7 +6,7 @@ import os
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from imgcal.errors import InputError
 from imgcal.io import IMAGE_SUFFIXES, is_file_name, natural_key, nearest, read_frame
 from imgcal.messages import list_names
 from imgcal.types import CameraRig
-from imgcal.watch.exposures import Exposure, Item, Unreadable
+from imgcal.watch.exposures import Exposure, FileStamp, Item, Unreadable
 
 TICK = 0.05  # s between two scans
 GIVEN_UP = 2.0  # s for which an unreadable file may still be incomplete
@@ -49,6 +49,14 @@ class Folder:
         files = (path for name in self.rig.camera_names for path in (self.folder / "frames" / name).glob("*"))
         stems = {path.stem for path in files if path.suffix.lower() in IMAGE_SUFFIXES and is_file_name(path.stem)}
         return sum(natural_key(stem) <= natural_key(self.after) for stem in stems)
+
+    def holds(self, files: Mapping[str, FileStamp]) -> bool:
+        """Tell whether files that were read, by camera, are in this folder and unchanged."""
+        try:
+            found = {name: (self.folder / "frames" / name / file.name).stat() for name, file in files.items()}
+        except (OSError, ValueError):  # missing, or a name that no file has
+            return False
+        return all(FileStamp.of(file.name, found[name]) == file for name, file in files.items())
 
     def delete_read(self, name: str) -> None:
         """Delete the frames read so far, up to snapshot `name`; they are not needed again.
@@ -111,7 +119,7 @@ class Folder:
         """Read a file of stable size; None = it may still be incomplete."""
         size = self.rig.image_size[self.rig.camera_names.index(name)].tolist()
         try:
-            changed = path.stat().st_mtime
+            found = path.stat()
             frame = read_frame(path, size=(size[0], size[1]))
         except (InputError, OSError) as error:
             if not camera.gives_up(path, now):
@@ -120,7 +128,7 @@ class Folder:
         camera.mark_done(path)
         if self.remove:
             self._read_files.append(path)
-        return Exposure(name, changed, frame, path.stem)
+        return Exposure(name, found.st_mtime, frame, path.stem, FileStamp.of(path.name, found))
 
 
 class _Camera:

@@ -6,15 +6,16 @@ import math
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 from imgcal.association import Proposer
 from imgcal.errors import InputError, RefusedError
-from imgcal.io import Frame, read_json
+from imgcal.io import Frame
 from imgcal.online import Event, RigState
 from imgcal.types import CameraRig, Detections
+from imgcal.watch.earlier_run import Progress
 from imgcal.watch.event_log import EventLog
 from imgcal.watch.hook import Hook
 from imgcal.watch.learning import Learning
@@ -78,41 +79,6 @@ class Page(Protocol):
         """Return the users' commands since the last call, each with a `name`; must return at once."""
 
 
-@dataclass(frozen=True)
-class Progress:
-    """Position in a source."""
-
-    time: float  # s, time of the last snapshot
-    name: str | None = None  # its name, if the source names snapshots
-    logged: int | None = None  # size of events.jsonl at that time, in bytes
-    source: str | None = None  # identity of the source; None = unknown
-    rate: float | None = None  # snapshots per second of a source without times
-
-    @classmethod
-    def load(cls, folder: Path) -> Progress | None:
-        """Read it from the state file, so that both are consistent; None = there is none.
-
-        Raises:
-            InputError: the file is not a state file.
-        """
-        path = folder / STATE
-        if not path.is_file():
-            return None
-        try:
-            entry = read_json(path.read_text())["progress"]
-            if entry is None:
-                return None
-            time, name, logged = float(entry["time"]), entry["name"], entry.get("logged")
-            source, rate = entry.get("source"), entry.get("rate")
-            if not all(text is None or isinstance(text, str) for text in (name, source)):
-                raise ValueError("a name is not text")
-            if not (logged is None or isinstance(logged, int)):
-                raise ValueError("the length is not a number")
-            return cls(time, name, logged, source, None if rate is None else float(rate))
-        except (ValueError, TypeError, KeyError, OverflowError) as error:
-            raise InputError(f"{path}: found something that imgcal watch did not write") from error
-
-
 class Watch:
     """Processes one snapshot after another. A context manager: leaving it saves the state.
 
@@ -151,7 +117,7 @@ class Watch:
         self.keeper, self.folder, self.tally = keeper, folder, Tally()
         self.paused = False
         self._hook, self._page, self._told, self._problem = hook, page, told, problem
-        self._poses, self._learning = poses, learning
+        self.poses, self.learning = poses, learning
         self._when_saved, self._source, self._rate = saved, source, rate
         self._saved = -math.inf  # the first snapshot is saved at once
         self._progress: Progress | None = None
@@ -228,16 +194,17 @@ class Watch:
         self.tally.latest = state
         for exposure in snapshot.exposures.values():
             self.tally.count_time_stamp(exposure.camera, exposure.time - snapshot.time)
-        self._progress = Progress(snapshot.time, snapshot.name, source=self._source, rate=self._rate)
+        files = {name: exposure.file for name, exposure in snapshot.exposures.items() if exposure.file is not None}
+        self._progress = Progress(snapshot.time, snapshot.name, source=self._source, rate=self._rate, files=files)
         self._unsaved = True
         for event in state.events:
             self.publish_event(event)
-        for output in self._poses:
+        for output in self.poses:
             output.publish(state)
         if self._page is not None:
             self._page.publish(state, snapshot.frames(names))
-        if self._learning is not None:
-            self._learning.offer(state, snapshot.frames(names))
+        if self.learning is not None:
+            self.learning.offer(state, snapshot.frames(names))
         return state
 
     def publish_event(self, event: Event) -> None:
@@ -289,7 +256,7 @@ class Watch:
 
     def _report_poses(self) -> None:
         """Report once for each output of poses that it fails."""
-        for output in self._poses:
+        for output in self.poses:
             if output.problem is not None and not self.tally.problems[output.name]:
                 self._fail(output.name, output.problem)
 
@@ -300,7 +267,7 @@ class Watch:
 
     def _apply_learning(self) -> None:
         """Switch to an adapted network, and report what came of trainings."""
-        for outcome in () if self._learning is None else self._learning.outcomes():
+        for outcome in () if self.learning is None else self.learning.outcomes():
             if outcome.proposer is not None:
                 self.keeper.use_proposer(outcome.proposer)
             state = self.tally.latest

@@ -6,11 +6,11 @@ import contextlib
 import threading
 import time
 from collections import Counter, deque
-from dataclasses import dataclass
 
 from imgcal.errors import InputError
 from imgcal.messages import one_line
 from imgcal.types import CameraRig
+from imgcal.watch.earlier_run import Known
 from imgcal.watch.exposures import CameraBlobs, Exposure, Item, Source, Unreadable, check_exposure
 from imgcal.watch.synchronization import Synchronizer, TimedSnapshot
 from imgcal.watch.timing import Timing
@@ -22,37 +22,6 @@ MOST_BYTES = 2**30
 LATELY = 3  # number of reasons to keep
 WOKEN = 0.2  # s
 LONGEST_OPENING = 10.0  # s
-
-
-@dataclass(frozen=True)
-class Known:
-    """How much of a recording an earlier run has processed."""
-
-    time: float  # s, time of the last snapshot
-    name: str | None = None  # its name, if the recording names snapshots
-    another: bool = False  # that was another recording: this one must be later
-
-    def includes(self, snapshot: TimedSnapshot) -> bool:
-        """Tell whether a snapshot was processed: all up to the one of that name, or otherwise of that time.
-
-        Raises:
-            InputError: the snapshot is of another recording, and not later.
-        """
-        if self.another:
-            if snapshot.time > self.time:
-                return False
-            raise InputError(
-                f"found a different recording that begins at {snapshot.time:.9g} s, expected one "
-                f"after {self.time:.9g} s; --fresh starts over"
-            )
-        return self._is_named(snapshot) or snapshot.time <= self.time
-
-    def ends_with(self, snapshot: TimedSnapshot) -> bool:
-        """Tell whether this is the last processed snapshot."""
-        return self._is_named(snapshot) and snapshot.name == self.name
-
-    def _is_named(self, snapshot: TimedSnapshot) -> bool:
-        return self.name is not None and snapshot.name is not None
 
 
 class SourceReader:

@@ -297,7 +297,7 @@ def test_a_recording_is_gone_on_with_by_its_names_and_rate_and_another_one_is_no
     out = tmp_path / "out"
     assert watch(tmp_path / "first.csv", out) == 0
     progress = json.loads((out / "state.json").read_text())["progress"]
-    expected = {"time": 0.1, "name": "003", "source": str(tmp_path / "first.csv"), "rate": 30.0}
+    expected = {"time": 0.1, "name": "003", "source": str(tmp_path / "first.csv"), "rate": 30.0, "files": {}}
     assert progress == expected | {"logged": 0}
     (tmp_path / "second.csv").replace(tmp_path / "first.csv")  # it has grown
     capsys.readouterr()

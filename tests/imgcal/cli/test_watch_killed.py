@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -188,3 +189,5 @@ def test_frames_in_a_folder(watch, frames, tmp_path):
     watch(frames, tmp_path / "out")
     assert_same(tmp_path / "out", tmp_path / "whole", 8)
     assert "all 8 snapshots" in watch(frames, tmp_path / "out")
+    moved = shutil.copytree(frames[0], tmp_path / "moved")
+    assert "all 8 snapshots" in watch((str(moved), *frames[1:]), tmp_path / "out")

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from imgcal.errors import InputError
 from imgcal.online import RigKeeper
 from imgcal.watch import CameraBlobs, Exposure, Hook, Poses, Progress, SourceReader, TimedSnapshot, Watch
 from imgcal.watch import loop as module
@@ -184,16 +183,6 @@ def test_time_stamps_of_cameras_are_compared_with_their_snapshots(tmp_path):
         for number in range(300):
             loop.process(snapshot(float(number), lag=0.004))
     assert loop.tally.stamps == pytest.approx({"cam01": 0, "cam02": 0.004, "cam03": 0, "cam04": 0})
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["", "{}", "[1]", '{"progress": {"time": "x", "name": null}}', '{"progress": {"time": 1, "name": 2}}', "[" * 5000],
-)
-def test_progress_that_is_none_of_ours(text, tmp_path):
-    (tmp_path / "state.json").write_text(text)
-    with pytest.raises(InputError, match=r"state\.json: found"):
-        Progress.load(tmp_path)
 
 
 def test_poses_go_out_and_an_output_that_fails_is_told_once(tmp_path):

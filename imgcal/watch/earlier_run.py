@@ -1,0 +1,135 @@
+"""What an earlier run left in its folder, and what of that applies to the source of this run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from imgcal.errors import InputError
+from imgcal.io import read_json
+from imgcal.watch.exposures import FileStamp, Source
+from imgcal.watch.folder import Folder
+from imgcal.watch.learning import adapted_networks
+from imgcal.watch.recordings import BlobTable
+from imgcal.watch.rig_files import STATE
+from imgcal.watch.synchronization import TimedSnapshot
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Position in a source."""
+
+    time: float  # s, time of the last snapshot
+    name: str | None = None  # its name, if the source names snapshots
+    logged: int | None = None  # size of events.jsonl at that time, in bytes
+    source: str | None = None  # identity of the source; None = unknown
+    rate: float | None = None  # snapshots per second of a source without times
+    files: Mapping[str, FileStamp] = field(default_factory=dict)  # of the last snapshot, by camera, if it has files
+
+    @classmethod
+    def load(cls, folder: Path) -> Progress | None:
+        """Read it from the state file, so that both are consistent; None = there is none.
+
+        Raises:
+            InputError: the file is not a state file.
+        """
+        path = folder / STATE
+        if not path.is_file():
+            return None
+        try:
+            entry = read_json(path.read_text())["progress"]
+            if entry is None:
+                return None
+            time, name, logged = float(entry["time"]), entry["name"], entry.get("logged")
+            source, rate = entry.get("source"), entry.get("rate")
+            if not all(text is None or isinstance(text, str) for text in (name, source)):
+                raise ValueError("a name is not text")
+            if not (logged is None or isinstance(logged, int)):
+                raise ValueError("the length is not a number")
+            files = {
+                camera: FileStamp(str(file), int(changed), int(size))
+                for camera, (file, changed, size) in dict(entry.get("files", ())).items()
+            }
+            return cls(time, name, logged, source, None if rate is None else float(rate), files)
+        except (ValueError, TypeError, KeyError, OverflowError) as error:
+            raise InputError(f"{path}: found something that imgcal watch did not write") from error
+
+
+@dataclass(frozen=True)
+class Known:
+    """How much of a recording an earlier run has processed."""
+
+    time: float  # s, time of the last snapshot
+    name: str | None = None  # its name, if the recording names snapshots
+    another: bool = False  # that was another recording: this one must be later
+
+    def includes(self, snapshot: TimedSnapshot) -> bool:
+        """Tell whether a snapshot was processed: all up to the one of that name, or otherwise of that time.
+
+        Raises:
+            InputError: the snapshot is of another recording, and not later.
+        """
+        if self.another:
+            if snapshot.time > self.time:
+                return False
+            raise InputError(
+                f"found a different recording that begins at {snapshot.time:.9g} s, expected one "
+                f"after {self.time:.9g} s; --fresh starts over"
+            )
+        return self._is_named(snapshot) or snapshot.time <= self.time
+
+    def ends_with(self, snapshot: TimedSnapshot) -> bool:
+        """Tell whether this is the last processed snapshot."""
+        return self._is_named(snapshot) and snapshot.name == self.name
+
+    def _is_named(self, snapshot: TimedSnapshot) -> bool:
+        return self.name is not None and snapshot.name is not None
+
+
+@dataclass(frozen=True)
+class EarlierRun:
+    """What of an earlier run applies to this one. `EarlierRun()`: nothing, as in an empty folder or with `--fresh`."""
+
+    state: Path | None = None  # state file to restore the rig from
+    known: Known | None = None  # how much of this recording has been processed
+    after: str | None = None  # name of the last processed snapshot of this folder of frames
+    logged: int | None = None  # bytes of events.jsonl to keep: what follows will be reported again; None = all
+    networks: tuple[str, str] | None = None  # adapted ones: folders, as `adapted_networks` names them
+
+    @classmethod
+    def find(cls, folder: Path, source: Source, identity: str, keep_all: bool = False) -> EarlierRun:
+        """Read what is in the output folder, and decide what applies to this source.
+
+        Args:
+            folder: output folder.
+            source: what is to be read, not begun.
+            identity: names the source, as in `Progress.source`.
+            keep_all: treat a live source as a recording.
+
+        Raises:
+            InputError: the state file is not one, or its recording had another rate.
+        """
+        state, progress = folder / STATE, Progress.load(folder)
+        run = cls(state if state.is_file() else None, networks=adapted_networks(folder))
+        if progress is None:
+            return run
+        same = progress.source in (None, identity)  # earlier versions did not note it
+        if isinstance(source, Folder):  # skips files by their names; it may have been moved
+            same = same or (len(progress.files) > 0 and source.holds(progress.files))
+            return replace(run, after=progress.name, logged=progress.logged) if same else run
+        if source.live and not keep_all:  # nothing comes twice: what it sent since the last save is lost
+            return run
+        if not same:
+            return replace(run, known=Known(progress.time, another=True))
+        return replace(run, known=_find_position(progress, source, state), logged=progress.logged)
+
+
+def _find_position(progress: Progress, source: Source, state: Path) -> Known:
+    """Find how much of the same recording has been processed: by name; by time where the name no longer exists."""
+    if not isinstance(source, BlobTable):
+        return Known(progress.time, progress.name)
+    if progress.rate not in (None, source.rate):
+        raise InputError(f"--rate: found {source.rate:g}, expected {progress.rate:g} as in {state}")
+    exists = progress.name in source.blobs.snapshot_names
+    return Known(progress.time, progress.name if exists else None)
