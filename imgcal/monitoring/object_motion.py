@@ -11,8 +11,9 @@ from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_ro
 
 AROUND = 7
 """Number of snapshots used to estimate the motion at one of them."""
-REACH = 0.2
-"""Usual number of seconds within which they must be: a hand changes direction within half a second."""
+REACH = 0.21
+"""Usual number of seconds within which they must be: a hand changes direction within half a second. With room for the
+rounding of times at 5 Hz."""
 NOISE = (5e-4,) * 3 + (0.1,) * 3
 """Standard deviations of a pose (rad, mm) relative to its neighbours ..."""
 FAST, SUDDEN = (10.0,) * 3 + (5e3,) * 3, (100.0,) * 3 + (2e4,) * 3

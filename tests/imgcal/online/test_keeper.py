@@ -108,6 +108,17 @@ def test_a_camera_whose_clock_has_slipped_counts_at_a_low_rate_too(rate: float) 
     assert normalized(states[-1], made.rig) < 2
 
 
+def test_a_clock_that_slips_at_five_snapshots_a_second_is_told_whatever_the_times_round_to() -> None:
+    made, events = stream(1, conditions=Conditions(rate=5.0), slips=[Slip(40, 1, -0.02)]), []
+    with RigKeeper(made.factory, made.obj) as keeper:
+        for time, blobs in made.snapshots(70):
+            state = keeper.update(blobs, 1.7e9 + time)
+            events += state.events
+    assert {(event.kind, event.camera) for event in events} == {("clock_slip", "cam02")}
+    assert state.cameras["cam02"] == "ok"
+    assert state.clock_offset[1] == pytest.approx(-0.02, rel=0.1)
+
+
 def test_a_late_camera_whose_blobs_cannot_be_corrected_is_not_lost() -> None:
     """The snapshots become too rare to know how the object moves."""
     made, events = stream(1, slips=[Slip(60, 1, 0.0167)]), []
