@@ -313,6 +313,15 @@ def test_half_of_the_cameras_that_are_knocked_are_told_and_nobody_is_calibrated_
     assert normalized(state, made.rig) < 1.6
 
 
+def test_a_knock_that_turns_all_cameras_is_told_as_that_and_not_as_another_object() -> None:
+    knock = [Bump(40, camera, "rotation", math.radians(0.7)) for camera in range(6)]
+    obj = imgcal.load_object("asymmetric8")
+    made = Stream(imgcal.load_rig("O6"), obj, 1, Conditions(rate=10.0, labelled=True), knock)
+    events, last = events_of(made, 120)
+    assert [event.kind for event in events] == ["restart"]
+    assert last.refused is None
+
+
 def shaking(made: Stream, count: int, cameras: list[int], since: int) -> Iterator[tuple[float, Detections]]:
     """Shift all that cameras see alike, in each snapshot otherwise, as a fan or a floor does."""
     generator = np.random.default_rng(7)
