@@ -11,8 +11,9 @@ from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_ro
 
 AROUND = 7
 """Number of snapshots used to estimate the motion at one of them."""
-REACH = 0.2
-"""Seconds within which they must be: a hand changes direction within half a second."""
+REACH = 0.21
+"""Usual number of seconds within which they must be: a hand changes direction within half a second. With room for the
+rounding of times at 5 Hz."""
 NOISE = (5e-4,) * 3 + (0.1,) * 3
 """Standard deviations of a pose (rad, mm) relative to its neighbours ..."""
 FAST, SUDDEN = (10.0,) * 3 + (5e3,) * 3, (100.0,) * 3 + (2e4,) * 3
@@ -37,14 +38,14 @@ class ObjectMotion:
     known: Tensor  # (S,) bool: has enough neighbours
 
     @classmethod
-    def of(cls, rig_from_object: RigidTransform, seconds: Tensor) -> ObjectMotion:
-        """Estimate the motion from poses (S,) at ascending times (S,) s."""
+    def of(cls, rig_from_object: RigidTransform, seconds: Tensor, reach: float = REACH) -> ObjectMotion:
+        """Estimate the motion from poses (S,) at ascending times (S,) s, each from those within `reach` seconds."""
         count = len(seconds)
         wide = min(AROUND, count)
         first = (torch.arange(count) - wide // 2).clamp(0, count - wide)
         near = first[:, None] + torch.arange(wide)  # (S, W)
         after = (seconds[near] - seconds[:, None]).double()
-        weight = (after.abs() <= REACH).double()
+        weight = (after.abs() <= reach).double()
         rotation, place = rig_from_object.rotation.double(), rig_from_object.translation.double()
         turned = vector_from_rotation(rotation[near] @ rotation[:, None].mT)
         way = torch.cat((turned, place[near] - place[:, None]), -1)  # (S, W, 6)

@@ -46,6 +46,7 @@ class VisibleObject:
     predicted: NDArray[np.float64]  # (C, N, 2), nan if unknown
     astray: frozenset[int]  # cameras that see a possible object in the wrong place
     silent: frozenset[int]  # cameras without data
+    left_out: frozenset[int] = frozenset()  # late cameras whose blobs could not be corrected, and got no labels
 
 
 @dataclass
@@ -91,7 +92,7 @@ class CameraVisibility:
         self.seen |= some
         labelled = set(np.flatnonzero(count >= labels_to_reappear(look.predicted.shape[1])).tolist()) - look.astray
         self._listen(look)
-        absent = self._should_see(rig, look.predicted) - some - look.astray - look.silent
+        absent = self._should_see(rig, look.predicted) - some - look.astray - look.silent - look.left_out
         for camera in labelled:
             self.missing.pop(camera, None)
             self.astray.pop(camera, None)

@@ -10,14 +10,17 @@ import torch
 from numpy.typing import NDArray
 
 from imgcal.geometry import RigidTransform
+from imgcal.medians import median
 from imgcal.monitoring import ObjectMotion, RigBelief, project_fiducials
 from imgcal.types import Detections
 
 INEXACT, UNSTEADY = 0.1, 30.0
 """Error of a corrected blob: a share of the distance moved, and pixels per second of delay. The place is extrapolated,
 and the extrapolation error is the same for all blobs of a snapshot."""
-LONGEST_GAP = 0.2
-"""Maximum time (s) since the last snapshot but one for which the object's motion is known."""
+INTERVALS, GAPS = 2.5, (0.2, 0.45)
+"""Maximum time since the last snapshot but one for which the object's motion is known: two usual intervals with some
+room, within these bounds (s). Three poses are needed: a delay's error is several times as large with the velocity
+between two. The upper bound lets pass 5 Hz, the lowest rate at which slips are found."""
 POSES = 16
 """Number of latest snapshots that give the motion."""
 
@@ -46,12 +49,13 @@ def clock_shifts(
     cameras = np.flatnonzero(late)
     if not len(cameras):
         return shift
-    known = len(poses) > 1 and time - poses[-2][0] <= LONGEST_GAP
-    if not known:
+    times = np.array([when for when, _ in poses])
+    least, most = GAPS
+    gap = least if len(times) < 2 else min(max(INTERVALS * median(np.diff(times)), least), most)
+    if len(times) < 2 or time - times[-2] > gap:
         shift[np.isin(blobs.camera, cameras)] = np.nan
         return shift
-    seconds = torch.tensor([when - time for when, _ in poses], dtype=torch.float64)
-    motion = ObjectMotion.of(RigidTransform.cat([pose for _, pose in poses]), seconds)
+    motion = ObjectMotion.of(RigidTransform.cat([pose for _, pose in poses]), torch.from_numpy(times - time), gap)
     for camera in cameras.tolist():
         mine = np.flatnonzero(blobs.camera == camera)
         now, then = project_fiducials(belief, motion.interpolate(torch.tensor([0.0, late[camera]])), camera).numpy()

@@ -20,8 +20,8 @@ from imgcal.online.sequential_test import check_like
 # Residuals that count.
 MEMORY_SECONDS = 5.0
 """Decay time (s, to 1/e) of a residual's weight."""
-LONGEST_INTERVAL = 0.2
-"""Maximum time (s) between snapshots for which the difference of predictions is a velocity."""
+LONGEST_INTERVAL = 0.21
+"""Maximum time (s) between snapshots for which the difference of predictions is a velocity: 5 Hz, with some room."""
 
 # Offsets that are reported and corrected.
 OFFSET_CHI2, LEAST = 40.0, 1e-3

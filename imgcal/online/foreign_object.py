@@ -1,4 +1,7 @@
-"""Detect a different object: as many blobs as fiducials, but no snapshot can be labelled for seconds."""
+"""Detect a different object: as many blobs as fiducials, but its pattern is not found in any snapshot for seconds.
+
+Labels that fit in no camera are another matter: that is the object, and most cameras have moved.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +22,8 @@ KNOWN, BY_CHANCE = 0.75, 3
 A snapshot with fewer labels may have them by chance, and cancels this number of refused ones."""
 SHARE, CAMERAS = 0.6, 2
 """Number of blobs, as a share of the object's fiducials, for a camera to see something like it, and of such cameras."""
+NOT_FOUND = "identity"
+"""How the reason for a refusal begins if the object's pattern was not found."""
 
 
 class ForeignObject:
@@ -39,9 +44,9 @@ class ForeignObject:
         blobs, fiducials = state.detections, len(state.belief.points_object)
         count = np.bincount(blobs.camera[blobs.usable], minlength=len(blobs.camera_names))
         like_it = count >= SHARE * fiducials
-        if state.refused is None:
+        if state.refused is None or not state.refused.startswith(NOT_FOUND):
             labelled = np.bincount(blobs.camera[blobs.fiducial >= 0], minlength=len(like_it))
-            if labelled[like_it].sum() >= KNOWN * fiducials * like_it.sum():
+            if state.refused is None and labelled[like_it].sum() >= KNOWN * fiducials * like_it.sum():
                 self._known, self._times = True, 0
             self._times = max(self._times - BY_CHANCE, 0)
             self._since = self._since if self._times else None

@@ -195,7 +195,15 @@ class RigKeeper:
         memory, late = self._memory, self._clock.late
         rows = np.flatnonzero(detections.usable & np.isfinite(lag).all(1))
         usable = shift_blobs(detections.select(rows), lag[rows], late)
-        labelled = label_snapshot(memory, self._labelling, usable, detections.snapshot_names[0], frames)
+
+        def correct(named: Detections, pose: RigidTransform) -> Detections:
+            if len(named) != len(rows):  # blobs of a proposer
+                return named
+            seen = replace(detections.select(rows), fiducial=named.fiducial)
+            return shift_blobs(seen, self._lag(seen, (memory.time, pose)), late)
+
+        name = detections.snapshot_names[0]
+        labelled = label_snapshot(memory, self._labelling, usable, name, frames, correct if late.any() else None)
         found = labelled.checked.blobs
         if len(found) != len(rows):  # blobs of a proposer
             return labelled, found, np.zeros((len(found), 2))
@@ -203,7 +211,8 @@ class RigKeeper:
         fiducial[rows] = found.fiducial
         shown = replace(detections, fiducial=fiducial)
         if late.any():  # the object's pose is known now
-            lag = self._lag(shown, (memory.time, labelled.checked.rig_from_object))
+            known = self._lag(shown, (memory.time, labelled.checked.rig_from_object))
+            lag = np.where(np.isfinite(lag), known, np.nan)  # what was left out stays so
             blobs = shift_blobs(shown.select(rows), lag[rows], late)
             labelled = replace(labelled, checked=replace(labelled.checked, blobs=blobs))
         return labelled, shown, lag
@@ -284,7 +293,8 @@ class RigKeeper:
         silent = (camera for camera, name in enumerate(names) if name in out)
         # An unsynchronized camera has not moved far.
         astray = frozenset() if labelled is None else labelled.astray - memory.monitor.quarantine.cameras
-        look = VisibleObject(time, number, state.detections, state.predicted, astray, frozenset(silent))
+        left_out = frozenset(state.detections.camera[np.isnan(state.lag).any(1)].tolist())
+        look = VisibleObject(time, number, state.detections, state.predicted, astray, frozenset(silent), left_out)
         events += memory.sightings.observe(state.rig, look)
         events += memory.relearning.report_relearnt(
             memory.belief, frozenset(memory.monitor.open), memory.best_known, time, number

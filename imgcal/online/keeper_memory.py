@@ -124,7 +124,8 @@ class KeeperMemory:
         self.noise.restart()
         self.usual.clear()
         self.times.clear()
-        message = "all cameras have moved: learning starts again from the factory calibration"
+        cause = "labels fit in no camera: all cameras have moved, or the labels are of another object"
+        message = f"{cause}; learning starts again from the factory calibration"
         self.pending.append(Event(self.time, self.count - 1, "restart", message=message))
 
     @property

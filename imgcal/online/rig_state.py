@@ -57,7 +57,7 @@ class RigState:
     sentence: str  # description of the state
     refused: str | None  # why this snapshot taught nothing
     detections: Detections  # blobs of this snapshot, labelled where identified
-    lag: NDArray[np.float64]  # (M, 2) pixels to add to these: cameras may expose late while the object moves
+    lag: NDArray[np.float64]  # (M, 2) pixels to add to these of late cameras; nan if the object's motion is unknown
     predicted: NDArray[np.float64]  # (C, N, 2) pixels, predicted fiducials; nan if unknown
     residual: NDArray[np.float64]  # (C,) RMS pixels of this snapshot; nan if nothing was seen
     rig_from_object: RigidTransform | None

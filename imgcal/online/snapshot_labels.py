@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +22,9 @@ from imgcal.online.snapshot_update import test_clocks, test_object
 from imgcal.pipeline import settle_labels
 from imgcal.types import Detections
 
+Correct = Callable[[Detections, RigidTransform], Detections]
+"""Moves labelled blobs of late cameras to where they would have been in time, given the object's pose (1,)."""
+
 MOST_VAIN = 64
 """Successive snapshots that fit in no camera, after which the rig is relearnt from the factory calibration."""
 
@@ -40,6 +43,7 @@ def label_snapshot(
     usable: Detections,
     name: str,
     frames: Mapping[str, Frame | None] | None,
+    correct: Correct | None = None,
 ) -> Labelled:
     """Label a snapshot.
 
@@ -49,6 +53,7 @@ def label_snapshot(
         usable: its blobs.
         name: its name.
         frames: frames that the blobs were found in; None = there are none.
+        correct: corrects blobs as soon as the object's pose is known; None = no camera is late.
 
     Raises:
         RefusedError: the blobs cannot be labelled, or the labels fit in no camera.
@@ -57,7 +62,7 @@ def label_snapshot(
         return Labelled(*label_lights(memory, memory.lights, usable))
     usable = settle_labels(usable, memory.belief.rig, memory.obj_now)
     coded = usable.fiducial.copy() if (usable.fiducial >= 0).any() else None
-    followed = None if coded is not None else _follow(memory, labelling, usable)
+    followed = None if coded is not None else _follow(memory, labelling, usable, correct)
     if followed is not None:
         return followed
     there = memory.surroundings
@@ -67,13 +72,13 @@ def label_snapshot(
     if pose is None:
         obj = memory.obj_now
         pose = initial_pose(to_observations(blobs, memory.prior, obj), memory.belief.rig, obj)[0]
-    checked = _check(memory, blobs, pose.reshape(1))
+    checked = _check(memory, blobs, pose.reshape(1), correct)
     if checked.usual > memory.most_usual and memory.doubts.due and test_clocks(memory):
-        checked = _check(memory, blobs, pose.reshape(1))
+        checked = _check(memory, blobs, pose.reshape(1), correct)
     changed = checked.usual > memory.most_usual and memory.doubts.due and test_object(memory, learnt=False)
     if changed and (change := changed.object_change) is not None:
         memory.pending.append(object_event(change, memory.change_time(change.since), memory.time, memory.count - 1))
-        checked = _check(memory, blobs, pose.reshape(1))
+        checked = _check(memory, blobs, pose.reshape(1), correct)
     if checked.usual > memory.most_usual:
         memory.doubts.observe_refused(checked, memory.time if memory.learnt is None else memory.learnt, memory.time)
         memory.in_vain += 1
@@ -86,7 +91,7 @@ def label_snapshot(
     return _search(memory, checked)
 
 
-def _follow(memory: KeeperMemory, labelling: Labelling, usable: Detections) -> Labelled | None:
+def _follow(memory: KeeperMemory, labelling: Labelling, usable: Detections, correct: Correct | None) -> Labelled | None:
     """Label a snapshot by the last one's pose; None = not possible."""
     if not labelling.follows or labelling.slips or not memory.poses:
         return None
@@ -96,7 +101,7 @@ def _follow(memory: KeeperMemory, labelling: Labelling, usable: Detections) -> L
         return None
     sought = frozenset(memory.search.sought)
     try:
-        found = _search(memory, _check(memory, named, pose))
+        found = _search(memory, _check(memory, named, pose, correct))
     except RefusedError:
         return None
     few = found.checked.labels < LEAST_FOLLOWED * memory.labels
@@ -113,10 +118,13 @@ def _extrapolate(memory: KeeperMemory) -> RigidTransform:
     return RigidTransform(last.rotation, last.translation + share * (last.translation - first.translation))
 
 
-def _check(memory: KeeperMemory, named: Detections, pose: RigidTransform) -> Checked:
+def _check(memory: KeeperMemory, named: Detections, pose: RigidTransform, correct: Correct | None) -> Checked:
     """Find the labels that fit; unsynchronized cameras do not count for the object's pose."""
     given = memory.belief.rig, memory.obj_now, pose, memory.options
     every = check_labels(named, *given)
+    if correct is not None:
+        named = correct(named, every.rig_from_object)
+        every = check_labels(named, *given)
     if not memory.monitor.quarantine.cameras:
         return every
     quarantined = np.isin(named.camera, list(memory.monitor.quarantine.cameras))

@@ -124,6 +124,13 @@ def test_an_object_that_has_left_the_view_of_a_camera_is_not_hidden_from_it() ->
     assert sightings.hidden_cameras(rig, look(5 / 60, []).predicted) == {3}  # it comes back, and is still covered
 
 
+def test_a_camera_whose_blobs_were_left_out_does_not_miss_the_object() -> None:
+    sightings, rig = CameraVisibility(("a", "b", "c", "d")), imgcal.load_rig("T4").to(torch.float64)
+    looks = [replace(look(s / 10, [0, 1, 2]), left_out=frozenset({3})) for s in range(60)]
+    assert kinds(sightings, looks) == []
+    assert sightings.hidden_cameras(rig, looks[-1].predicted) == frozenset()
+
+
 def test_a_camera_that_cannot_see_the_object_misses_nothing() -> None:
     sightings, rig = CameraVisibility(("a", "b", "c", "d")), imgcal.load_rig("T4").to(torch.float64)
     for s in range(120):

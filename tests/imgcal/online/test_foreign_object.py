@@ -63,3 +63,12 @@ def test_an_absent_object_is_no_foreign_one() -> None:
     test = ForeignObject()
     watched(test, None, True, 0.0, 1)
     assert watched(test, "identity", False, 1.0, 200) == []
+
+
+def test_labels_that_fit_in_no_camera_are_those_of_the_object() -> None:
+    """All cameras have moved: it is recognized, but nowhere in its place."""
+    test = ForeignObject()
+    watched(test, None, True, 0.0, 1)
+    assert watched(test, "estimation: labels are 32.1 px off in most cameras", True, 1.0, 200) == []
+    (event,) = watched(test, "identity", True, 11.0, 200)
+    assert event.since == 11.0

@@ -96,6 +96,41 @@ def test_a_clock_that_slips_is_told_as_that_alone(seed: int, late: float) -> Non
     assert normalized(states[-1], made.rig) < 3
 
 
+@pytest.mark.parametrize("rate", [6.0, 10.0])
+def test_a_camera_whose_clock_has_slipped_counts_at_a_low_rate_too(rate: float) -> None:
+    made = stream(1, conditions=Conditions(rate=rate), slips=[Slip(40, 1, -0.02)])
+    states = kept(made, 90)
+    (event,) = (event for state in states for event in state.events)
+    assert (event.kind, event.camera) == ("clock_slip", "cam02")
+    seen = [int((state.detections.fiducial[state.detections.camera == 1] >= 0).sum()) for state in states]
+    assert np.mean(seen[50:]) > 0.9 * np.mean(seen[:40])
+    assert states[-1].cameras["cam02"] == "ok"
+    assert normalized(states[-1], made.rig) < 2
+
+
+def test_a_clock_that_slips_at_five_snapshots_a_second_is_told_whatever_the_times_round_to() -> None:
+    made, events = stream(1, conditions=Conditions(rate=5.0), slips=[Slip(40, 1, -0.02)]), []
+    with RigKeeper(made.factory, made.obj) as keeper:
+        for time, blobs in made.snapshots(70):
+            state = keeper.update(blobs, 1.7e9 + time)
+            events += state.events
+    assert {(event.kind, event.camera) for event in events} == {("clock_slip", "cam02")}
+    assert state.cameras["cam02"] == "ok"
+    assert state.clock_offset[1] == pytest.approx(-0.02, rel=0.1)
+
+
+def test_a_late_camera_whose_blobs_cannot_be_corrected_is_not_lost() -> None:
+    """The snapshots become too rare to know how the object moves."""
+    made, events = stream(1, slips=[Slip(60, 1, 0.0167)]), []
+    with RigKeeper(made.factory, made.obj) as keeper:
+        for number in (*range(100), *range(120, 2520, 60)):  # 60 Hz, then 1 Hz
+            state = keeper.update(made.snapshot(number), number / 60)
+            events += state.events
+    assert {event.kind for event in events} == {"clock_slip"}
+    assert not (state.detections.fiducial[state.detections.camera == 1] >= 0).any()
+    assert state.cameras["cam02"] == "ok"
+
+
 def test_a_bump_of_a_camera_whose_clock_has_slipped_is_told_as_fast() -> None:
     made = stream(3, slips=[Slip(30, 1, 0.0167)], bumps=[Bump(90, 1, "rotation", math.radians(0.3))])
     events = [event for state in kept(made, 110) for event in state.events]
@@ -276,6 +311,15 @@ def test_half_of_the_cameras_that_are_knocked_are_told_and_nobody_is_calibrated_
     }
     assert {event.camera for event in events if event.kind == "moved"} == {"cam01", "cam04"}
     assert normalized(state, made.rig) < 1.6
+
+
+def test_a_knock_that_turns_all_cameras_is_told_as_that_and_not_as_another_object() -> None:
+    knock = [Bump(40, camera, "rotation", math.radians(0.7)) for camera in range(6)]
+    obj = imgcal.load_object("asymmetric8")
+    made = Stream(imgcal.load_rig("O6"), obj, 1, Conditions(rate=10.0, labelled=True), knock)
+    events, last = events_of(made, 120)
+    assert [event.kind for event in events] == ["restart"]
+    assert last.refused is None
 
 
 def shaking(made: Stream, count: int, cameras: list[int], since: int) -> Iterator[tuple[float, Detections]]:
