@@ -17,7 +17,10 @@ from imgcal.types import CalibrationObject
 
 LEAST_OVERLAP = 0.6  # minimum share of fiducials that fall onto others for a shift to be confusing
 TOLERANCE_STEP = 0.05  # of the logarithm: a tolerance is rounded up, so that few different ones occur in a capture
-MOST_SHIFTS = 8  # the smallest ones; larger ones are combinations of them
+MOST_SHIFTS = 8  # the smallest ones, and others as small; larger ones are combinations of them
+SAME_LENGTH = 1 + 1e-6  # maximum ratio of equal lengths
+FIRST_DIFFERENCES = 32  # per fiducial, in the first search for shifts
+GROWTH = 4  # factor in each further one
 
 
 @dataclass(frozen=True)
@@ -43,16 +46,38 @@ def lattice_shifts(obj: CalibrationObject) -> list[Ambiguity]:
 @lru_cache(maxsize=16)
 def _lattice_shifts(coordinates: bytes, tolerance: float) -> tuple[Ambiguity, ...]:
     """Find the shifts once per object: there are many snapshots, but few objects."""
-    points = np.frombuffer(coordinates).reshape(-1, 3)
+    points, reach = np.frombuffer(coordinates).reshape(-1, 3), 2 * tolerance
     differences = (points[None] - points[:, None]).reshape(-1, 3)
-    cells, place, counts = np.unique(
-        np.round(differences / (2 * tolerance)).astype(np.int64), axis=0, return_inverse=True, return_counts=True
-    )
-    often = (counts >= LEAST_OVERLAP * len(points)) & cells.any(1)
-    sums = np.stack([np.bincount(place.ravel(), weights=differences[:, i]) for i in range(3)], axis=1)
-    shifts = sums[often] / counts[often, None]
-    shifts = shifts[np.argsort(np.linalg.norm(shifts, axis=1), kind="stable")[:MOST_SHIFTS]]
-    return tuple(Ambiguity(np.eye(3), shift, _map_onto(points, points + shift, 2 * tolerance)) for shift in shifts)
+    length = np.linalg.norm(differences, axis=1)
+    ascending = np.argsort(length, kind="stable")
+    # A large lattice has its smallest shifts among the smallest differences: the others need no search.
+    count, shifts = FIRST_DIFFERENCES * len(points), np.empty((0, 3))
+    while len(shifts) <= MOST_SHIFTS and count < GROWTH * len(differences):
+        few = ascending[:count]
+        longest = np.inf if count >= len(differences) else length[few[-1]] - reach
+        shifts = _frequent(differences[few], LEAST_OVERLAP * len(points), reach, longest)
+        count *= GROWTH
+    if len(shifts) > MOST_SHIFTS:
+        shifts = shifts[np.linalg.norm(shifts, axis=1) <= SAME_LENGTH * np.linalg.norm(shifts[MOST_SHIFTS - 1])]
+    return tuple(Ambiguity(np.eye(3), shift, _map_onto(points, points + shift, reach)) for shift in shifts)
+
+
+def _frequent(differences: NDArray[np.float64], least: float, reach: float, longest: float) -> NDArray[np.float64]:
+    """Find vectors (K, 3), shortest first, within `reach` of at least `least` of the differences (M, 3).
+
+    They are longer than `reach` and shorter than `longest`.
+    """
+    tree, length = cKDTree(differences), np.linalg.norm(differences, axis=1)
+    count = tree.query_ball_point(differences, reach, return_length=True)
+    left = np.flatnonzero((count >= least) & (length > reach) & (length < longest))
+    left = left[np.argsort(-count[left], kind="stable")]
+    found = []
+    while len(left):
+        middle = differences[left[0]]
+        found.append(differences[tree.query_ball_point(middle, reach)].mean(0))
+        left = left[np.linalg.norm(differences[left] - middle, axis=1) > 2 * reach]
+    shifts = np.reshape(found, (-1, 3))
+    return shifts[np.argsort(np.linalg.norm(shifts, axis=1), kind="stable")]
 
 
 def near_symmetries(obj: CalibrationObject, tolerance: float) -> list[Ambiguity]:

@@ -3,7 +3,7 @@ import torch
 
 from imgcal.association import lattice_shifts, near_symmetries
 from imgcal.association.ambiguities import conflicts, differ, relabel
-from imgcal.geometry import RigidTransform
+from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import data_path, load_object
 from imgcal.types import CalibrationObject
 
@@ -26,6 +26,27 @@ def test_steps_of_a_lattice_are_found() -> None:
     for motion in shifts:
         falls = motion.permutation >= 0
         np.testing.assert_allclose(points[falls] + motion.translation, points[motion.permutation[falls]], atol=1e-9)
+
+
+def test_steps_of_a_measured_lattice_are_found_in_any_frame_and_order() -> None:
+    random, exact = np.random.default_rng(0), lattice(5, 4)
+    points = exact.points.numpy() + 0.07 * random.standard_normal((20, 3))
+    turn = rotation_from_vector(torch.from_numpy(random.standard_normal(3))).numpy()
+    expected = np.array([motion.translation for motion in lattice_shifts(exact)])
+    for order, rotation in ((np.arange(20), np.eye(3)), (random.permutation(20), turn)):
+        measured = CalibrationObject(torch.from_numpy(points[order] @ rotation.T), torch.ones(20, 3))
+        shifts = lattice_shifts(measured)
+        found = np.array([motion.translation @ rotation for motion in shifts])
+        assert len(found) == len(expected)
+        np.testing.assert_allclose(found[np.lexsort(found.round().T)], expected[np.lexsort(expected.T)], atol=0.1)
+        assert all((motion.permutation >= 0).sum() >= 12 for motion in shifts)
+
+
+def test_steps_of_a_large_lattice_are_the_smallest() -> None:
+    plain, cube = lattice(23, 19), CalibrationObject(torch.cartesian_prod(*[torch.arange(5.0)] * 3), torch.ones(125, 3))
+    assert [round(float(np.linalg.norm(motion.translation))) for motion in lattice_shifts(plain)] == 4 * [10] + 4 * [14]
+    lengths = [float(np.linalg.norm(motion.translation)) for motion in lattice_shifts(cube)]
+    np.testing.assert_allclose(lengths, 6 * [1.0] + 12 * [np.sqrt(2)])  # all of them, not those that rounding prefers
 
 
 def test_an_asymmetric_object_has_no_motion() -> None:
