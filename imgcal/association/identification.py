@@ -16,6 +16,7 @@ from imgcal.association.ambiguities import (
     displacement,
     lattice_shifts,
     near_symmetries,
+    partial_turns,
     relabel,
 )
 from imgcal.association.assignment import spacing
@@ -366,6 +367,7 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
     distance = scene.rig.working_distance or _usual_distance(scene.known, _one_snapshot(pose))
     pattern = scene.known.spread.at(distance)
     turns = [] if known_pose else near_symmetries(scene.obj, 2 * pattern.shape * scene.obj.size)
+    turns += [] if known_pose else partial_turns(scene.obj)
     if not shifts and not turns:
         return best, np.inf
     compared: dict[tuple[int, bytes], list[tuple[float, NDArray[np.int64]]]] = {}

@@ -1,9 +1,10 @@
 import numpy as np
+import pytest
 import torch
 
 from imgcal.association import lattice_shifts, near_symmetries
-from imgcal.association.ambiguities import conflicts, differ, relabel
-from imgcal.geometry import RigidTransform, rotation_from_vector
+from imgcal.association.ambiguities import conflicts, differ, partial_turns, relabel
+from imgcal.geometry import RigidTransform, geodesic_angle, rotation_from_vector
 from imgcal.io import data_path, load_object
 from imgcal.types import CalibrationObject
 
@@ -53,6 +54,24 @@ def test_an_asymmetric_object_has_no_motion() -> None:
     obj = load_object(data_path("objects", "asymmetric8.csv"))
     assert lattice_shifts(obj) == []
     assert near_symmetries(obj, 1.0) == []
+
+
+def test_turns_that_take_most_fiducials_near_others_are_found() -> None:
+    sphere = load_object(data_path("objects", "sphere64.csv"))  # its neighbours differ by the golden angle
+    turns = partial_turns(sphere)
+    angles = [float(geodesic_angle(torch.from_numpy(turn.rotation), torch.eye(3).double())) for turn in turns]
+    np.testing.assert_allclose(np.degrees(sorted(angles)), [137.5, 137.5, 180, 180], atol=0.5)
+    points = sphere.points.numpy()
+    for turn in turns:
+        moved = points @ turn.rotation.T + turn.translation
+        away = np.linalg.norm(moved - points[turn.permutation], axis=1)
+        assert sorted(turn.permutation) == list(range(64))
+        assert (away < 0.05 * sphere.size).mean() > 0.6
+
+
+@pytest.mark.parametrize("name", ["asymmetric8", "cube8", "cube27"])
+def test_objects_without_partial_turns(name: str) -> None:
+    assert partial_turns(load_object(data_path("objects", f"{name}.csv"))) == []
 
 
 def test_moved_labels_and_pose_explain_the_same_blobs() -> None:

@@ -113,9 +113,16 @@ def test_a_cube_is_ambiguous_with_one_symmetry_element_for_all_cameras(o10: Came
         assert agreements(found.labels, truth, cube)[1] == 0
 
 
-def test_an_object_turned_almost_onto_itself_is_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("size", [1.0, 0.5, 0.25])
+def test_an_object_turned_almost_onto_itself_is_not_accepted(size: float, monkeypatch: pytest.MonkeyPatch) -> None:
     # Turned by the golden angle, three fifths of this object are near others, and a bent rig makes up for the rest.
     rig, obj = read_rig(data_path("rigs", "T4.yaml")), load_object(data_path("objects", "sphere64.csv"))
+    rig = replace(
+        rig,
+        focal_length=size * rig.focal_length,
+        principal_point=size * (rig.principal_point + 0.5) - 0.5,
+        image_size=(size * rig.image_size).long(),
+    )
     truth = true_detections(simulate_truth(rig, obj, 6, torch.Generator().manual_seed(5), PhysicalDrift()))
     random = np.random.default_rng(5)
     seen = truth.select(random.random(len(truth)) > 0.3)
@@ -124,13 +131,18 @@ def test_an_object_turned_almost_onto_itself_is_not_accepted(monkeypatch: pytest
     blobs, std = replace(seen, fiducial=np.full(len(seen), -1)), RigPrior().std(rig)
     with monkeypatch.context() as patch:
         patch.setattr(identification, "COARSE", np.inf)
+        patch.setattr(identification, "partial_turns", lambda obj: [])
         turned = relocalize(blobs, rig, obj, std)
+    assert turned.accepted
     assert agreements(turned.labels, seen.fiducial, obj)[1] > 100  # the first labelling that is found
-    assert turned.rig_from_object is not None
-    refused = track(blobs, rig, obj, std, turned.rig_from_object)
-    assert not refused.accepted and "the object may have another pose" in refused.reason
-    for found in (relocalize(blobs, rig, obj, std), identify(blobs, rig, obj, std, [turned.rig_from_object])):
-        right, wrong = agreements(found.labels, seen.fiducial, obj)
+    found = [relocalize(blobs, rig, obj, std)]
+    if size == 1:  # the residuals show it as well, even near a pose that seems to be known
+        assert turned.rig_from_object is not None
+        refused = track(blobs, rig, obj, std, turned.rig_from_object)
+        assert not refused.accepted and "the object may have another pose" in refused.reason
+        found.append(identify(blobs, rig, obj, std, [turned.rig_from_object]))
+    for each in found:
+        right, wrong = agreements(each.labels, seen.fiducial, obj)
         assert wrong == 0
         assert right > 0.9 * len(seen)
 
