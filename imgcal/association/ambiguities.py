@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from imgcal.association.hypotheses import Poses
 from imgcal.geometry import RigidTransform
@@ -17,7 +20,14 @@ from imgcal.types import CalibrationObject
 
 LEAST_OVERLAP = 0.6  # minimum share of fiducials that fall onto others for a shift to be confusing
 TOLERANCE_STEP = 0.05  # of the logarithm: a tolerance is rounded up, so that few different ones occur in a capture
-MOST_SHIFTS = 8  # the smallest ones; larger ones are combinations of them
+MOST_SHIFTS = 8  # the smallest ones, and others as small; larger ones are combinations of them
+SAME_LENGTH = 1 + 1e-6  # maximum ratio of equal lengths
+FIRST_DIFFERENCES = 32  # per fiducial, in the first search for shifts
+GROWTH = 4  # factor in each further one
+NEAR = 0.05  # distance that a bent rig may hide, relative to the object's size
+BASES = 6  # fiducials whose pairs are turned onto others: two of them are nearly always among those that fall onto some
+SAME_TURN = 0.1  # rad, angle between rotations that are one
+MOST_TURNED = 128  # fiducials; with more, there are too many pairs
 
 
 @dataclass(frozen=True)
@@ -43,16 +53,38 @@ def lattice_shifts(obj: CalibrationObject) -> list[Ambiguity]:
 @lru_cache(maxsize=16)
 def _lattice_shifts(coordinates: bytes, tolerance: float) -> tuple[Ambiguity, ...]:
     """Find the shifts once per object: there are many snapshots, but few objects."""
-    points = np.frombuffer(coordinates).reshape(-1, 3)
+    points, reach = np.frombuffer(coordinates).reshape(-1, 3), 2 * tolerance
     differences = (points[None] - points[:, None]).reshape(-1, 3)
-    cells, place, counts = np.unique(
-        np.round(differences / (2 * tolerance)).astype(np.int64), axis=0, return_inverse=True, return_counts=True
-    )
-    often = (counts >= LEAST_OVERLAP * len(points)) & cells.any(1)
-    sums = np.stack([np.bincount(place.ravel(), weights=differences[:, i]) for i in range(3)], axis=1)
-    shifts = sums[often] / counts[often, None]
-    shifts = shifts[np.argsort(np.linalg.norm(shifts, axis=1), kind="stable")[:MOST_SHIFTS]]
-    return tuple(Ambiguity(np.eye(3), shift, _map_onto(points, points + shift, 2 * tolerance)) for shift in shifts)
+    length = np.linalg.norm(differences, axis=1)
+    ascending = np.argsort(length, kind="stable")
+    # A large lattice has its smallest shifts among the smallest differences: the others need no search.
+    count, shifts = FIRST_DIFFERENCES * len(points), np.empty((0, 3))
+    while len(shifts) <= MOST_SHIFTS and count < GROWTH * len(differences):
+        few = ascending[:count]
+        longest = np.inf if count >= len(differences) else length[few[-1]] - reach
+        shifts = _frequent(differences[few], LEAST_OVERLAP * len(points), reach, longest)
+        count *= GROWTH
+    if len(shifts) > MOST_SHIFTS:
+        shifts = shifts[np.linalg.norm(shifts, axis=1) <= SAME_LENGTH * np.linalg.norm(shifts[MOST_SHIFTS - 1])]
+    return tuple(Ambiguity(np.eye(3), shift, _map_onto(points, points + shift, reach)) for shift in shifts)
+
+
+def _frequent(differences: NDArray[np.float64], least: float, reach: float, longest: float) -> NDArray[np.float64]:
+    """Find vectors (K, 3), shortest first, within `reach` of at least `least` of the differences (M, 3).
+
+    They are longer than `reach` and shorter than `longest`.
+    """
+    tree, length = cKDTree(differences), np.linalg.norm(differences, axis=1)
+    count = tree.query_ball_point(differences, reach, return_length=True)
+    left = np.flatnonzero((count >= least) & (length > reach) & (length < longest))
+    left = left[np.argsort(-count[left], kind="stable")]
+    found = []
+    while len(left):
+        middle = differences[left[0]]
+        found.append(differences[tree.query_ball_point(middle, reach)].mean(0))
+        left = left[np.linalg.norm(differences[left] - middle, axis=1) > 2 * reach]
+    shifts = np.reshape(found, (-1, 3))
+    return shifts[np.argsort(np.linalg.norm(shifts, axis=1), kind="stable")]
 
 
 def near_symmetries(obj: CalibrationObject, tolerance: float) -> list[Ambiguity]:
@@ -72,6 +104,74 @@ def _near_symmetries(coordinates: bytes, tolerance: float) -> tuple[Ambiguity, .
     points = torch.frombuffer(bytearray(coordinates), dtype=torch.float64).reshape(-1, 3)
     turns = CalibrationObject(points, torch.zeros_like(points)).near_symmetries(tolerance)
     return tuple(Ambiguity(turn.rotation, turn.translation, turn.permutation) for turn in turns)
+
+
+def partial_turns(obj: CalibrationObject) -> list[Ambiguity]:
+    """Find the rotations about the centroid, best first, that take most fiducials near others, but are not symmetries.
+
+    A rig within its prior can bend so that an object turned like this seems to explain most blobs. `permutation` has no
+    -1: the other fiducials fall far from those it names.
+    """
+    if obj.pose_rank < 6 or obj.num_fiducials > MOST_TURNED:
+        return []
+    exact = np.stack([motion.rotation for motion in obj.symmetries])
+    turns = _partial_turns(obj.points.double().cpu().numpy().tobytes(), NEAR * obj.size)
+    return [turn for turn in turns if _angles(exact, turn.rotation).min() > SAME_TURN]
+
+
+@lru_cache(maxsize=16)
+def _partial_turns(coordinates: bytes, tolerance: float) -> tuple[Ambiguity, ...]:
+    """Find the rotations once per object: those of some pairs of fiducials onto all others that are as far apart."""
+    points = np.frombuffer(coordinates).reshape(-1, 3)
+    centroid = points.mean(0)
+    points = points - centroid
+    tree, least = cKDTree(points), LEAST_OVERLAP * len(points)
+    found: list[tuple[int, NDArray[np.float64], NDArray[np.int64]]] = []
+    for pair in combinations(_spread_points(points, BASES), 2):
+        rotations = _turns_of_pair(points, *pair, tolerance)
+        distance, near = tree.query(points @ rotations.swapaxes(1, 2), distance_upper_bound=2 * tolerance)
+        for k in np.flatnonzero(np.isfinite(distance).sum(1) >= least):
+            if any(_angles(turn, rotations[k]) < SAME_TURN for _, turn, _ in found):
+                continue
+            onto, fell = near[k], near[k] < len(points)
+            for _ in range(2):
+                u, _, vh = np.linalg.svd(points[onto[fell]].T @ points[fell])
+                rotation = u @ np.diag([1, 1, np.linalg.det(u @ vh)]) @ vh
+                onto = tree.query(points @ rotation.T, distance_upper_bound=tolerance)[1]
+                fell = onto < len(points)
+            if fell.sum() >= least and all(_angles(turn, rotation) > SAME_TURN for _, turn, _ in found):
+                # The others get a place as well: their blobs are fiducials, too.
+                everywhere = linear_sum_assignment(cdist(points @ rotation.T, points) ** 2)[1]
+                found.append((int(fell.sum()), rotation, everywhere))
+    found.sort(key=lambda each: -each[0])
+    return tuple(Ambiguity(turn, centroid - turn @ centroid, near) for _, turn, near in found)
+
+
+def _spread_points(points: NDArray[np.float64], count: int) -> list[int]:
+    """Choose points far from the centroid (at the origin) and from each other."""
+    distance = np.linalg.norm(points, axis=1)
+    chosen: list[int] = []
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return chosen
+
+
+def _turns_of_pair(points: NDArray[np.float64], first: int, second: int, tolerance: float) -> NDArray[np.float64]:
+    """Rotations (R, 3, 3) about the origin that take two points near others."""
+    length = np.linalg.norm(points, axis=1)
+    i, j = np.nonzero(np.abs(cdist(points, points) - np.linalg.norm(points[first] - points[second])) <= 2 * tolerance)
+    alike = (np.abs(length[i] - length[first]) <= tolerance) & (np.abs(length[j] - length[second]) <= tolerance)
+    source, target = points[[first, second]], np.stack((points[i[alike]], points[j[alike]]), axis=1)
+    u, _, vh = np.linalg.svd(target.swapaxes(1, 2) @ source)
+    u[..., 2] *= np.linalg.det(u @ vh)[:, None]
+    return np.asarray(u @ vh)
+
+
+def _angles(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angles (*B,) rad between rotations (*B, 3, 3) and one (3, 3)."""
+    half = np.linalg.norm(first - second, axis=(-2, -1)) / math.sqrt(8)
+    return np.asarray(2 * np.arcsin(np.minimum(half, 1)))
 
 
 def relabel(

@@ -16,6 +16,7 @@ from imgcal.association.ambiguities import (
     displacement,
     lattice_shifts,
     near_symmetries,
+    partial_turns,
     relabel,
 )
 from imgcal.association.assignment import spacing
@@ -27,7 +28,7 @@ from imgcal.association.hypotheses import (
 )
 from imgcal.association.identity import Identity, IdentityOptions, Status
 from imgcal.association.minimal_labels import compare_labellings, has_minimal_blobs
-from imgcal.association.search import VERIFIED, Search, match_on_lattice
+from imgcal.association.search import DECISIVE, VERIFIED, Search, match_on_lattice
 from imgcal.association.stick_poses import fit_sticks
 from imgcal.association.verification import (
     STAGES,
@@ -43,6 +44,7 @@ from imgcal.association.verification import (
     part_of_camera,
     predictions,
     refine,
+    residual_sigma,
     rig_and_pose,
     select_pose,
     settle_labels,
@@ -67,6 +69,9 @@ MOST_SHARED = 0.2  # maximum share of common blobs for two labellings to be two 
 # Explained share near a known pose below which other poses are tried, too: an object shifted by its own edge still
 # explains half.
 CONVINCING = 0.6
+# Residuals (px) of a labelling that is no more than a coarse fit. An object turned almost onto itself explains half of
+# the blobs that well, with a rig that is bent to them.
+COARSE = 0.9
 
 
 def identify(
@@ -269,6 +274,11 @@ def _decide(scene: Scene, fits: Fits, options: IdentityOptions, known_pose: bool
                 f"another labelling explains the blobs nearly as well, or chance does: margin {margin:.1f}, expected "
                 f"{options.least_margin:.0f}; show more of the object, to more cameras"
             )
+        elif share < DECISIVE and (residual := float(residual_sigma(scene, settled)[0])) > COARSE:
+            refusal = (
+                f"the best fit explains only {100 * share:.0f} % of the visible markers, and these to no better than "
+                f"{residual:.1f} px: the object may have another pose; show more of it, to more cameras"
+            )
     if share < least_share:
         refusal = _explain_too_few_labels(scene.obj.name, _share(scene, best, options), share, least_share)
     elif options.others_in_view and refusal is None and scene.rig.num_cameras > 1 and _cameras(chosen) < 2:
@@ -357,6 +367,7 @@ def _against_motions(scene: Scene, best: Fits, known_pose: bool) -> tuple[Fits, 
     distance = scene.rig.working_distance or _usual_distance(scene.known, _one_snapshot(pose))
     pattern = scene.known.spread.at(distance)
     turns = [] if known_pose else near_symmetries(scene.obj, 2 * pattern.shape * scene.obj.size)
+    turns += [] if known_pose else partial_turns(scene.obj)
     if not shifts and not turns:
         return best, np.inf
     compared: dict[tuple[int, bytes], list[tuple[float, NDArray[np.int64]]]] = {}

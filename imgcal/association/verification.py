@@ -213,7 +213,7 @@ def is_settled(before: NDArray[np.int64], fits: Fits) -> bool:
 def fit_and_label(scene: Scene, fits: Fits, sigma: float) -> Fits:
     """Fit with an error of `sigma` px beyond the blobs' own, and label again."""
     fits = fit(scene, replace(fits, sigma=np.full(len(fits.labels), sigma)))
-    return replace(fits, sigma=_residual_sigma(scene, fits), labels=_assign(fits))
+    return replace(fits, sigma=np.minimum(residual_sigma(scene, fits), fits.sigma), labels=_assign(fits))
 
 
 def settle_labels(scene: Scene, fits: Fits, rounds: int = 4) -> Fits:
@@ -222,7 +222,7 @@ def settle_labels(scene: Scene, fits: Fits, rounds: int = 4) -> Fits:
         labels = _assign(fits)
         if np.array_equal(labels, fits.labels):
             break
-        fits = fit(scene, replace(fits, sigma=_residual_sigma(scene, fits), labels=labels))
+        fits = fit(scene, replace(fits, sigma=np.minimum(residual_sigma(scene, fits), fits.sigma), labels=labels))
     return fits
 
 
@@ -368,14 +368,14 @@ def fit(scene: Scene, fits: Fits) -> Fits:
     )  # fmt: skip
 
 
-def _residual_sigma(scene: Scene, fits: Fits) -> NDArray[np.float64]:
-    """Error of blob centres beyond their own sigmas, from the residuals: (K,) px."""
+def residual_sigma(scene: Scene, fits: Fits) -> NDArray[np.float64]:
+    """Error of blob centres beyond their own sigmas, from the residuals of labels within the gate: (K,) px."""
     found = _require_innovations(fits)
     inlier = (fits.labels >= 0) & (found.own < GATE)
     freedom = np.where(inlier, found.freedom, 0).sum((1, 2))
     variance = np.where(inlier, found.residual, 0).sum((1, 2)) / np.maximum(freedom, 1e-3)
     own = np.where(inlier, _blob_noise(scene, fits), 0).sum((1, 2)) / np.maximum(inlier.sum((1, 2)), 1)
-    return np.minimum(np.sqrt(np.maximum(variance - own, 0)), fits.sigma)
+    return np.asarray(np.sqrt(np.maximum(variance - own, 0)))
 
 
 def _size_misfit(scene: Scene, fits: Fits) -> NDArray[np.float64]:

@@ -1,9 +1,10 @@
 import numpy as np
+import pytest
 import torch
 
 from imgcal.association import lattice_shifts, near_symmetries
-from imgcal.association.ambiguities import conflicts, differ, relabel
-from imgcal.geometry import RigidTransform
+from imgcal.association.ambiguities import conflicts, differ, partial_turns, relabel
+from imgcal.geometry import RigidTransform, geodesic_angle, rotation_from_vector
 from imgcal.io import data_path, load_object
 from imgcal.types import CalibrationObject
 
@@ -28,10 +29,49 @@ def test_steps_of_a_lattice_are_found() -> None:
         np.testing.assert_allclose(points[falls] + motion.translation, points[motion.permutation[falls]], atol=1e-9)
 
 
+def test_steps_of_a_measured_lattice_are_found_in_any_frame_and_order() -> None:
+    random, exact = np.random.default_rng(0), lattice(5, 4)
+    points = exact.points.numpy() + 0.07 * random.standard_normal((20, 3))
+    turn = rotation_from_vector(torch.from_numpy(random.standard_normal(3))).numpy()
+    expected = np.array([motion.translation for motion in lattice_shifts(exact)])
+    for order, rotation in ((np.arange(20), np.eye(3)), (random.permutation(20), turn)):
+        measured = CalibrationObject(torch.from_numpy(points[order] @ rotation.T), torch.ones(20, 3))
+        shifts = lattice_shifts(measured)
+        found = np.array([motion.translation @ rotation for motion in shifts])
+        assert len(found) == len(expected)
+        np.testing.assert_allclose(found[np.lexsort(found.round().T)], expected[np.lexsort(expected.T)], atol=0.1)
+        assert all((motion.permutation >= 0).sum() >= 12 for motion in shifts)
+
+
+def test_steps_of_a_large_lattice_are_the_smallest() -> None:
+    plain, cube = lattice(23, 19), CalibrationObject(torch.cartesian_prod(*[torch.arange(5.0)] * 3), torch.ones(125, 3))
+    assert [round(float(np.linalg.norm(motion.translation))) for motion in lattice_shifts(plain)] == 4 * [10] + 4 * [14]
+    lengths = [float(np.linalg.norm(motion.translation)) for motion in lattice_shifts(cube)]
+    np.testing.assert_allclose(lengths, 6 * [1.0] + 12 * [np.sqrt(2)])  # all of them, not those that rounding prefers
+
+
 def test_an_asymmetric_object_has_no_motion() -> None:
     obj = load_object(data_path("objects", "asymmetric8.csv"))
     assert lattice_shifts(obj) == []
     assert near_symmetries(obj, 1.0) == []
+
+
+def test_turns_that_take_most_fiducials_near_others_are_found() -> None:
+    sphere = load_object(data_path("objects", "sphere64.csv"))  # its neighbours differ by the golden angle
+    turns = partial_turns(sphere)
+    angles = [float(geodesic_angle(torch.from_numpy(turn.rotation), torch.eye(3).double())) for turn in turns]
+    np.testing.assert_allclose(np.degrees(sorted(angles)), [137.5, 137.5, 180, 180], atol=0.5)
+    points = sphere.points.numpy()
+    for turn in turns:
+        moved = points @ turn.rotation.T + turn.translation
+        away = np.linalg.norm(moved - points[turn.permutation], axis=1)
+        assert sorted(turn.permutation) == list(range(64))
+        assert (away < 0.05 * sphere.size).mean() > 0.6
+
+
+@pytest.mark.parametrize("name", ["asymmetric8", "cube8", "cube27"])
+def test_objects_without_partial_turns(name: str) -> None:
+    assert partial_turns(load_object(data_path("objects", f"{name}.csv"))) == []
 
 
 def test_moved_labels_and_pose_explain_the_same_blobs() -> None:

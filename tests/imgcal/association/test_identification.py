@@ -5,11 +5,12 @@ import pytest
 import torch
 
 from imgcal.association import IdentityOptions, identification, identify, relocalize, track
+from imgcal.association.search import DECISIVE
 from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.io import data_path, load_object, read_rig
 from imgcal.synthesis import PhysicalDrift, RelativeDrift, Snapshots, simulate_truth, synthesize, true_detections
-from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections
+from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections, RigPrior
 
 DRIFT = RelativeDrift(0.05, 0.05)
 Associations = tuple[Detections, np.ndarray]
@@ -110,6 +111,51 @@ def test_a_cube_is_ambiguous_with_one_symmetry_element_for_all_cameras(o10: Came
         found = relocalize(blobs, o10, cube, DRIFT.std(o10))
         assert (found.status, found.alternatives) == ("ambiguous", 24)
         assert agreements(found.labels, truth, cube)[1] == 0
+
+
+@pytest.mark.parametrize("size", [1.0, 0.5, 0.25])
+def test_an_object_turned_almost_onto_itself_is_not_accepted(size: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Turned by the golden angle, three fifths of this object are near others, and a bent rig makes up for the rest.
+    rig, obj = read_rig(data_path("rigs", "T4.yaml")), load_object(data_path("objects", "sphere64.csv"))
+    rig = replace(
+        rig,
+        focal_length=size * rig.focal_length,
+        principal_point=size * (rig.principal_point + 0.5) - 0.5,
+        image_size=(size * rig.image_size).long(),
+    )
+    truth = true_detections(simulate_truth(rig, obj, 6, torch.Generator().manual_seed(5), PhysicalDrift()))
+    random = np.random.default_rng(5)
+    seen = truth.select(random.random(len(truth)) > 0.3)
+    noise = 0.05 * random.standard_normal(seen.uv.shape)
+    seen = replace(seen, uv=seen.uv + noise, sigma=np.full(len(seen), 0.3)).of_snapshots(1, 2)
+    blobs, std = replace(seen, fiducial=np.full(len(seen), -1)), RigPrior().std(rig)
+    with monkeypatch.context() as patch:
+        patch.setattr(identification, "COARSE", np.inf)
+        patch.setattr(identification, "partial_turns", lambda obj: [])
+        turned = relocalize(blobs, rig, obj, std)
+    assert turned.accepted
+    assert agreements(turned.labels, seen.fiducial, obj)[1] > 100  # the first labelling that is found
+    found = [relocalize(blobs, rig, obj, std)]
+    if size == 1:  # the residuals show it as well, even near a pose that seems to be known
+        assert turned.rig_from_object is not None
+        refused = track(blobs, rig, obj, std, turned.rig_from_object)
+        assert not refused.accepted and "the object may have another pose" in refused.reason
+        found.append(identify(blobs, rig, obj, std, [turned.rig_from_object]))
+    for each in found:
+        right, wrong = agreements(each.labels, seen.fiducial, obj)
+        assert wrong == 0
+        assert right > 0.9 * len(seen)
+
+
+def test_few_noisy_blobs_among_false_ones_are_identified(o10: CameraRig, asymmetric: CalibrationObject) -> None:
+    few = 0
+    for blobs, truth in snapshots(o10, asymmetric, 10, visible=5, false=3)[1]:
+        noise = 0.7 * np.random.default_rng(1).standard_normal(blobs.uv.shape)
+        found = relocalize(replace(blobs, uv=blobs.uv + noise), o10, asymmetric, DRIFT.std(o10))
+        assert found.accepted, found.reason
+        assert agreements(found.labels, truth, asymmetric)[1] == 0
+        few += found.explained < DECISIVE
+    assert few >= 3  # judged by their residuals
 
 
 @pytest.mark.parametrize("kind", ["single camera", "planar", "four fiducials", "many planar"])
