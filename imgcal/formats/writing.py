@@ -113,7 +113,7 @@ def _convert_to_ours(rig: ForeignRig, name: str, limit: float, hold_distortion: 
             beside = f"{name}{POSTERIOR}"
             files[beside] = posterior_bytes(posterior)
         else:
-            notes.append("the posterior of the calibration is left out: it describes other cameras, or another prior")
+            notes.append("the posterior of the calibration is left out: it describes other values, or another prior")
     full = rig.covariance is not None and rig.covariance.matrix is not None
     text = rig_text(made, name, rig.covariance, full, beside)
     return _compare(rig, held, from_camera_rig(rig_from_text(text, name)), {**files, "": text.encode()}, notes)
