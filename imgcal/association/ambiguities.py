@@ -114,15 +114,14 @@ def partial_turns(obj: CalibrationObject) -> list[Ambiguity]:
     """
     if obj.pose_rank < 6 or obj.num_fiducials > MOST_TURNED:
         return []
-    exact = np.stack([motion.rotation for motion in obj.symmetries])
-    turns = _partial_turns(obj.points.double().cpu().numpy().tobytes(), NEAR * obj.size)
-    return [turn for turn in turns if _angles(exact, turn.rotation).min() > SAME_TURN]
+    exact = np.stack([motion.rotation for motion in obj.symmetries]).tobytes()
+    return list(_partial_turns(obj.points.double().cpu().numpy().tobytes(), exact, NEAR * obj.size))
 
 
 @lru_cache(maxsize=16)
-def _partial_turns(coordinates: bytes, tolerance: float) -> tuple[Ambiguity, ...]:
+def _partial_turns(coordinates: bytes, symmetries: bytes, tolerance: float) -> tuple[Ambiguity, ...]:
     """Find the rotations once per object: those of some pairs of fiducials onto all others that are as far apart."""
-    points = np.frombuffer(coordinates).reshape(-1, 3)
+    points, exact = np.frombuffer(coordinates).reshape(-1, 3), np.frombuffer(symmetries).reshape(-1, 3, 3)
     centroid = points.mean(0)
     points = points - centroid
     tree, least = cKDTree(points), LEAST_OVERLAP * len(points)
@@ -144,6 +143,7 @@ def _partial_turns(coordinates: bytes, tolerance: float) -> tuple[Ambiguity, ...
                 everywhere = linear_sum_assignment(cdist(points @ rotation.T, points) ** 2)[1]
                 found.append((int(fell.sum()), rotation, everywhere))
     found.sort(key=lambda each: -each[0])
+    found = [each for each in found if _angles(exact, each[1]).min() > SAME_TURN]
     return tuple(Ambiguity(turn, centroid - turn @ centroid, near) for _, turn, near in found)
 
 
