@@ -3,6 +3,9 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+MEDIAN_SQUARED = 1.386
+"""Median of a squared length in two dimensions with unit variance on both axes."""
+
 
 def median(values: ArrayLike) -> float:
     """Median of all values; NaN where one of them is NaN, or where there is none.

@@ -26,6 +26,7 @@ from imgcal.estimation.object_shape import (
 from imgcal.estimation.pose_support import require_poses
 from imgcal.estimation.remaining_variance import remaining_variance
 from imgcal.estimation.shape_modes import ModeEvidence, bend_object, mode_evidence
+from imgcal.medians import MEDIAN_SQUARED
 from imgcal.types import PARAMETER_KINDS
 
 ROUNDS = 40
@@ -399,7 +400,7 @@ def _additive_noise(squared: NDArray[np.floating], variance: NDArray[np.floating
     """
     count = 2 * len(squared)
     free = max(count - taken, 1.0)
-    unit = squared * (count / free / 1.386)
+    unit = squared * (count / free / MEDIAN_SQUARED)
     middle = (len(squared) - 1) // 2
     # Six standard deviations of a chi-squared mean: below, the residuals agree with the blobs' sigmas.
     if np.partition(unit / variance, middle)[middle] <= 1 + 6 * (2 / free) ** 0.5:

@@ -1,5 +1,5 @@
 from .case import SHAPE, ClockSlip, ObjectChange
-from .change_test import CHANGES, ChangeTest, OwnTest, camera_change_errors, change_std, pixel_changes
+from .change_test import CHANGES, ChangeTest, Comparison, OwnTest, camera_change_errors, change_std, pixel_changes
 from .clock_slip import project_fiducials
 from .cusum import Cusum, cusum_threshold
 from .measurement_update import absorb
@@ -19,6 +19,7 @@ __all__ = [
     "Change",
     "ChangeTest",
     "ClockSlip",
+    "Comparison",
     "Cusum",
     "MeasurementUpdate",
     "MonitorUpdate",

@@ -86,6 +86,51 @@ def camera_change_errors(rig: CameraRig, unit: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
+class Comparison:
+    """Later snapshots beside earlier knowledge, from which tests are made.
+
+    Raises:
+        RefusedError: nothing is known about the rig; raised by both tests.
+    """
+
+    information: Tensor  # (D, D) of the earlier knowledge, aged to the time of the later snapshots
+    brought: Tensor  # (D, D) information of the later snapshots
+    pull: Tensor  # (D,) gradient of the later snapshots at the earlier estimate of the rig
+    change: Tensor  # (C, K, K) see `camera_change_errors`
+    pixels: Tensor  # (C, K) see `pixel_changes`
+    lasting: Tensor | float = MODEL_ERROR  # (C,) px, see `NoiseCorrelation.model_error`
+
+    def test_each(self) -> OwnTest:
+        """Prepare the test of each camera alone: a third of the work of all together."""
+        change, cameras, wide = self.change, len(self.change), self.pixels.numel()
+        half = self._whiten()
+        each = half[:, :-1].unflatten(1, (cameras, -1)).movedim(1, 0)  # (C, D, K)
+        own = _own_blocks(self.brought[:wide, :wide], cameras) - each.mT @ each
+        left = (self.pull[:wide] - half[:, :-1].mT @ half[:, -1]).unflatten(0, (cameras, -1))
+        learnt = change.mT @ own @ change
+        pull = (change.mT @ left[..., None])[..., 0]
+        return OwnTest(pull, 0.5 * (learnt + learnt.mT), self.pixels, self.lasting)
+
+    def test_together(self) -> ChangeTest:
+        """Prepare the test of all cameras together."""
+        change, cameras, wide = self.change, len(self.change), self.pixels.numel()
+        half = self._whiten()
+        left = torch.cat((self.brought[:wide, :wide], self.pull[:wide, None]), 1) - half[:, :wide].mT @ half
+        own = torch.einsum("cij,cik->cjk", change, left.unflatten(0, (cameras, -1)))  # (C, K, K C + 1)
+        learnt = own[..., :-1].unflatten(-1, (cameras, -1))
+        learnt = torch.einsum("cidj,djk->cidk", learnt, change).reshape(wide, wide)
+        return ChangeTest(own[..., -1].flatten(), 0.5 * (learnt + learnt.mT), self.pixels, self.lasting)
+
+    def _whiten(self) -> Tensor:
+        """L^-1 (A, g) of the cameras' K C columns of A, where L L^T = S: (D, K C + 1)."""
+        factor, failed = torch.linalg.cholesky_ex(self.information + self.brought)
+        if bool(failed):
+            raise RefusedError("estimation: these observations do not determine the rig")
+        right = torch.cat((self.brought[:, : self.pixels.numel()], self.pull[:, None]), 1)
+        return torch.linalg.solve_triangular(factor, right, upper=False)
+
+
+@dataclass(frozen=True)
 class OwnTest:
     """The gradient left over for each camera's own parameters, with its covariance: those blocks of r and G that the
     scores need.
@@ -95,26 +140,6 @@ class OwnTest:
     learnt: Tensor  # (C, K, K) its covariance if nothing has changed
     pixels: Tensor  # (C, K) see `pixel_changes`
     lasting: Tensor | float = MODEL_ERROR  # (C,) px: persistent error of each image without any change
-
-    @classmethod
-    def of(
-        cls,
-        information: Tensor,
-        brought: Tensor,
-        pull: Tensor,
-        change: Tensor,
-        pixels: Tensor,
-        lasting: Tensor | float = MODEL_ERROR,
-    ) -> OwnTest:
-        """Prepare the tests; arguments and errors as for `ChangeTest.of`, which does three times the work."""
-        cameras, wide = len(change), pixels.numel()
-        half = _whiten_by_all(information, brought, pull, wide)
-        each = half[:, :-1].unflatten(1, (cameras, -1)).movedim(1, 0)  # (C, D, K)
-        blocks = brought[:wide, :wide].unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
-        own = blocks.diagonal(dim1=0, dim2=2).movedim(-1, 0) - each.mT @ each
-        left = (pull[:wide] - half[:, :-1].mT @ half[:, -1]).unflatten(0, (cameras, -1))
-        learnt = change.mT @ own @ change
-        return cls((change.mT @ left[..., None])[..., 0], 0.5 * (learnt + learnt.mT), pixels, lasting)
 
     def scores(self) -> dict[str, Tensor]:
         """Test each camera for each kind of change: (C,) for each of `CHANGES`.
@@ -153,44 +178,11 @@ class ChangeTest:
     pixels: Tensor  # (C, K) see `pixel_changes`
     lasting: Tensor | float = MODEL_ERROR  # (C,) px: persistent error of each image without any change
 
-    @classmethod
-    def of(
-        cls,
-        information: Tensor,
-        brought: Tensor,
-        pull: Tensor,
-        change: Tensor,
-        pixels: Tensor,
-        lasting: Tensor | float = MODEL_ERROR,
-    ) -> ChangeTest:
-        """Prepare the tests.
-
-        Args:
-            information: (D, D) of the earlier knowledge, aged to the time of the later snapshots.
-            brought: (D, D) information of the later snapshots.
-            pull: (D,) gradient of the later snapshots at the earlier estimate of the rig.
-            change: (C, K, K) see `camera_change_errors`.
-            pixels: (C, K) see `pixel_changes`.
-            lasting: (C,) px, see `NoiseCorrelation.model_error`.
-
-        Raises:
-            RefusedError: nothing is known about the rig.
-        """
-        cameras, wide = len(change), pixels.numel()
-        half = _whiten_by_all(information, brought, pull, wide)
-        left = torch.cat((brought[:wide, :wide], pull[:wide, None]), 1) - half[:, :wide].mT @ half
-        own = torch.einsum("cij,cik->cjk", change, left.unflatten(0, (cameras, -1)))  # (C, K, K C + 1)
-        learnt = own[..., :-1].unflatten(-1, (cameras, -1))
-        learnt = torch.einsum("cidj,djk->cidk", learnt, change).reshape(wide, wide)
-        return cls(own[..., -1].flatten(), 0.5 * (learnt + learnt.mT), pixels, lasting)
-
     @property
     def each(self) -> OwnTest:
         """The test of each camera alone."""
-        cameras = len(self.pixels)
-        learnt = self.learnt.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
-        own = learnt.diagonal(dim1=0, dim2=2).movedim(-1, 0)
-        return OwnTest(self.pull.unflatten(0, (cameras, -1)), own, self.pixels, self.lasting)
+        pull, cameras = self.pull.unflatten(0, self.pixels.shape), len(self.pixels)
+        return OwnTest(pull, _own_blocks(self.learnt, cameras), self.pixels, self.lasting)
 
     def odds(self, changes: Mapping[int, str | None]) -> float:
         """Log odds of the given changes (None = of any kind) against no change."""
@@ -229,12 +221,10 @@ class ChangeTest:
         return scaled, factor, pull
 
 
-def _whiten_by_all(information: Tensor, brought: Tensor, pull: Tensor, wide: int) -> Tensor:
-    """L^-1 (A, g) of the cameras' `wide` columns of A, where L L^T = S: (D, wide + 1); arguments as `ChangeTest.of`."""
-    factor, failed = torch.linalg.cholesky_ex(information + brought)
-    if bool(failed):
-        raise RefusedError("estimation: these observations do not determine the rig")
-    return torch.linalg.solve_triangular(factor, torch.cat((brought[:, :wide], pull[:, None]), 1), upper=False)
+def _own_blocks(matrix: Tensor, cameras: int) -> Tensor:
+    """Blocks (C, K, K) along the diagonal of a matrix (K C, K C)."""
+    square = matrix.unflatten(0, (cameras, -1)).unflatten(-1, (cameras, -1))
+    return square.diagonal(dim1=0, dim2=2).movedim(-1, 0)
 
 
 def _by_kind(values: Tensor, axes: int = 1) -> Tensor:

@@ -20,7 +20,15 @@ import torch
 from torch import Tensor
 
 from imgcal.estimation import error_between
-from imgcal.monitoring.change_test import CHANGES, MODEL_ERROR, ChangeTest, OwnTest, camera_change_errors, pixel_changes
+from imgcal.monitoring.change_test import (
+    CHANGES,
+    MODEL_ERROR,
+    ChangeTest,
+    Comparison,
+    OwnTest,
+    camera_change_errors,
+    pixel_changes,
+)
 from imgcal.monitoring.recent_snapshots import RecentSnapshots
 from imgcal.monitoring.rig_belief import RigBelief, age_belief, widen
 from imgcal.monitoring.rig_filter import RigFilter
@@ -73,7 +81,8 @@ class Stretch:
         before = self.before
         known = age_belief(before, self.seconds, rate).information
         change = camera_change_errors(before.rig, before.unit)
-        return ChangeTest.of(known, self.brought, self.pull, change, pixel_changes(before.rig), self.lasting)
+        found = Comparison(known, self.brought, self.pull, change, pixel_changes(before.rig), self.lasting)
+        return found.test_together()
 
 
 class DriftPaces:

@@ -16,6 +16,7 @@ from imgcal.monitoring.change_test import (
     FORMS_OF,
     LARGE,
     ChangeTest,
+    Comparison,
     camera_change_errors,
     change_std,
     pixel_changes,
@@ -120,7 +121,7 @@ class PendingChange:
         known = age_belief(before, self.seconds, walk).information
         pull = self.weighted - self.brought @ self.distance(before)
         change = camera_change_errors(before.rig, before.unit)
-        return ChangeTest.of(known, self.brought, pull, change, pixel_changes(before.rig))
+        return Comparison(known, self.brought, pull, change, pixel_changes(before.rig)).test_together()
 
     def decide(self, test: ChangeTest, camera: int, last: bool) -> tuple[str | None, str | None] | None:
         """Decide how a camera has changed, now if it is the `last` chance.

@@ -22,7 +22,15 @@ from imgcal.errors import RefusedError
 from imgcal.estimation import displace
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring.case import Snapshot
-from imgcal.monitoring.change_test import CHANGES, MODEL_ERROR, ChangeTest, OwnTest, camera_change_errors, pixel_changes
+from imgcal.monitoring.change_test import (
+    CHANGES,
+    MODEL_ERROR,
+    ChangeTest,
+    Comparison,
+    OwnTest,
+    camera_change_errors,
+    pixel_changes,
+)
 from imgcal.monitoring.recent_screening import add_error, add_row, put, screen
 from imgcal.monitoring.rig_arrays import RigArrays
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
@@ -227,7 +235,7 @@ class RecentSnapshots:
         Raises:
             RefusedError: nothing is known about the rig.
         """
-        return ChangeTest.of(*self._compare(age, aged, without), self._change, self._pixels, self.lasting)
+        return self._compare(age, aged, without).test_together()
 
     def test_each(self, age: int) -> OwnTest:
         """Test each camera for a change before the latest `age` snapshots, allowing for all drift since then at once.
@@ -235,10 +243,10 @@ class RecentSnapshots:
         Raises:
             RefusedError: nothing is known about the rig.
         """
-        return OwnTest.of(*self._compare(age), self._change, self._pixels, self.lasting)
+        return self._compare(age).test_each()
 
-    def _compare(self, age: int, aged: bool = True, without: range = range(0)) -> tuple[Tensor, Tensor, Tensor]:
-        """Information (D, D) before the latest snapshots and in them, and their gradient (D,); arguments as `test`."""
+    def _compare(self, age: int, aged: bool = True, without: range = range(0)) -> Comparison:
+        """Compare the latest snapshots with the belief before them; arguments as `test`."""
         number = self._next - age
         information, factor, at = self._belief_before(number)
         brought, weighted = self._sums(number, self._next)
@@ -250,7 +258,7 @@ class RecentSnapshots:
             covariance = torch.cholesky_inverse(factor)
             add_blocks(covariance, (self._change * variance[:, None, :]) @ self._change.mT)
             information = torch.cholesky_inverse(_cholesky(covariance))
-        return information, brought, weighted - brought @ at
+        return Comparison(information, brought, weighted - brought @ at, self._change, self._pixels, self.lasting)
 
     def score_without_episode(self, age: int, camera: int, kind: str, episode: int) -> tuple[float, float]:
         """Score a camera's change without the episode that supports it most, treating everything else as known.

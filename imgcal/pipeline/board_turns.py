@@ -26,13 +26,12 @@ from imgcal.estimation import (
     make_problem,
     single_camera_poses,
 )
+from imgcal.medians import MEDIAN_SQUARED
 from imgcal.pipeline.labelled_capture import LabelledCapture
 from imgcal.types import Board, CalibrationObject, CameraRig, Detections, Observations
 
 CLEAR = 5.0
 """Logarithm of the odds from which a snapshot is turned; one that shows little of the bend stays as it is."""
-MEDIAN = 1.386
-"""Median of a squared length in two dimensions with unit variance on both axes."""
 ROUNDS = 10
 """Most fits; one or two are usual."""
 STEPS, CONVERGED = 100, 1e-6
@@ -174,7 +173,7 @@ def find_exchanged(
     shown = np.where((odds > 0)[:, None], bend[::-1], bend)
     away = pull - (information @ shown[..., None])[..., 0]
     squared = np.einsum("sk,skl,sl->s", away, np.linalg.pinv(information, hermitian=True), away)
-    odds = odds / max(1.0, float(np.median(squared)) / MEDIAN)
+    odds = odds / max(1.0, float(np.median(squared)) / MEDIAN_SQUARED)
     if expected[0] == expected[1] and 2 * (odds > 0).sum() > len(odds):
         odds = -odds
     return odds > CLEAR

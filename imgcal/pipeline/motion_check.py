@@ -25,12 +25,11 @@ from imgcal.estimation import (
     rig_at,
 )
 from imgcal.geometry import RigidTransform
+from imgcal.medians import MEDIAN_SQUARED
 from imgcal.pipeline.label_counts import LabelCounts, count_labels
 from imgcal.pipeline.labelled_capture import LabelledCapture, arrange_labels
 from imgcal.types import CalibrationObject, CameraRig, Detections, MovedCamera, MovedError
 
-MEDIAN = 1.386
-"""Median of a squared 2D length with unit variance on both axes."""
 LEAST_AGREEMENT = 0.9
 """Minimum share of the other cameras' labels that must agree when a snapshot is labelled again."""
 MOST_MIXED = 0.2
@@ -208,7 +207,7 @@ def _fit(arranged: LabelledCapture, rig: CameraRig, obj: CalibrationObject, opti
         squared, used = solutions[-1].equations.residual[0].square().sum(-2), noise
         taken = rig.num_parameters * rig.num_cameras + float(problem.pose_freedom)
         free = max(1 - taken / (2 * int(seen.sum())), 0.2)
-        noise = own + (squared[seen].median() / (MEDIAN * free) - own[seen].median()).clamp_min(0)
+        noise = own + (squared[seen].median() / (MEDIAN_SQUARED * free) - own[seen].median()).clamp_min(0)
     fitting = (squared <= CLIP**2 * used) & seen
     poses, fitted = pose_at(problem, state)[0], rig_at(problem, state.offset)[0]
     counts = count_labels(arranged.labelled, fitting.numpy(), poses, rig, obj, fitted)

@@ -12,8 +12,8 @@ from imgcal.geometry import RigidTransform
 from imgcal.monitoring import (
     CHANGES,
     ChangeTest,
+    Comparison,
     MeasurementUpdate,
-    OwnTest,
     RigBelief,
     absorb,
     camera_change_errors,
@@ -51,7 +51,7 @@ def against(later: MeasurementUpdate, before: RigBelief | None = None) -> Change
     at, information = brought.distance_from(before.rig, before.object_offset), brought.information()
     pull = brought.pull.sum(0) - information @ at
     change = camera_change_errors(before.rig, before.unit)
-    return ChangeTest.of(before.information, information, pull, change, pixel_changes(before.rig))
+    return Comparison(before.information, information, pull, change, pixel_changes(before.rig)).test_together()
 
 
 def test_each_camera_alone_is_tested_like_all_together(followed) -> None:
@@ -61,8 +61,8 @@ def test_each_camera_alone_is_tested_like_all_together(followed) -> None:
     pull = brought.pull.sum(0) - information @ brought.distance_from(before.rig, before.object_offset)
     lasting = torch.tensor([0.02, 0.1, 0.02, 0.5], dtype=torch.float64)
     change, pixels = camera_change_errors(before.rig, before.unit), pixel_changes(before.rig)
-    given = (before.information, information, pull, change, pixels, lasting)
-    alone, together = OwnTest.of(*given).scores(), ChangeTest.of(*given).each.scores()
+    given = Comparison(before.information, information, pull, change, pixels, lasting)
+    alone, together = given.test_each().scores(), given.test_together().each.scores()
     for kind in CHANGES:
         torch.testing.assert_close(alone[kind], together[kind], rtol=1e-6, atol=1e-9)
 
