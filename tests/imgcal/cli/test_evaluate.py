@@ -16,6 +16,8 @@ from imgcal.training import load_experiment
 from tests.imgcal.cli.calibrating import one_line
 from tests.imgcal.fleet.conftest import engine  # noqa: F401  one Ray for all tests
 
+pytestmark = pytest.mark.usefixtures("few_timings")
+
 EXPERIMENT = """
 format: imgcal-experiment/1
 name: tiny
