@@ -74,6 +74,12 @@ def seen(rig, obj):
     return replace(blobs, uv=blobs.uv + 0.05 * np.random.default_rng(0).standard_normal(blobs.uv.shape))
 
 
+def unlabelled(blobs, snapshots=2):
+    """The first snapshots without their labels: where no pose explains them, each takes long."""
+    few = replace(blobs.select(blobs.snapshot < snapshots), snapshot_names=blobs.snapshot_names[:snapshots])
+    return replace(few, fiducial=np.full_like(few.fiducial, -1))
+
+
 @cache
 def rig_of(name):
     return read_rig(name)
@@ -100,11 +106,9 @@ def test_a_mistaken_unit_is_refused_and_named(rig, obj, mistake, distance):
 @pytest.mark.parametrize("mistake", ["rig in metres", "object in centimetres", "rotations in degrees"])
 def test_a_mistaken_unit_is_named_where_no_blob_has_a_label(mistake):
     change, expected = MISTAKES[mistake]
-    blobs = seen("T4", "asymmetric8")
-    with pytest.raises(RefusedError, match=f"^{expected}.*; so "):
-        calibrate(
-            replace(blobs, fiducial=np.full_like(blobs.fiducial, -1)), *change(rig_of("T4"), load_object("asymmetric8"))
-        )
+    blobs = unlabelled(seen("T4", "asymmetric8"))
+    with pytest.raises(RefusedError, match=f"^{expected}.*; .*; so "):
+        calibrate(blobs, *change(rig_of("T4"), load_object("asymmetric8")))
 
 
 def test_snapshots_of_one_camera_at_the_start_hide_no_unit():
@@ -127,7 +131,7 @@ def test_a_refusal_for_another_reason_names_no_unit():
     rig, obj, blobs = rig_of("T4"), load_object("asymmetric8"), seen("T4", "asymmetric8")
     exchanged = replace(blobs, camera=np.where(blobs.camera < 2, 1 - blobs.camera, blobs.camera))
     noisy = replace(blobs, uv=blobs.uv + 8 * np.random.default_rng(0).standard_normal(blobs.uv.shape))
-    for wrong in (exchanged, noisy, replace(noisy, fiducial=np.full_like(noisy.fiducial, -1))):
+    for wrong in (exchanged, noisy, unlabelled(noisy)):
         with pytest.raises(RefusedError, match=r"^(estimation|identity|camera)"):
             calibrate(wrong, rig, obj)
 
@@ -155,13 +159,3 @@ def test_a_small_board_close_to_one_camera_is_no_doubt():
     obj = load_object("asymmetric8")
     assert unit_doubt(rig, replace(obj, points=obj.points / 40)) == ""
     assert unit_doubt(replace(read_rig("T4"), working_distance=None).select([0]), obj) == ""
-
-
-def test_a_refusal_begins_with_the_unit():
-    rig, obj = read_rig("T4"), load_object("asymmetric8")
-    blobs = true_detections(simulate_truth(rig, obj, 2, torch.Generator().manual_seed(0), PhysicalDrift()))
-    blobs = replace(blobs, fiducial=blobs.fiducial * 0 - 1)
-    with pytest.raises(
-        RefusedError, match=r"^the rig is .* times too small for the object, as if it were in metres; .*; so "
-    ):
-        calibrate(blobs, in_metres(rig), obj)
