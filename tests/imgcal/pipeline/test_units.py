@@ -14,6 +14,7 @@ from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate, score, unit_doubt
 from imgcal.pipeline.units import image_doubt
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+from tests.imgcal.pipeline.short_search import SHORT
 
 RIGS = ("O10", "O6", "U7", "T4", "room10")
 
@@ -100,7 +101,7 @@ def test_a_mistaken_unit_is_refused_and_named(rig, obj, mistake, distance):
     change, expected = MISTAKES[mistake]
     wrong = change(replace(rig_of(rig), working_distance=distance), load_object(obj))
     with pytest.raises(RefusedError, match=f"^{expected}.*; so "):
-        calibrate(seen(rig, obj), *wrong)
+        calibrate(seen(rig, obj), *wrong, SHORT)
 
 
 @pytest.mark.parametrize("mistake", ["rig in metres", "object in centimetres", "rotations in degrees"])
@@ -108,7 +109,7 @@ def test_a_mistaken_unit_is_named_where_no_blob_has_a_label(mistake):
     change, expected = MISTAKES[mistake]
     blobs = unlabelled(seen("T4", "asymmetric8"))
     with pytest.raises(RefusedError, match=f"^{expected}.*; .*; so "):
-        calibrate(blobs, *change(rig_of("T4"), load_object("asymmetric8")))
+        calibrate(blobs, *change(rig_of("T4"), load_object("asymmetric8")), SHORT)
 
 
 def test_snapshots_of_one_camera_at_the_start_hide_no_unit():
@@ -133,7 +134,7 @@ def test_a_refusal_for_another_reason_names_no_unit():
     noisy = replace(blobs, uv=blobs.uv + 8 * np.random.default_rng(0).standard_normal(blobs.uv.shape))
     for wrong in (exchanged, noisy, unlabelled(noisy)):
         with pytest.raises(RefusedError, match=r"^(estimation|identity|camera)"):
-            calibrate(wrong, rig, obj)
+            calibrate(wrong, rig, obj, SHORT)
 
 
 @pytest.mark.parametrize("distance_known", [True, False])
