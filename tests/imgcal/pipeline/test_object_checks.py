@@ -11,6 +11,7 @@ from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate, score
 from imgcal.synthesis import PhysicalDrift, simulate_truth, simulate_volume, true_detections
 from imgcal.types import RigPrior
+from tests.imgcal.pipeline.short_search import SHORT
 
 DRIFT = PhysicalDrift()
 PRIOR = RigPrior(DRIFT.focal_length, DRIFT.principal_point, DRIFT.distortion, np.radians(DRIFT.rotation_deg), 2.0)
@@ -67,7 +68,7 @@ def right(points):
 def test_another_scale_is_refused(rig_name: str, factor: float, snapshots: int) -> None:
     rig, obj, _, _, table = capture(rig_name, snapshots, scaled(factor))
     with pytest.raises(RefusedError, match=r"all cameras have moved together.*(larger|smaller) than its file says"):
-        calibrate(table, rig, obj)
+        calibrate(table, rig, obj, SHORT)
 
 
 def test_a_scale_that_may_be_off_is_estimated() -> None:
@@ -100,7 +101,7 @@ def test_a_displaced_fiducial_is_named_beside_a_scale_that_may_be_off(factor: fl
 def test_a_stretched_object_is_refused(rig_name: str, factor: float, snapshots: int) -> None:
     rig, obj, _, _, table = capture(rig_name, snapshots, stretched(factor))
     with pytest.raises(RefusedError):
-        calibrate(table, rig, obj)
+        calibrate(table, rig, obj, SHORT)
 
 
 @pytest.mark.parametrize(
@@ -145,7 +146,7 @@ def test_of_a_symmetric_object_nobody_says_which_fiducial_is_off() -> None:
         calibrate(table, rig, replace(obj, tolerance=torch.full((8,), 0.2, dtype=torch.float64)))
     rig, obj, table = jumping_cube(moved(1, (0.5, 0, 0)))
     with pytest.raises(RefusedError, match="the object is symmetric"):
-        calibrate(table, rig, obj)
+        calibrate(table, rig, obj, SHORT)
 
 
 def test_tolerated_displacements_are_not_named() -> None:
