@@ -368,14 +368,19 @@ def _require_scale(shape: ShapeEvidence | ScaleEvidence, fit: _Fit, least: float
     error, deviation = shape.scale_error
     granted = 0.0 if problem.object_prior_std is None else float(problem.object_prior_std[0, -1])
     if MOST_SCALE > abs(error) > max(least, WRONG_SCALE * np.hypot(deviation * usual**0.5, granted)):
-        size = "larger" if error > 0 else "smaller"
+        size = f"{100 * abs(error):.2g} +- {100 * deviation:.1g} % {'larger' if error > 0 else 'smaller'}"
+        if problem.part_of is not None:  # of several objects, the scale has no tolerance
+            advice = "measure them again, and check their units"
+            raise RefusedError(
+                f"object: all cameras have moved together, as if all objects were {size} than their files say",
+                python=advice,
+                command=advice,
+            )
+        advice = f"measure it again, check its unit, or give its scale a tolerance (now {granted:g})"
         raise RefusedError(
-            f"object: all cameras have moved together, as if it were {100 * abs(error):.2g} +- {100 * deviation:.1g} % "
-            f"{size} than its file says",
-            python=f"measure it again, check its unit, or give its scale a tolerance (now {granted:g}): "
-            "replace(obj, scale_tolerance=...)",
-            command=f"measure it again, check its unit, or give its scale a tolerance (now {granted:g}): "
-            "--object-scale-tolerance",
+            f"object: all cameras have moved together, as if it were {size} than its file says",
+            python=f"{advice}: replace(obj, scale_tolerance=...)",
+            command=f"{advice}: --object-scale-tolerance",
         )
 
 

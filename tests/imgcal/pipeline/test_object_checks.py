@@ -70,6 +70,17 @@ def test_another_scale_is_refused(rig_name: str, factor: float, snapshots: int) 
         calibrate(table, rig, obj)
 
 
+def test_a_tolerance_of_the_scale_is_advised_only_where_it_can_be_given() -> None:
+    rig, obj, _, _, table = capture("O10", 6, scaled(1.1))
+    with pytest.raises(RefusedError, match="give its scale a tolerance") as single:
+        calibrate(table, rig, obj)
+    with pytest.raises(RefusedError, match="all cameras have moved together") as several:
+        calibrate(table, rig, [obj, load_object("wand4")])
+    assert "--object-scale-tolerance" in single.value.for_command
+    assert "toleranc" not in several.value.for_command and "toleranc" not in str(several.value)
+    assert several.value.for_command.endswith("than their files say; measure them again, and check their units")
+
+
 def test_a_scale_that_may_be_off_is_estimated() -> None:
     rig, obj, *_, table = capture("O10", 6, scaled(1.05))
     found = calibrate(table, rig, replace(obj, scale_tolerance=0.1))
