@@ -105,6 +105,17 @@ def test_a_displaced_fiducial_is_named_beside_a_scale_that_may_be_off(factor: fl
     assert only.fiducial == 5 and only.distance == pytest.approx(1.0, abs=4 * only.sigma) and only.sigma < 0.1
 
 
+def test_the_tolerances_of_fiducials_are_learned_without_the_scale_that_may_be_off() -> None:
+    tolerances = []
+    for factor in (0.95, 1.0, 1.05):
+        rig, obj, *_, table = capture("O10", 12, lambda points, by=factor: moved(5, (0.6, 0.8, 0))(scaled(by)(points)))
+        found = calibrate(table, rig, replace(obj, scale_tolerance=0.05))
+        tolerance = found.estimate.problem.object_prior_std[0, :-1:3]
+        assert [offset.fiducial for offset in found.displaced] == tolerance.nonzero().flatten().tolist() == [5]
+        tolerances.append(float(tolerance[5]))
+    assert tolerances == pytest.approx([1 / 3**0.5] * 3, rel=0.03)
+
+
 @pytest.mark.parametrize("snapshots", [1, 5])
 @pytest.mark.parametrize("factor", [1.15, 1.3])
 @pytest.mark.parametrize("rig_name", ["T4", "O10"])
