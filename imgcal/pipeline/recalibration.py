@@ -9,6 +9,7 @@ import contextlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NoReturn
 
 import numpy as np
 import torch
@@ -26,6 +27,7 @@ from imgcal.pipeline.late_cameras import find_late_cameras, require_same_moments
 from imgcal.pipeline.learned_measurer import LearnedMeasurer
 from imgcal.pipeline.learned_proposer import LearnedProposer
 from imgcal.pipeline.lights import add_lights, find_lights
+from imgcal.pipeline.partial_labels import name_missing_labels
 from imgcal.pipeline.repeats import Repeats, drop_repeats, hide_repeats, name_repeats
 from imgcal.pipeline.sources import Detector, Frames, as_one, as_unknown_marker, check_frames, find_blobs, make_sight
 from imgcal.pipeline.synchronization import NOTICEABLE, find_unsynchronized
@@ -107,7 +109,6 @@ def calibrate(
             labelled = associate(detections, rig, obj, options, progress, sight)
     except RefusedError as error:
         case.explain(error, None)
-        raise
     identified = time.perf_counter()
     try:
         fit = _fit_labels(labelled, detections if sight is None else _given_labels(labelled), case, initializer)
@@ -119,7 +120,6 @@ def calibrate(
                 )
                 return replace(fit, labelled=name_repeats(fit.labelled, repeats), repeats=repeats)
         case.explain(error, labelled)
-        raise
     used, given = len(fit.labelled.used), len(detections.snapshot_names)
     if case.may_be_misread and used < LEAST_USED * given:
         case.try_conventions(RefusedError(f"identity: only {used} of {given} snapshots could be used"))
@@ -147,25 +147,27 @@ class _Case:
     options: PipelineOptions
     may_be_misread: bool
 
-    def explain(self, error: RefusedError, labelled: Associations | None) -> None:
-        """Replace a refusal if a cause can be named: other conventions, units or images, or late cameras.
+    def explain(self, error: RefusedError, labelled: Associations | None) -> NoReturn:
+        """Raise a refusal, with a cause if one can be named: other conventions, units or images, or late cameras.
 
         Args:
             error: the refusal.
             labelled: the labels, where the refusal is not about these.
 
         Raises:
-            RefusedError: with the cause.
+            RefusedError: always.
         """
         given = (self.detections, self.rig, self.obj)
-        with contextlib.suppress(*UNSOLVABLE):  # what cannot be solved explains nothing
-            if self.may_be_misread:
-                self.try_conventions(error)
-            if _is_solid(self.obj):
-                require_units(error, *given)
-            if labelled is not None:
-                require_matching_images(error, self.detections, labelled, self.rig, self.obj)
-                require_same_moments(error, self.detections, labelled, self.rig, self.obj, self.options)
+        with name_missing_labels(self.detections):
+            with contextlib.suppress(*UNSOLVABLE):  # what cannot be solved explains nothing
+                if self.may_be_misread:
+                    self.try_conventions(error)
+                if _is_solid(self.obj):
+                    require_units(error, *given)
+                if labelled is not None:
+                    require_matching_images(error, self.detections, labelled, self.rig, self.obj)
+                    require_same_moments(error, self.detections, labelled, self.rig, self.obj, self.options)
+            raise error
 
     def try_conventions(self, error: RefusedError) -> None:
         """Replace a refusal if images or rig follow other conventions; see `require_conventions`."""

@@ -21,6 +21,7 @@ from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.pipeline.board_turns import settle_labels
 from imgcal.pipeline.lights import FoundLights, find_lights
+from imgcal.pipeline.partial_labels import name_missing_labels
 from imgcal.pipeline.sources import Frames, as_one, as_unknown_marker, find_blobs
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections
@@ -124,9 +125,10 @@ def score(
         with require_solvable():
             return _fit_poses(associate(detections, rig, obj, options, progress), rig, obj, options)
     except RefusedError as error:
-        if obj.pose_rank == 6 and not obj.parts:  # as in `calibrate`
-            require_units(error, detections, rig, obj)
-        raise
+        with name_missing_labels(detections):
+            if obj.pose_rank == 6 and not obj.parts:  # as in `calibrate`
+                require_units(error, detections, rig, obj)
+            raise
 
 
 def _fit_poses(labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> RigScore:
