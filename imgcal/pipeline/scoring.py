@@ -117,17 +117,15 @@ def score(
     rig, options = rig.to(torch.float64), options.of_object(obj)
     detections = settle_labels(find_blobs(source, rig, obj, detection), rig, obj)
     obj = as_unknown_marker(obj, detections)
-    if obj.unknown_markers:
-        with require_solvable():
-            lights = find_lights(detections, rig, obj)
-            return replace(_fit_poses(lights.labelled, rig, obj, options), lights=lights)
     try:
         with require_solvable():
+            if obj.unknown_markers:
+                lights = find_lights(detections, rig, obj)
+                return replace(_fit_poses(lights.labelled, rig, obj, options), lights=lights)
             return _fit_poses(associate(detections, rig, obj, options, progress), rig, obj, options)
     except RefusedError as error:
         with name_missing_labels(detections):
-            if obj.pose_rank == 6 and not obj.parts:  # as in `calibrate`
-                require_units(error, detections, rig, obj)
+            require_units(error, detections, rig, obj)
             raise
 
 
