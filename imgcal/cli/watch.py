@@ -278,7 +278,7 @@ def _explain_no_learning(tally: Tally, intake: SourceReader, refusals: FirstRefu
 
 
 def _make_remover(source: Source) -> Callable[[Progress], None]:
-    """What deletes frames that have been learnt from."""
+    """What deletes frames that have been learned from."""
     if not isinstance(source, Folder):
         return lambda progress: None
     return lambda progress: None if progress.name is None else source.delete_read(progress.name)
