@@ -24,7 +24,7 @@ from imgcal.io import holding, load_objects
 from imgcal.live_page import Address, parse_address
 from imgcal.messages import plural, shorten
 from imgcal.online import Event, RigKeeper
-from imgcal.pipeline import DETECTORS, DetectorName, LearnedMeasurer, choose_proposer
+from imgcal.pipeline import DETECTORS, DetectorName, LearnedMeasurer, choose_proposer, unit_doubt
 from imgcal.types import CalibrationObject, CameraRig, object_difference, rig_difference
 from imgcal.watch import (
     CURRENT,
@@ -91,6 +91,8 @@ class Watch(arguments.Watch):
             if len(given.points) > 1 and obj is not given:
                 note = f"note: markers of {given.name} are followed one by one; where their distances fit, they count"
                 print(note, file=sys.stderr)
+            if doubt := unit_doubt(rig, given):
+                print(f"note: {doubt}", file=sys.stderr)
             poses = stack.enter_context(open_pose_outputs(self.poses, rig, obj))
             learning = stack.enter_context(self._learning(keeper, obj, folder, earlier.networks))
             page = stack.enter_context(_serve(page_at, rig, obj, display))
@@ -276,7 +278,7 @@ def _explain_no_learning(tally: Tally, intake: SourceReader, refusals: FirstRefu
 
 
 def _make_remover(source: Source) -> Callable[[Progress], None]:
-    """What deletes frames that have been learnt from."""
+    """What deletes frames that have been learned from."""
     if not isinstance(source, Folder):
         return lambda progress: None
     return lambda progress: None if progress.name is None else source.delete_read(progress.name)

@@ -322,7 +322,7 @@ class RigMonitor:
             changes: changes decided on the way are appended.
 
         Raises:
-            RefusedError: the case cannot be decided yet, or the snapshots cannot be learnt.
+            RefusedError: the case cannot be decided yet, or the snapshots cannot be learned.
         """
         free: dict[int, str | None] = {}
         pending, camera = self._pending, likeliest_camera(self._recent.test(age))
@@ -558,7 +558,7 @@ class RigMonitor:
         """Learn the object again if its change explains some snapshots; `new`: the filter has not absorbed them.
 
         Returns:
-            The update; None = the change does not explain them, or cannot be learnt.
+            The update; None = the change does not explain them, or cannot be learned.
         """
         case = Case(before, snapshots, pauses, len(snapshots), self.filter.options)
         with contextlib.suppress(RefusedError):  # nothing explains these snapshots

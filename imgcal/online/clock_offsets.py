@@ -36,7 +36,7 @@ LEAST_MEMORY = 0.75
 # When motion and shift can be separated.
 LEAST_MOTION, LEAST_SIGMAS = 0.5, 5.0
 """Pixels, and standard deviations, by which blobs (their median) must move between snapshots: less is noise of the
-pose, which correlates with the residuals. Predictions would not do: they also move as the rig is learnt."""
+pose, which correlates with the residuals. Predictions would not do: they also move as the rig is learned."""
 CAMERA_STEP, STEP_SNAPSHOTS = 0.2, 3
 """Change (px) of a camera's image, and number of snapshots that it must last, to restart that camera's estimate ..."""
 LASTING_STEP = 2.0
@@ -82,7 +82,7 @@ class ClockOffsets:
         least = max(LEAST_MOTION, LEAST_SIGMAS * median(state.detections.sigma))
         if not len(went) or median(went) < least:
             return ()
-        # Use the current rig for both: what is learnt about cameras is no motion.
+        # Use the current rig for both: what is learned about cameras is no motion.
         self._add(state, (state.predicted - self._predict(state, last[1])) / self._period)
         offset, sigma = self.offsets()
         changed = np.abs(offset - self.late)

@@ -39,7 +39,7 @@ TERM_WIDTH = 0.5
 """... and the standard deviation of each."""
 FEATURES = 1 + len(TERM_CENTRES) ** 2 + 2 + 3  # constant, local terms, log distance and its square, direction
 
-# What is known beforehand, and how it is learnt.
+# What is known beforehand, and how it is learned.
 LEAST_SPREAD = np.array((0.03, 0.15, 0.1))
 """Minimum standard deviations of a block: size (3 %), sigma (15 %), share missing (0.1, on the real stream)."""
 PRIOR = np.array(((10.0, 0.1, 0.3, 0.1), (10.0, 0.5, 2.0, 0.5), (0.3, 0.2, 0.2, 0.2)))
@@ -50,9 +50,9 @@ MEMORY_BLOCKS = 600
 """Number of blocks over which the spread is averaged."""
 LEARNT = 0.1
 """A place is known if the variance of its expected value is below this, in variances of a block. Only known places are
-tested; nothing is learnt there, so that slow changes are not absorbed."""
+tested; nothing is learned there, so that slow changes are not absorbed."""
 SUSPICION = 0.3
-"""Share of the alarm threshold above which nothing is learnt: it may be the fault itself."""
+"""Share of the alarm threshold above which nothing is learned: it may be the fault itself."""
 
 # The test.
 RUN_LENGTH = 1e7
@@ -77,7 +77,7 @@ class ImageQuality:
     """Tracks three measures of each camera: size and sigma of its blobs, and the share of fiducials that it misses.
 
     Each is averaged over a second and compared with a regression on the object's place in the image, its distance and
-    the viewing direction, learnt from the camera's own history. New places are learnt, known ones are tested. The
+    the viewing direction, learned from the camera's own history. New places are learned, known ones are tested. The
     remainder is correlated in time, so its innovations feed Page's cumulative sum.
     """
 

@@ -29,7 +29,7 @@ COLUMNS = (
 class PoseRecord:
     """The object's pose in a snapshot.
 
-    Status: `ok`, all cameras are calibrated; `degraded`, some are not (lost, in doubt, being relearnt), and the
+    Status: `ok`, all cameras are calibrated; `degraded`, some are not (lost, in doubt, being relearned), and the
     pose comes from the others; `no_object`, there is no pose.
     """
 

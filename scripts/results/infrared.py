@@ -1,7 +1,7 @@
 """Find and identify fiducials in single snapshots of captured frames: networks and blobs, by level of difficulty.
 
 `python -m scripts.results.infrared --models ir-cnn=out/ir-cnn/model.safetensors` rewrites
-`docs/results/infrared.json` and the tables of `docs/infrared.md`. All methods get the same frames.
+`docs/results/infrared.json` and the tables of `docs/results/infrared.md`. All methods get the same frames.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from imgcal.networks import InfraredNetwork, Measurer, Queries, load_infrared, l
 from imgcal.pipeline.learned_proposer import LearnedProposer
 from imgcal.synthesis import DIFFICULTIES, Difficulty, FrameModel, PhysicalDrift, simulate_shots, simulate_truth
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
-from scripts.output import RESULTS, ROOT, command, markdown, read_json, replaced, surroundings, write_json
+from scripts.output import RESULTS, command, markdown, read_json, replaced, surroundings, write_json
 
-JSON, PAGE = RESULTS / "infrared.json", ROOT / "docs" / "infrared.md"
+JSON, PAGE = RESULTS / "infrared.json", RESULTS / "infrared.md"
 NEAR = 5.0  # px within which a position is right: less than the radius of a marker
 FAR_OFF = 20.0  # px: no measurement of the right marker has such an error
 VISIBLE = 0.25  # share of a marker that must be visible for it to count

@@ -3,7 +3,7 @@
 `python -m scripts.results.infrared_families --runs out/runs --train` trains every encoder of `ENCODERS` with every
 seed, as `imgcal train ir-cnn --set network.encoder=NAME training.seed=K` does, in RUNS/ir-NAME-seedK (existing runs are
 kept). It then measures all, writes `docs/results/infrared_families.json` and its picture, and rewrites the tables of
-`docs/infrared.md`.
+`docs/results/infrared.md`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ from scripts.output import (
     BLUE,
     RED,
     RESULTS,
-    ROOT,
     command,
     figure,
     fill,
@@ -49,7 +48,7 @@ from scripts.results.infrared import HARDER, NEARLY, Case, Tally, ask, cases
 JSON, PICTURE, PAGE = (
     RESULTS / "infrared_families.json",
     RESULTS / "infrared_families.png",
-    ROOT / "docs" / "infrared.md",
+    RESULTS / "infrared.md",
 )
 EXPERIMENT = "ir-cnn"  # its schedule and data are used for all
 ON_FRAMES = ("cnn", "vit", "vit-stem")  # in the size that is shipped

@@ -1,8 +1,8 @@
 """Compare detectors on targets of many small dots, real and simulated.
 
 `IMGCAL_CAPTURES=... python -m scripts.results.many_dots` rewrites `docs/results/many-dots.json` and the tables of
-`docs/infrared.md`. Factory rigs are perturbed by some pixels in each camera. The result is scored on dots that were not
-used for the factory calibration (real), or on the exact positions of the dots at another pose (simulated).
+`docs/results/infrared.md`. Factory rigs are perturbed by some pixels in each camera. The result is scored on dots that
+were not used for the factory calibration (real), or on the exact positions of the dots at another pose (simulated).
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.synthesis import Difficulty, FrameModel, Truth, simulate_shots
 from imgcal.types import CalibrationObject, CameraRig, Detections
 from renderers import BlobRange, ClutterModel
-from scripts.output import RESULTS, ROOT, command, fill, markdown, read_json, surroundings, write_json
+from scripts.output import RESULTS, command, fill, markdown, read_json, surroundings, write_json
 from tests.captures.conftest import Points, as_detections, disturbed
 from tests.captures.sets import PRIOR, SIZE, cavity_two_cameras, three_cameras_dots
 
-JSON, PAGE = RESULTS / "many-dots.json", ROOT / "docs" / "infrared.md"
+JSON, PAGE = RESULTS / "many-dots.json", RESULTS / "infrared.md"
 NEAR = 3.0  # px within which a position is right
 WRONG = 2.0  # px: held-out RMS of a wrong rig; dots are at least 35 px apart
 PIXELS = (9.0, 12.0, 14.0)  # errors of the factory rigs

@@ -46,7 +46,7 @@ from scripts.results import infrared, measurer
 from scripts.results.degradations import DEGRADATIONS
 from tests.captures.sets import dot_grid
 
-JSON, PAGE = RESULTS / "own_frames.json", ROOT / "docs" / "infrared.md"
+JSON, PAGE = RESULTS / "own_frames.json", RESULTS / "infrared.md"
 MODELS = ROOT / "data" / "models"
 ADAPT = {
     "dots": ("cam1",),

@@ -18,10 +18,10 @@ from torch import Tensor
 from imgcal.networks import InfraredNetwork, load_infrared
 from imgcal.training import InfraredTask, change_experiment, load_experiment
 from imgcal.training.infrared_task import CropBatch
-from scripts.output import RED, RESULTS, ROOT, command, figure, fill, markdown, surroundings, write_json
+from scripts.output import RED, RESULTS, command, figure, fill, markdown, surroundings, write_json
 
 JSON, PICTURE = RESULTS / "saliency.json", RESULTS / "saliency.png"
-PAGE = ROOT / "docs" / "infrared.md"
+PAGE = RESULTS / "infrared.md"
 SEED = 77
 SHARES = (0.5, 0.9)
 

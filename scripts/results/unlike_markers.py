@@ -47,7 +47,7 @@ from imgcal.types import CameraRig, Detections, RigPrior
 from scripts.output import RESULTS, ROOT, command, fill, markdown, read_json, surroundings, write_json
 from scripts.results.infrared import Case, Tally, ask
 
-JSON, PAGE = RESULTS / "unlike_markers.json", ROOT / "docs" / "infrared.md"
+JSON, PAGE = RESULTS / "unlike_markers.json", RESULTS / "infrared.md"
 MARKERS = ("squares", "rings", "bars", "dark", "bloomed")
 FRAMES = {3: (0,), 10: (0,), 30: (0, 1, 2), 100: (0,)}  # numbers of frames, and the seeds of each
 CLUTTER = 15  # false round discs per frame

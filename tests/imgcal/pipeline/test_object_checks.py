@@ -71,6 +71,17 @@ def test_another_scale_is_refused(rig_name: str, factor: float, snapshots: int) 
         calibrate(table, rig, obj, SHORT)
 
 
+def test_a_tolerance_of_the_scale_is_advised_only_where_it_can_be_given() -> None:
+    rig, obj, _, _, table = capture("O10", 6, scaled(1.1))
+    with pytest.raises(RefusedError, match="give its scale a tolerance") as single:
+        calibrate(table, rig, obj)
+    with pytest.raises(RefusedError, match="all cameras have moved together") as several:
+        calibrate(table, rig, [obj, load_object("wand4")])
+    assert "--object-scale-tolerance" in single.value.for_command
+    assert "toleranc" not in several.value.for_command and "toleranc" not in str(several.value)
+    assert several.value.for_command.endswith("than their files say; measure them again, and check their units")
+
+
 def test_a_scale_that_may_be_off_is_estimated() -> None:
     rig, obj, *_, table = capture("O10", 6, scaled(1.05))
     found = calibrate(table, rig, replace(obj, scale_tolerance=0.1))
@@ -93,6 +104,17 @@ def test_a_displaced_fiducial_is_named_beside_a_scale_that_may_be_off(factor: fl
     rig, obj, *_, table = capture("O10", 8, lambda points: moved(5, (0.6, 0.8, 0))(scaled(factor)(points)))
     (only,) = calibrate(table, rig, replace(obj, scale_tolerance=0.03)).displaced
     assert only.fiducial == 5 and only.distance == pytest.approx(1.0, abs=4 * only.sigma) and only.sigma < 0.1
+
+
+def test_the_tolerances_of_fiducials_are_learned_without_the_scale_that_may_be_off() -> None:
+    tolerances = []
+    for factor in (0.95, 1.0, 1.05):
+        rig, obj, *_, table = capture("O10", 12, lambda points, by=factor: moved(5, (0.6, 0.8, 0))(scaled(by)(points)))
+        found = calibrate(table, rig, replace(obj, scale_tolerance=0.05))
+        tolerance = found.estimate.problem.object_prior_std[0, :-1:3]
+        assert [offset.fiducial for offset in found.displaced] == tolerance.nonzero().flatten().tolist() == [5]
+        tolerances.append(float(tolerance[5]))
+    assert tolerances == pytest.approx([1 / 3**0.5] * 3, rel=0.03)
 
 
 @pytest.mark.parametrize("snapshots", [1, 5])

@@ -13,7 +13,7 @@ from imgcal.geometry import RigidTransform, rotation_from_vector, vector_from_ro
 from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate, score, unit_doubt
 from imgcal.pipeline.units import image_doubt
-from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+from imgcal.synthesis import PhysicalDrift, simulate_truth, simulate_volume, true_detections
 from tests.imgcal.pipeline.short_search import SHORT
 
 RIGS = ("O10", "O6", "U7", "T4", "room10")
@@ -160,3 +160,42 @@ def test_a_small_board_close_to_one_camera_is_no_doubt():
     obj = load_object("asymmetric8")
     assert unit_doubt(rig, replace(obj, points=obj.points / 40)) == ""
     assert unit_doubt(replace(read_rig("T4"), working_distance=None).select([0]), obj) == ""
+
+
+def scaled(factor, rig, obj):
+    return object_times(factor)(*rig_times(factor)(rig, obj))
+
+
+def test_rigs_as_small_as_endoscopes_and_microscopes_are_no_doubt():
+    """An endoscope sees 3 mm across from 15 mm, a microscope a tenth of that from 10 mm through a narrow field."""
+    rig, obj = replace(rig_of("T4"), working_distance=15.0), load_object("asymmetric8")
+    assert unit_doubt(rig, object_times(1.3 / obj.size)(rig, obj)[1]) == ""
+    narrow = replace(rig, working_distance=10.0, focal_length=15 * rig.focal_length)
+    assert unit_doubt(narrow, object_times(0.3 / obj.size)(rig, obj)[1]) == ""
+    assert unit_doubt(narrow, load_object("lights")) == ""
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_a_rig_and_an_object_both_in_inches_look_like_smaller_ones(name):
+    """Images show no lengths, and a rig 25 times as small is plausible: the docs say that this is not noticed."""
+    assert unit_doubt(*scaled(1 / 25.4, rig_of(name), load_object("asymmetric8"))) == ""
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_a_rig_in_metres_is_noticed_where_nothing_is_known_of_the_markers(name):
+    lights, doubt = load_object("lights"), "the rig seems to be in metres, expected millimetres: the markers are "
+    assert unit_doubt(rig_of(name), lights) == ""
+    assert unit_doubt(in_metres(rig_of(name)), lights).startswith(doubt)
+    assert unit_doubt(in_metres(rig_of(name)), object_in_metres(load_object("wand4"))) != ""
+
+
+def test_a_refusal_of_unknown_markers_or_a_stick_names_the_unit():
+    rig, stick = rig_of("room10").select([0, 2, 5, 7]), load_object("wand4")
+    few = true_detections(simulate_volume(rig, stick, 6, torch.Generator().manual_seed(0), PhysicalDrift()))
+    with pytest.raises(RefusedError, match=r"^the rig seems to be in metres, .*; so unknown markers: "):
+        calibrate(few, in_metres(rig), load_object("lights"))
+    stick = replace(stick, points=torch.tensor([[0.0, 0, 0], [200, 0, 0], [500, 0, 0]]), colours=torch.ones(3, 3))
+    stick = replace(stick, radius=None, fiducial_names=())
+    blobs = true_detections(simulate_volume(rig, stick, 20, torch.Generator().manual_seed(0), PhysicalDrift()))
+    with pytest.raises(RefusedError, match=r"^the object seems to be in metres, .*; so "):
+        calibrate(blobs, rig, object_in_metres(stick))
