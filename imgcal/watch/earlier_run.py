@@ -48,8 +48,8 @@ class Progress:
             if not (logged is None or isinstance(logged, int)):
                 raise ValueError("the length is not a number")
             files = {
-                camera: FileStamp(str(file), int(changed), int(size))
-                for camera, (file, changed, size) in dict(entry.get("files", ())).items()
+                camera: FileStamp(str(file), int(content))
+                for camera, (file, content) in dict(entry.get("files", ())).items()
             }
             return cls(time, name, logged, source, None if rate is None else float(rate), files)
         except (ValueError, TypeError, KeyError, OverflowError) as error:
@@ -115,14 +115,24 @@ class EarlierRun:
         if progress is None:
             return run
         same = progress.source in (None, identity)  # earlier versions did not note it
-        if isinstance(source, Folder):  # skips files by their names; it may have been moved
-            same = same or (len(progress.files) > 0 and source.holds(progress.files))
+        if isinstance(source, Folder):  # skips files by their names
+            same = _is_continued(progress, source, same)
             return replace(run, after=progress.name, logged=progress.logged) if same else run
         if source.live and not keep_all:  # nothing comes twice: what it sent since the last save is lost
             return run
         if not same:
             return replace(run, known=Known(progress.time, another=True))
         return replace(run, known=_find_position(progress, source, state), logged=progress.logged)
+
+
+def _is_continued(progress: Progress, folder: Folder, same_place: bool) -> bool:
+    """Tell whether a folder holds what was read, perhaps at another place; at the same one, frames may be gone."""
+    kept, missing = folder.compare(progress.files)
+    if not same_place:
+        return kept == len(progress.files) > 0
+    if kept or progress.name is None or missing < len(progress.files):
+        return kept + missing == len(progress.files)
+    return not folder.begins_anew(progress.name, progress.time)
 
 
 def _find_position(progress: Progress, source: Source, state: Path) -> Known:
