@@ -349,7 +349,7 @@ class RigKeeper:
         state = {
             "memory": writer.write(KeeperMemory, memory),
             "labelling": writer.write(Labelling, self._labelling),
-            "tests": {test.name: writer.write_plain(test.saved()) for test in self.tests},
+            "tests": {test.name: writer.write(type(test), test) for test in self.tests},
         }
         return KeeperFile(
             time=memory.time,
@@ -406,7 +406,7 @@ class RigKeeper:
             keeper._labelling.rig = keeper.factory
             for test in keeper.tests:
                 if test.name in found["tests"]:
-                    test.restored(reader.read_plain(found["tests"][test.name], f"tests.{test.name}"))
+                    reader.read_object(type(test), found["tests"][test.name], f"tests.{test.name}", test)
         except (ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
             raise unusable_error(path, error) from error
         except InputError as error:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -162,25 +163,26 @@ def test_an_object_that_jumps_between_snapshots_is_found_again() -> None:
     assert all(float(np.nanmax(state.residual)) < 1.5 for state in states[4:])
 
 
-def test_tests_see_every_snapshot_and_tell_of_cameras() -> None:
+def test_tests_see_every_snapshot_tell_of_cameras_and_go_on_after_a_restart(tmp_path: Path) -> None:
     class Dirty:
-        name = "dirty"
+        name, STATE = "dirty", MappingProxyType({"told": ("told", int)})
+
+        def __init__(self):
+            self.told = 0
 
         def __call__(self, state, frames, absorbed):
             assert frames is None
             assert (absorbed is None) == (state.refused is not None)
             kind = {1: "dirty", 3: "clean"}.get(state.snapshot)
+            self.told += kind is not None
             return [] if kind is None else [Event(state.time, state.snapshot, kind, "cam03", message="a lens")]
-
-        def saved(self):
-            return {}
-
-        def restored(self, values):
-            assert not values
 
     made = stream(8, absent=[(2, 3)])
     with RigKeeper(made.factory, made.obj, tests=[Dirty()]) as keeper:
         states = [keeper.update(blobs, time) for time, blobs in made.snapshots(4)]
+        keeper.save(tmp_path / "state.json")
+    with RigKeeper.restore(tmp_path / "state.json", tests=[Dirty()]) as keeper:
+        assert keeper.tests[0].told == 2
     assert [state.cameras["cam03"] for state in states] == ["ok", "dirty", "dirty", "ok"]
     assert [event.kind for state in states for event in state.events] == ["dirty", "clean"]
     assert states[1].sentence == "cam03 is dirty"
