@@ -88,6 +88,8 @@ class Watch(arguments.Watch):
         with contextlib.ExitStack() as stack:
             keeper = stack.enter_context(self._open_keeper(earlier.state, rig, obj, detector))
             stack.enter_context(intake).wait_until_open()  # before anything is written
+            if earlier.known is not None and not intake.resumes:
+                earlier = earlier.as_another()
             if len(given.points) > 1 and obj is not given:
                 note = f"note: markers of {given.name} are followed one by one; where their distances fit, they count"
                 print(note, file=sys.stderr)

@@ -218,4 +218,4 @@ def test_the_loop_notes_the_files_of_the_last_snapshot(tmp_path):
     }
     with Watch(KeeperOfStates(), tmp_path) as loop:
         loop.process(TimedSnapshot(1.0, exposures, "7"))
-    assert Progress.load(tmp_path) == Progress(1.0, "7", 0, files={"cam01": stamp})
+    assert Progress.load(tmp_path) == Progress(1.0, "7", logged=0, files={"cam01": stamp})
