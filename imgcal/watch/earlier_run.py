@@ -25,6 +25,8 @@ class Progress:
     era: int = 0  # number of joint jumps of all clocks before it
     first: int | None = None  # digest of the first snapshot of the source that shows anything; None = unknown
     logged: int | None = None  # size of events.jsonl at that time, in bytes
+    tables: Mapping[str, int] = field(default_factory=dict)  # the same of tables of poses, by path; rows may follow
+    snapshot: int = 0  # number of the last snapshot's update
     source: str | None = None  # identity of the source; None = unknown
     rate: float | None = None  # snapshots per second of a source without times
     files: Mapping[str, FileStamp] = field(default_factory=dict)  # of the last snapshot, by camera, if it has files
@@ -54,7 +56,9 @@ class Progress:
                 for camera, (file, content) in dict(entry.get("files", ())).items()
             }
             rate = None if rate is None else float(rate)
-            return cls(time, name, int(entry.get("era", 0)), first, logged, source, rate, files)
+            tables = {str(path): int(size) for path, size in dict(entry.get("tables", ())).items()}
+            era, snapshot = int(entry.get("era", 0)), int(entry.get("snapshot", 0))
+            return cls(time, name, era, first, logged, tables, snapshot, source, rate, files)
         except (ValueError, TypeError, KeyError, OverflowError) as error:
             raise InputError(f"{path}: found something that imgcal watch did not write") from error
 
@@ -118,6 +122,8 @@ class EarlierRun:
     known: Known | None = None  # how much of this recording has been processed
     after: str | None = None  # name of the last processed snapshot of this folder of frames
     logged: int | None = None  # bytes of events.jsonl to keep: what follows will be reported again; None = all
+    tables: Mapping[str, int] = field(default_factory=dict)  # the same of tables of poses, by path ...
+    snapshot: int = 0  # ... if it is of later snapshots than this one
     networks: tuple[str, str] | None = None  # adapted ones: folders, as `adapted_networks` names them
 
     @classmethod
@@ -143,7 +149,7 @@ class EarlierRun:
         same = progress.source in (None, identity)  # earlier versions did not note it
         if isinstance(source, Folder):  # skips files by their names
             same = _is_continued(progress, source, same)
-            return replace(run, after=progress.name, logged=progress.logged) if same else run
+            return replace(run._going_on(progress), after=progress.name) if same else run
         if source.live and not keep_all:  # nothing comes twice: what it sent since the last save is lost
             return run
         known = _find_position(progress, source, state)
@@ -151,11 +157,14 @@ class EarlierRun:
             return replace(run, known=Known(progress.time, another=True))
         if known.first is None and known.mismatch is not None:
             raise InputError(known.mismatch)
-        return replace(run, known=known, logged=progress.logged)
+        return replace(run._going_on(progress), known=known)
+
+    def _going_on(self, progress: Progress) -> EarlierRun:
+        return replace(self, logged=progress.logged, tables=progress.tables, snapshot=progress.snapshot)
 
     def as_another(self) -> EarlierRun:
-        """What applies to another recording than that of the earlier run: no event will be reported again."""
-        return replace(self, logged=None)
+        """What applies to another recording than that of the earlier run: nothing will be reported again."""
+        return replace(self, logged=None, tables={})
 
 
 def _is_continued(progress: Progress, folder: Folder, same_place: bool) -> bool:

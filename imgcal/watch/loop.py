@@ -233,7 +233,8 @@ class Watch:
             return
         self._saved = time.monotonic()
         self._report_problems()
-        progress = replace(self._progress, logged=self._log.size)
+        tables = dict(output.table for output in self.poses if output.table is not None)
+        progress = replace(self._progress, logged=self._log.size, tables=tables, snapshot=state.snapshot)
         memory = self.keeper.saved(asdict(progress))
         self._files.write(
             state, also=lambda: memory.write(self.folder / STATE), then=lambda: self._when_saved(progress)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 from imgcal.errors import InputError
 from imgcal.messages import shorten
-from imgcal.watch.poses import PoseRecord, PoseStatus
+from imgcal.watch.poses import PoseRecord, PoseSink, PoseStatus
 
 PORT = 18944
 """Usual port of OpenIGTLink."""
@@ -103,7 +103,7 @@ class _Client:
     moved: float = field(default_factory=time.monotonic)  # s, time of its last read
 
 
-class OpenIGTLink:
+class OpenIGTLink(PoseSink):
     """Serves any number of clients without blocking; a client that does not read misses poses, then is disconnected."""
 
     def __init__(self, host: str = "127.0.0.1", port: int = PORT, stalled: float = STALLED) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import math
 import threading
+from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from imgcal.geometry import vector_from_rotation
 from imgcal.online import LightPoints, ObjectPose, RigState
@@ -107,9 +108,15 @@ class UnwrittenError(OSError):
         self.count = count
 
 
-class PoseSink(Protocol):
+class PoseSink(ABC):
     """Takes poses."""
 
+    @property
+    def table(self) -> tuple[str, int] | None:
+        """Path and size (bytes) of a table from which a restart removes the rows that come again; None = no table."""
+        return None
+
+    @abstractmethod
     def send(self, record: PoseRecord) -> None:
         """Take the pose of a snapshot.
 
@@ -118,6 +125,7 @@ class PoseSink(Protocol):
             UnwrittenError: the same of several poses.
         """
 
+    @abstractmethod
     def close(self) -> None:
         """Close the sink.
 
@@ -156,6 +164,11 @@ class Poses:
     def lost(self) -> int:
         """Number of poses that the sink did not get."""
         return self.dropped + self.failed
+
+    @property
+    def table(self) -> tuple[str, int] | None:
+        """See `PoseSink`."""
+        return self._sink.table
 
     def publish(self, state: RigState) -> None:
         """Take the state after a snapshot; returns at once."""

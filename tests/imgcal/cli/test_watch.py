@@ -314,7 +314,8 @@ def test_a_recording_is_gone_on_with_by_its_names_and_rate_and_another_one_is_no
     assert watch(tmp_path / "first.csv", out) == 0
     progress = json.loads((out / "state.json").read_text())["progress"]
     expected = {"time": 0.1, "name": "003", "source": str(tmp_path / "first.csv"), "rate": 30.0, "files": {}}
-    assert progress == expected | {"logged": 0, "era": 0, "first": progress["first"]} and progress["first"] is not None
+    expected |= {"logged": 0, "tables": {}, "snapshot": 3, "era": 0, "first": progress["first"]}
+    assert progress == expected and progress["first"] is not None
     (tmp_path / "second.csv").replace(tmp_path / "first.csv")  # it has grown
     capsys.readouterr()
     assert watch(tmp_path / "first.csv", out, "--rate", "60") == 2

@@ -48,7 +48,7 @@ def table(*names, rate=30.0):
 
 def leave(folder, **progress):
     """Write what an earlier run leaves: 9 s into `SOURCE`, after snapshot 10 and 300 bytes of events."""
-    entry = {"time": 9.0, "name": "10", "logged": 300, "source": SOURCE} | progress
+    entry = {"time": 9.0, "name": "10", "logged": 300, "snapshot": 8, "source": SOURCE} | progress
     (folder / "state.json").write_text(json.dumps({"progress": entry}))
     return folder / "state.json"
 
@@ -68,13 +68,13 @@ def test_a_state_without_a_position_is_resumed_and_all_is_read(source, tmp_path)
 @pytest.mark.parametrize(
     ("source", "keep_all", "expected"),
     [
-        (Recording(), False, EarlierRun(known=Known(9.0, "10"), logged=300)),
+        (Recording(), False, EarlierRun(known=Known(9.0, "10"), logged=300, snapshot=8)),
         (Recording(live=True), False, EarlierRun()),
-        (Recording(live=True), True, EarlierRun(known=Known(9.0, "10"), logged=300)),
-        (Folder(Path("capture"), RIG), False, EarlierRun(after="10", logged=300)),
-        (Folder(Path("capture"), RIG), True, EarlierRun(after="10", logged=300)),
-        (table("9", "10", "11"), False, EarlierRun(known=Known(9.0, "10"), logged=300)),
-        (table("a", "b"), False, EarlierRun(known=Known(9.0), logged=300)),
+        (Recording(live=True), True, EarlierRun(known=Known(9.0, "10"), logged=300, snapshot=8)),
+        (Folder(Path("capture"), RIG), False, EarlierRun(after="10", logged=300, snapshot=8)),
+        (Folder(Path("capture"), RIG), True, EarlierRun(after="10", logged=300, snapshot=8)),
+        (table("9", "10", "11"), False, EarlierRun(known=Known(9.0, "10"), logged=300, snapshot=8)),
+        (table("a", "b"), False, EarlierRun(known=Known(9.0), logged=300, snapshot=8)),
     ],
 )
 def test_the_same_source_continues_after_the_last_snapshot(source, keep_all, expected, noted, tmp_path):
@@ -99,7 +99,7 @@ def test_another_source_is_read_in_full_and_no_event_is_removed(source, keep_all
 
 def test_a_state_of_a_version_that_noted_no_events_keeps_them_all(tmp_path):
     state = leave(tmp_path, logged=None)
-    assert EarlierRun.find(tmp_path, Recording(), SOURCE) == EarlierRun(state, Known(9.0, "10"))
+    assert EarlierRun.find(tmp_path, Recording(), SOURCE) == EarlierRun(state, Known(9.0, "10"), snapshot=8)
 
 
 def test_a_table_at_another_rate_is_refused_unless_it_is_another_table(tmp_path):
@@ -165,7 +165,7 @@ def test_a_folder_that_was_moved_is_the_same_source(copied, tmp_path):
     there, out, here = fill(tmp_path / "there"), tmp_path / "out", tmp_path / "here"
     state = leave_after_reading(there, out)
     shutil.copytree(there, here, copy_function=shutil.copyfile) if copied else there.rename(here)
-    assert EarlierRun.find(out, Folder(here, SMALL), str(here)) == EarlierRun(state, after="10", logged=300)
+    assert EarlierRun.find(out, Folder(here, SMALL), str(here)) == EarlierRun(state, after="10", logged=300, snapshot=8)
 
 
 def draw_anew(path):
@@ -190,7 +190,7 @@ def find_in(folder, out):
 def test_new_frames_in_the_same_place_are_another_source(names, tmp_path):
     folder, out = fill(tmp_path / "capture"), tmp_path / "out"
     state = leave_after_reading(folder, out)
-    assert find_in(folder, out) == EarlierRun(state, after="10", logged=300)
+    assert find_in(folder, out) == EarlierRun(state, after="10", logged=300, snapshot=8)
     shutil.rmtree(folder)
     assert find_in(fill(folder, names, seed=1, seconds=1.7e9 + 60), out) == EarlierRun(state)
 
@@ -202,7 +202,7 @@ def test_frames_that_were_read_may_be_gone(left, tmp_path):
     for path in folder.glob("frames/*/*.png"):
         if path.stem not in left:
             path.unlink()
-    assert find_in(folder, out) == EarlierRun(state, after="10", logged=300)
+    assert find_in(folder, out) == EarlierRun(state, after="10", logged=300, snapshot=8)
 
 
 def test_a_folder_is_another_source_where_its_files_were_not_noted(tmp_path):
