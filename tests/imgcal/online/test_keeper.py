@@ -320,7 +320,7 @@ def test_a_knock_that_turns_all_cameras_is_told_as_that_and_not_as_another_objec
     obj = imgcal.load_object("asymmetric8")
     made = Stream(imgcal.load_rig("O6"), obj, 1, Conditions(rate=10.0, labelled=True), knock)
     events, last = events_of(made, 120)
-    assert [event.kind for event in events] == ["restart"]
+    assert [(event.kind, event.camera) for event in events] == [("moved", None), ("restart", None)]
     assert last.refused is None
 
 
@@ -386,6 +386,16 @@ def test_a_camera_that_is_late_from_the_first_snapshot_on_does_not_move_again_an
     events, last = events_of(made, 130)  # 28 and 33 events without doubt
     assert [event.kind for event in events].count("moved") <= 2 and {event.camera for event in events} <= {"cam02"}
     assert last.cameras["cam02"] != "ok" or last.clock_offset[1] == pytest.approx(late, rel=0.1)
+
+
+def test_cameras_that_all_move_at_once_are_told_within_nine_snapshots() -> None:
+    """A truck has passed, and the tripods have settled."""
+    made = stream(4, bumps=[Bump(40, camera, "rotation", math.radians(0.17)) for camera in range(4)])
+    (state, *_) = told = [state for state in kept(made, 52) if state.events]
+    (event,) = state.events
+    assert len(told) == 1 and (event.kind, event.camera, event.change) == ("moved", None, "unknown")
+    assert event.snapshot <= 48 and event.since == pytest.approx(40 / 60)
+    assert set(state.cameras.values()) == {"doubtful"}
 
 
 @pytest.mark.parametrize("leap", [1.7e9, 3.2e6])
