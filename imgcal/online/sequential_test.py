@@ -15,7 +15,7 @@ class SequentialTest(Protocol):
     """Sees the snapshots one by one; `RigKeeper` calls it, and saves it with its own state."""
 
     name: str
-    STATE: ClassVar[Mapping[str, tuple[str, Any]]]
+    STATE: ClassVar[Any]
     """What is saved: key in the file -> attribute and type, as in `{"times": ("_times", int)}`."""
 
     def __call__(

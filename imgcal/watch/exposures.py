@@ -118,7 +118,7 @@ class Source(Protocol):
 
 def frame_digest(frame: Frame) -> int:
     """Number that differs between frames (H, W) of other content; much quicker than to read one."""
-    return zlib.crc32(np.ascontiguousarray(frame[::DIGESTED_ROWS]))
+    return zlib.crc32(np.ascontiguousarray(frame[::DIGESTED_ROWS]).data)
 
 
 def check_exposure(exposure: Exposure, rig: CameraRig) -> Exposure:
