@@ -169,11 +169,11 @@ class EarlierRun:
 
 def _is_continued(progress: Progress, folder: Folder, same_place: bool) -> bool:
     """Tell whether a folder holds what was read, perhaps at another place; at the same one, frames may be gone."""
-    kept, missing = folder.compare(progress.files)
+    count, (kept, missing) = len(progress.files), folder.compare(progress.files)
     if not same_place:
-        return kept == len(progress.files) > 0
-    if kept or progress.name is None or missing < len(progress.files):
-        return kept + missing == len(progress.files)
+        return kept == count > 0
+    if progress.name is None or kept or missing < count or not count:
+        return kept + missing == count
     return not folder.begins_anew(progress.name, progress.time)
 
 
