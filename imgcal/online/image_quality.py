@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,6 @@ from imgcal.monitoring import Cusum, MeasurementUpdate
 from imgcal.online.camera_visibility import well_inside
 from imgcal.online.events import Event, EventKind
 from imgcal.online.rig_state import RigState
-from imgcal.online.sequential_test import check_like
 
 Array = NDArray[np.float64]
 
@@ -82,6 +81,19 @@ class ImageQuality:
     """
 
     name = "image quality"
+    STATE: ClassVar = {
+        "began": ("_began", float | None),
+        "collected": ("_collected", float),
+        "bad": ("_bad", NDArray[np.bool_]),
+        "test": ("_test", Cusum),
+        **{
+            name: (f"_{name}", Array)
+            for name in (
+                "distance", "count", "sum", "place", "last_time", "last_value", "last_place", "coefficients",
+                "covariance", "variance", "blocks", "usual", "good",
+            )
+        },
+    }  # fmt: skip
 
     def __init__(self, cameras: int) -> None:
         """Start with cameras whose images are good."""
@@ -205,27 +217,6 @@ class ImageQuality:
             message = f"{names[camera]} shows its blobs as before"
             events.append(Event(state.time, state.snapshot, "clean", names[camera], message=message))
         return events
-
-    def saved(self) -> dict[str, Any]:
-        """See `SequentialTest`."""
-        arrays = {name: getattr(self, f"_{name}") for name in _ARRAYS}
-        test = {name: getattr(self._test, name) for name in Cusum.STATE}
-        return arrays | test | {"began": self._began, "collected": self._collected}
-
-    def restored(self, values: dict[str, Any]) -> None:
-        """See `SequentialTest`."""
-        for name in _ARRAYS:
-            setattr(self, f"_{name}", check_like(f"{self.name}: {name}", getattr(self, f"_{name}"), values[name]))
-        for name in Cusum.STATE:
-            setattr(self._test, name, check_like(f"{self.name}: {name}", getattr(self._test, name), values[name]))
-        began, self._collected = values["began"], float(values["collected"])
-        self._began = None if began is None else float(began)
-
-
-_ARRAYS = (
-    "distance", "count", "sum", "place", "last_time", "last_value", "last_place", "coefficients", "covariance",
-    "variance", "blocks", "usual", "bad", "good",
-)  # fmt: skip
 
 
 def _prior() -> Array:

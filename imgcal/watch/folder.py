@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 import time
@@ -15,6 +16,7 @@ from imgcal.io import IMAGE_SUFFIXES, is_file_name, natural_key, nearest, read_f
 from imgcal.messages import list_names
 from imgcal.types import CameraRig
 from imgcal.watch.exposures import Exposure, FileStamp, Item, Unreadable
+from imgcal.watch.timing import LEAP
 
 TICK = 0.05  # s between two scans
 GIVEN_UP = 2.0  # s for which an unreadable file may still be incomplete
@@ -46,17 +48,30 @@ class Folder:
         """Count the existing snapshots that were processed before."""
         if self.after is None:
             return 0
-        files = (path for name in self.rig.camera_names for path in (self.folder / "frames" / name).glob("*"))
-        stems = {path.stem for path in files if path.suffix.lower() in IMAGE_SUFFIXES and is_file_name(path.stem)}
-        return sum(natural_key(stem) <= natural_key(self.after) for stem in stems)
+        return sum(natural_key(stem) <= natural_key(self.after) for stem in {path.stem for path in self._frames()})
 
-    def holds(self, files: Mapping[str, FileStamp]) -> bool:
-        """Tell whether files that were read, by camera, are in this folder and unchanged."""
-        try:
-            found = {name: (self.folder / "frames" / name / file.name).stat() for name, file in files.items()}
-        except (OSError, ValueError):  # missing, or a name that no file has
-            return False
-        return all(FileStamp.of(file.name, found[name]) == file for name, file in files.items())
+    def compare(self, files: Mapping[str, FileStamp]) -> tuple[int, int]:
+        """Count how many files that were read, by camera, are in this folder unchanged, and how many are missing."""
+        paths = {name: self.folder / "frames" / name / file.name for name, file in files.items()}
+        there = {name: path for name, path in paths.items() if path.is_file()}
+        kept = 0
+        for name, path in there.items():
+            with contextlib.suppress(InputError, OSError):  # it is no frame now
+                kept += FileStamp.of(path.name, read_frame(path)) == files[name]
+        return kept, len(files) - len(there)
+
+    def begins_anew(self, after: str, time: float) -> bool:
+        """Tell whether frames up to snapshot `after` were written later than `time` (s since the epoch)."""
+        for path in self._frames():
+            with contextlib.suppress(OSError):  # deleted meanwhile
+                if natural_key(path.stem) <= natural_key(after) and path.stat().st_mtime > time + LEAP:
+                    return True
+        return False
+
+    def _frames(self) -> list[Path]:
+        """The frames in this folder."""
+        files = (path for name in self.rig.camera_names for path in (self.folder / "frames" / name).glob("*"))
+        return [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES and is_file_name(path.stem)]
 
     def delete_read(self, name: str) -> None:
         """Delete the frames read so far, up to snapshot `name`; they are not needed again.
@@ -128,7 +143,7 @@ class Folder:
         camera.mark_done(path)
         if self.remove:
             self._read_files.append(path)
-        return Exposure(name, found.st_mtime, frame, path.stem, FileStamp.of(path.name, found))
+        return Exposure(name, found.st_mtime, frame, path.stem, FileStamp.of(path.name, frame))
 
 
 class _Camera:
