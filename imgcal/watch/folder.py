@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from imgcal.errors import InputError
-from imgcal.io import IMAGE_SUFFIXES, is_file_name, natural_key, nearest, read_frame
+from imgcal.io import IMAGE_SUFFIXES, is_file_name, natural_key, nearest, read_frame, snapshot_name
 from imgcal.messages import list_names
 from imgcal.types import CameraRig
 from imgcal.watch.exposures import Exposure, FileStamp, Item, Unreadable
@@ -25,7 +25,7 @@ REMEMBERED = 4096  # names of read files kept per camera; earlier names count as
 
 @dataclass(frozen=True)
 class Folder:
-    """Frames of a growing capture; the name of a file is that of its snapshot.
+    """Frames of a growing capture; the name of a file, without the camera's, is that of its snapshot.
 
     No file is read half-written: its size must be equal in two scans, and the image must be complete. Names that begin
     with a dot or do not end in an image suffix (`1.png.part`) are ignored.
@@ -48,7 +48,7 @@ class Folder:
         """Count the existing snapshots that were processed before."""
         if self.after is None:
             return 0
-        return sum(natural_key(stem) <= natural_key(self.after) for stem in {path.stem for path in self._frames()})
+        return sum(natural_key(name) <= natural_key(self.after) for name in {_snapshot(path) for path in self._frames()})
 
     def compare(self, files: Mapping[str, FileStamp]) -> tuple[int, int]:
         """Count how many files that were read, by camera, are in this folder unchanged, and how many are missing."""
@@ -64,7 +64,7 @@ class Folder:
         """Tell whether frames up to snapshot `after` were written later than `time` (s since the epoch)."""
         for path in self._frames():
             with contextlib.suppress(OSError):  # deleted meanwhile
-                if natural_key(path.stem) <= natural_key(after) and path.stat().st_mtime > time + LEAP:
+                if natural_key(_snapshot(path)) <= natural_key(after) and path.stat().st_mtime > time + LEAP:
                     return True
         return False
 
@@ -83,7 +83,7 @@ class Folder:
         problem: OSError | None = None
         for _ in range(len(self._read_files)):
             path = self._read_files.popleft()
-            if natural_key(path.stem) > natural_key(name):
+            if natural_key(_snapshot(path)) > natural_key(name):
                 self._read_files.append(path)
                 continue
             try:
@@ -104,7 +104,7 @@ class Folder:
         while self.until_idle is None or time.monotonic() - heard < self.until_idle:
             now = time.monotonic()
             ready = [(path, name) for name, camera in cameras.items() for path in camera.stable_files()]
-            for path, name in sorted(ready, key=lambda pair: (natural_key(pair[0].stem), pair[1])):
+            for path, name in sorted(ready, key=lambda pair: (natural_key(_snapshot(pair[0])), pair[1])):
                 item = self._read(cameras[name], name, path, now)
                 if item is not None:
                     yield item
@@ -143,7 +143,7 @@ class Folder:
         camera.mark_done(path)
         if self.remove:
             self._read_files.append(path)
-        return Exposure(name, found.st_mtime, frame, path.stem, FileStamp.of(path.name, frame))
+        return Exposure(name, found.st_mtime, frame, _snapshot(path), FileStamp.of(path.name, frame))
 
 
 class _Camera:
@@ -183,7 +183,7 @@ class _Camera:
         self._read[path.name] = None
         if len(self._read) > REMEMBERED:
             first, _ = self._read.popitem(last=False)
-            key = natural_key(Path(first).stem)
+            key = natural_key(_snapshot(self._folder / first))
             self._floor = key if self._floor is None else max(self._floor, key)
 
     def gives_up(self, path: Path, now: float) -> bool:
@@ -197,4 +197,11 @@ class _Camera:
         stem, _, suffix = name.rpartition(".")
         if name.startswith(".") or f".{suffix.lower()}" not in IMAGE_SUFFIXES or name in self._read:
             return False
-        return is_file_name(stem) and (self._floor is None or natural_key(stem) > self._floor)
+        if self._floor is None or not is_file_name(stem):
+            return is_file_name(stem)
+        return natural_key(snapshot_name(stem, self._folder.name)) > self._floor
+
+
+def _snapshot(path: Path) -> str:
+    """Name the snapshot of a frame, `frames/<camera name>/<file>`."""
+    return snapshot_name(path.stem, path.parent.name)
