@@ -48,7 +48,9 @@ class Folder:
         """Count the existing snapshots that were processed before."""
         if self.after is None:
             return 0
-        return sum(natural_key(name) <= natural_key(self.after) for name in {_snapshot(path) for path in self._frames()})
+        return sum(
+            natural_key(name) <= natural_key(self.after) for name in {_snapshot(path) for path in self._frames()}
+        )
 
     def compare(self, files: Mapping[str, FileStamp]) -> tuple[int, int]:
         """Count how many files that were read, by camera, are in this folder unchanged, and how many are missing."""
