@@ -27,6 +27,10 @@ STEPS = 5  # Gauss-Newton steps; two are nearly always enough
 CLIPPED_STEPS = 15  # more, because the start is farther off where the top of the blob is clipped
 SETTLED = 0.01  # of the variance: a smaller step of the centre ends the iteration
 FARTHEST = 0.5  # px from the centroid: a fit farther away has found something else
+DEFECTS = 3  # most defective pixels of a blob that are left out
+DEFECT = 5.0  # times the RMS residual of the other pixels ...
+LEAST_DEFECT = 0.1  # ... and of the blob's height: the least residual of a defective pixel
+CLEAN = 2.0  # times the noise: the largest RMS residual of the others; a blob of another shape has no defects
 # Phi(t) - 1/2 = t * polynomial(t^2) for |t| < END, with value 1/2 and slope 0 there: at most 2.4e-4 off.
 END = 3.5
 PHI = np.array([3.9820702e-1, -6.4665547e-2, 8.6445825e-3, -7.4875071e-4, 3.6610834e-5, -7.5567596e-7], np.float32)
@@ -36,6 +40,8 @@ _SLOPE = (PHI * np.arange(1, 13, 2)).astype(np.float32)
 @njit(cache=True, nogil=True, error_model="numpy")
 def fit_centre(rows, pixels, start, clipped, noise):
     """Fit the centre of a blob.
+
+    Single pixels far off the fit are hot or dead and left out if the others then differ from it by their noise alone.
 
     Args:
         rows: (ROWS, MOST) scratch; its last three rows are offsets x, y and grey values above the background.
@@ -48,6 +54,40 @@ def fit_centre(rows, pixels, start, clipped, noise):
         Centre x, y; its information, 1 / px^2 for unit noise (mean of the axes, 0 where the fit has failed); and the
         mean squared residual.
     """
+    now, known, cost = _descend(rows, pixels, start, clipped, noise)
+    first, left = (now[5], now[6], known, cost / max(pixels - PARAMETERS, 1)), pixels
+    for _ in range(DEFECTS):
+        if known == 0.0:
+            cost = _draw(rows, left, now)  # the last residuals are those of a refused step
+        if left <= PARAMETERS + 1 or not _drop_defect(rows, left, cost, now[0]):
+            break
+        left -= 1
+        now, known, cost = _descend(rows, left, now, clipped, noise)
+    freedom = max(left - PARAMETERS, 1)
+    if left == pixels or cost > (CLEAN * noise) ** 2 * freedom:
+        return first
+    return now[5], now[6], known, cost / freedom
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _drop_defect(rows, pixels, cost, height):
+    """Put the last pixel in the place of one whose residual nothing but a defect explains; return whether one has."""
+    worst = 0
+    for p in range(pixels):
+        if abs(rows[7, p]) > abs(rows[7, worst]):
+            worst = p
+    squared = rows[7, worst] ** 2
+    others = (cost - squared) / (pixels - PARAMETERS - 1)
+    if squared < DEFECT**2 * others or squared < (LEAST_DEFECT * height) ** 2:
+        return False
+    for i in range(8, ROWS):
+        rows[i, worst] = rows[i, pixels - 1]
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _descend(rows, pixels, start, clipped, noise):
+    """Minimize the squared residuals: the parameters, the centre's information as `fit_centre`, and their sum."""
     now, cost = start, _draw(rows, pixels, start)
     normal = _products(rows, pixels)
     factor, damping, moved, settled = normal, 1e-3, False, False
@@ -72,7 +112,7 @@ def fit_centre(rows, pixels, start, clipped, noise):
         factor = _factor(normal, 1e-9)
     a, b, d = factor[5, 5], factor[6, 5], factor[6, 6]
     known = a * a * d * d / ((a * a + b * b + d * d) / 2)  # one over the mean of the inverse's diagonal
-    return now[5], now[6], known if settled else 0.0, cost / max(pixels - PARAMETERS, 1)
+    return now, known if settled else 0.0, cost
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

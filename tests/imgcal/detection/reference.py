@@ -133,9 +133,25 @@ def quadratic(parameters, x, y):
 
 
 def fit(x, y, grey, start, clipped, noise):
-    """Levenberg and Marquardt on A Phi(t): centre x, y, information (0 where it fails), mean squared residual."""
+    """A Phi(t) without defective pixels: centre x, y, information (0 where it fails), mean squared residual."""
     if len(x) <= fitting.PARAMETERS:
         return 0.0, 0.0, 0.0, 0.0
+    tries = []
+    for _ in range(fitting.DEFECTS + 1):
+        now, known, cost, residual = descend(x, y, grey, start, clipped, noise)
+        left = len(x) - fitting.PARAMETERS
+        tries.append((*now[5:], known, cost / max(left, 1)))
+        worst = np.abs(residual).argmax()
+        others = (cost - residual[worst] ** 2) / max(left - 1, 1)
+        least = max(fitting.DEFECT * np.sqrt(max(others, 0)), fitting.LEAST_DEFECT * now[0])
+        if left <= 1 or abs(residual[worst]) < least:
+            break
+        x, y, grey, start = (*(np.delete(values, worst) for values in (x, y, grey)), now)
+    return tries[-1] if tries[-1][3] <= (fitting.CLEAN * noise) ** 2 else tries[0]
+
+
+def descend(x, y, grey, start, clipped, noise):
+    """Levenberg and Marquardt: parameters, the centre's information, squared residuals, and those of the last step."""
     now, damping, moved = start, 1e-3, False
     value, jacobian = drawn(now, x, y)
     for _ in range(fitting.CLIPPED_STEPS if clipped else fitting.STEPS):
@@ -144,8 +160,7 @@ def fit(x, y, grey, start, clipped, noise):
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
         if moved and (np.diag(normal)[5:] * step[5:] ** 2).sum() < fitting.SETTLED * noise**2:
             covariance = np.linalg.inv(normal)
-            mean_square = (residual @ residual - gradient @ step) / (len(x) - fitting.PARAMETERS)
-            return *(now + step)[5:], 2 / np.trace(covariance[5:, 5:]), mean_square
+            return now + step, 2 / np.trace(covariance[5:, 5:]), residual @ residual - gradient @ step, residual
         trial = now + step
         if trial[:3].min() > 0 and trial[2] * trial[4] - trial[3] ** 2 > 1e-3:
             after = drawn(trial, x, y)
@@ -153,7 +168,8 @@ def fit(x, y, grey, start, clipped, noise):
                 now, damping, moved, (value, jacobian) = trial, damping / 10, True, after
                 continue
         damping = max(30 * damping, 1e-2)
-    return *now[5:], 0.0, ((grey - value) ** 2).sum() / (len(x) - fitting.PARAMETERS)
+    residual = grey - value
+    return now, 0.0, residual @ residual, residual
 
 
 def drawn(parameters, x, y):

@@ -101,6 +101,22 @@ def assert_same_within_noise(distance, sigma):
     assert (distance < 1.2 * sigma).all()
 
 
+@pytest.mark.parametrize(("place", "value"), [((5, 1), 80), ((4, 1), 0), ((1, 0), 0), ((0, 3), 0), ((-2, -2), 90)])
+def test_a_defective_pixel_moves_no_centre(place, value):
+    """Neither a hot one beside the blob nor a dead one in it; sigma says what is left."""
+    rng = np.random.default_rng(0)
+    uv = np.stack(np.meshgrid(np.arange(40.0, 600, 50), np.arange(40.0, 440, 50)), axis=-1).reshape(-1, 2)
+    uv += rng.uniform(-0.5, 0.5, uv.shape)
+    frame = exposed(draw_discs((480, 640), uv, 3.0, contrast=150.0), 2.0, rng)
+    column, row = np.rint(uv).astype(int).T
+    frame[row + place[1], column + place[0]] = value
+    blobs = detect_frame(frame, DetectionOptions())
+    found, distance = nearest(blobs.uv, uv)
+    assert len(found) == len(uv)
+    assert np.sqrt(np.square(distance).mean() / 2) < 0.012
+    assert 0.7 < np.sqrt(np.square(distance / blobs.sigma[found]).mean() / 2) < 1.3
+
+
 def test_shifted_frame_gives_shifted_blobs():
     frame, _ = scene()
     reference = detect_frame(frame, DetectionOptions())
