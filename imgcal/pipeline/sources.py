@@ -39,8 +39,17 @@ def as_unknown_marker(obj: CalibrationObject, detections: Detections) -> Calibra
 
 
 def as_one(obj: CalibrationObject | Sequence[CalibrationObject]) -> CalibrationObject:
-    """One object, or several combined."""
-    return obj if isinstance(obj, CalibrationObject) else CalibrationObject.of_several(obj)
+    """One object, or several combined.
+
+    Raises:
+        InputError: something else.
+    """
+    if isinstance(obj, CalibrationObject):
+        return obj
+    if isinstance(obj, str) or not all(isinstance(part, CalibrationObject) for part in obj):
+        found = repr(obj) if isinstance(obj, str) else f"a {type(obj).__name__} of other things"
+        raise InputError(f"object: found {found:.80}, expected a CalibrationObject; load_object(...) reads one")
+    return CalibrationObject.of_several(obj)
 
 
 def find_blobs(
