@@ -149,7 +149,8 @@ def save_object(obj: CalibrationObject, path: str | Path) -> None:
     """Write a calibration object in one step; every number in its shortest exact form.
 
     Raises:
-        InputError: the file cannot be written, or a name could not be read again.
+        InputError: the file cannot be written; or the object has something that a file has no place for (a scale
+            tolerance, several objects), or that could not be read again.
 
     Examples:
         >>> import imgcal
@@ -157,11 +158,17 @@ def save_object(obj: CalibrationObject, path: str | Path) -> None:
         >>> imgcal.load_object("mine.csv").name
         'mine'
     """
-    write_text(path, object_text(obj, path))
+    where = f"{path}: not written"
+    if obj.parts or obj.scale_tolerance:
+        found = "several objects" if obj.parts else f"a scale tolerance of {obj.scale_tolerance:g}"
+        raise InputError(f"{where}: found {found}, for which a file has no place")
+    text = object_text(obj, path)
+    object_from_text(text, where)  # raises what reading it again would
+    write_text(path, text)
 
 
 def object_text(obj: CalibrationObject, where: str | Path = "object") -> str:
-    """Make the text that `save_object` writes; errors begin with `where`.
+    """Make the text that `save_object` writes, which leaves out a scale tolerance; errors begin with `where`.
 
     Raises:
         InputError: the name of a fiducial could not be read again, or is not unique.

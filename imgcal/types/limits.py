@@ -11,16 +11,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NoReturn
 
+import numpy as np
 import torch
 
 from imgcal import geometry
 from imgcal.errors import InputError
 from imgcal.messages import shorten
+from imgcal.types.detections import BlobFlag
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
     from torch import Tensor
 
     from imgcal.types.calibration_object import CalibrationObject
+    from imgcal.types.detections import Detections
     from imgcal.types.observations import Observations
     from imgcal.types.rig import CameraRig, DriftRate, RigPrior
 
@@ -45,6 +49,7 @@ MOST_CAMERAS = 256
 MOST_FIDUCIALS = 1000
 LONGEST_SIDE = 2**16  # px
 MOST_PIXELS = 2**27  # of one image
+MOST_FLAGS = 2 * max(BlobFlag) - 1  # sum of all bits
 
 FOCAL_LENGTH = Range(0.1, 1e7, "px")
 PIXEL = Range(-1e6, 1e6, "px")  # any coordinate in an image or beside it
@@ -181,6 +186,60 @@ def check_object(obj: CalibrationObject) -> None:
             if bool(wrong.any()):
                 place = wrong.nonzero()[0].tolist()
                 _fail(f"object {part.name}: fiducial {place[0]}: {name}", float(tensor[tuple(place)]), plausible)
+
+
+def check_detections(detections: Detections, where: str = "detections") -> None:
+    """Check blobs that were not read from a file: columns of one length, and values in the ranges of their kinds.
+
+    Args:
+        detections: the blobs.
+        where: what errors begin with.
+
+    Raises:
+        InputError: inconsistent columns, a camera or snapshot that does not exist or has another's name, an invalid
+            pixel, standard deviation or radius, or a fiducial that a camera has twice in a snapshot.
+    """
+    count = np.shape(detections.uv)[:1]
+    for name in ("uv", "sigma", "camera", "snapshot", "fiducial", "radius", "flags"):
+        column, expected = getattr(detections, name), (*count, 2) if name == "uv" else count
+        if not isinstance(column, np.ndarray) or column.shape != expected:
+            found = f"an array of shape {column.shape}" if isinstance(column, np.ndarray) else type(column).__name__
+            raise InputError(f"{where}: {name}: found {found}, expected a NumPy array of shape {expected}")
+        wanted, kinds = ("numbers", "fiu") if name in ("uv", "sigma", "radius") else ("integers", "iu")
+        if column.dtype.kind not in kinds:
+            raise InputError(f"{where}: {name}: found an array of {column.dtype}, expected {wanted}")
+    for name in ("camera", "snapshot"):
+        names, column = getattr(detections, f"{name}_names"), getattr(detections, name)
+        if (twice := find_repeated(names)) is not None:
+            raise InputError(
+                f"{where}: found the {name} name {shorten(twice)} more than once, expected different names"
+            )
+        _check_column(detections, name, (column >= 0) & (column < len(names)), f"0 to {len(names) - 1}", where)
+    fiducial, flags = detections.fiducial, detections.flags
+    _check_column(detections, "fiducial", fiducial >= -1, "a row of the object, or -1", where)
+    _check_column(detections, "flags", (flags >= 0) & (flags <= MOST_FLAGS), f"0 to {MOST_FLAGS}", where)
+    row = detections.find_repeated_label()
+    if row is not None:
+        camera = detections.camera_names[detections.camera[row]]
+        snapshot = detections.snapshot_names[detections.snapshot[row]]
+        raise InputError(
+            f"{where}: fiducial: found {detections.fiducial[row]} again in row {row} for camera {camera} in "
+            f"snapshot {snapshot}, expected it once"
+        )
+    uv, sigma, radius = detections.uv, detections.sigma, detections.radius
+    good = ((uv >= PIXEL.low) & (uv <= PIXEL.high)).all(axis=1)
+    _check_column(detections, "uv", good, f"a pixel, {PIXEL}", where)
+    good = (sigma >= SIGMA.low) & (sigma <= SIGMA.high)
+    _check_column(detections, "sigma", good, f"a standard deviation > 0, {SIGMA}", where)
+    good = np.isnan(radius) | ((radius >= 0) & (radius <= BLOB_RADIUS.high))
+    _check_column(detections, "radius", good, f"a radius, {BLOB_RADIUS}, or nan", where)
+
+
+def _check_column(detections: Detections, column: str, good: NDArray[np.bool_], expected: str, where: str) -> None:
+    if not good.all():
+        row = int(good.argmin())
+        found = getattr(detections, column)[row]
+        raise InputError(f"{where}: {column}: found {found} in row {row}, expected {expected}")
 
 
 def check_observations(observations: Observations) -> None:
