@@ -25,6 +25,9 @@ from imgcal.geometry.shapes import require_shapes
 from imgcal.geometry.transforms import RigidTransform
 from renderers.compiling import njit
 
+STEPS = 25
+"""Most steps of Newton's method on the inverse of a lens."""
+
 
 def project_cpu(
     points_rig: Tensor,
@@ -142,7 +145,9 @@ def project_arrays(models, given):
 
 
 def undistort_cpu(xy_distorted: Tensor, distortion: Tensor, models: ModelNames = DEFAULT) -> tuple[Tensor, Tensor]:
-    """Undistort like `lenses.undistort`, for tensors on the CPU: without gradients, until it converges.
+    """Undistort like `lenses.undistort`, for tensors on the CPU: without gradients, in as many steps as it takes.
+
+    At most `STEPS`: near the edge of a lens that magnifies it many times, the start is too far off.
 
     Args:
         xy_distorted: (*B, C, N, 2) distorted coordinates on the z = 1 plane.
@@ -185,11 +190,11 @@ def _inverse(lens: CompiledLens, size: int) -> Formula:
                     xd, yd = distorted[b, c, n, 0], distorted[b, c, n, 1]
                     x, y = start(xd, yd, k)
                     error, rr, slope = np.inf, 0.0, 1.0
-                    for _ in range(9):
+                    for _ in range(STEPS):
                         ux, uy, jxx, jxy, jyy, rr, slope = distort(1.0, x, y, k)
                         ex, ey = ux - xd, uy - yd
-                        error = max(abs(ex), abs(ey))
-                        if error < 4 * np.finfo(np.float64).eps:
+                        last, error = error, max(abs(ex), abs(ey))
+                        if error < 4 * np.finfo(np.float64).eps or last <= error < rounding:
                             break
                         determinant = jxx * jyy - jxy * jxy
                         x, y = x - (jyy * ex - jxy * ey) / determinant, y - (jxx * ey - jxy * ex) / determinant

@@ -165,7 +165,7 @@ def _check_frame(frame: Any, camera: str, width: int, height: int, rig: CameraRi
     """Check the size of a frame; detection explains other faults."""
     if not isinstance(frame, np.ndarray):
         return frame
-    if frame.ndim == 3:
+    if frame.ndim == 3 or not frame.dtype.isnative or np.ma.is_masked(frame):
         frame = grey_frame(frame, f"camera {camera}")
     if frame.ndim == 2 and frame.shape != (height, width):
         raise InputError(
