@@ -27,6 +27,7 @@ from imgcal.types import (
     CalibrationObject,
     CameraRig,
     Observations,
+    Range,
     RigPrior,
     check_object,
     check_observations,
@@ -39,6 +40,7 @@ RESTART_AFTER = 15
 COARSER = (3000.0, 300.0, 30.0, 3.0)
 """Factors on the standard deviation of the observations, in stages."""
 COARSE_TOLERANCE = 0.1
+FINITE_STD = Range(0.0, torch.finfo(torch.float64).max, "")
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,7 @@ def estimate(
     check_object(obj)
     problem = make_problem(observations, rig, obj, prior_std)
     check_observations(observations)
-    if not bool(((problem.prior_std >= 0) & problem.prior_std.isfinite()).all()):
+    if not FINITE_STD.holds_all(problem.prior_std):
         raise InputError("prior_std: found a value below 0 or not finite, expected standard deviations of 0 or more")
     if rig_from_object is None:
         with torch.no_grad():

@@ -62,7 +62,7 @@ def project_cpu(
     radius_squared = np.zeros(fiducials, kind) if radius is None else radius.detach().numpy().astype(kind) ** 2
     arrays = [np.ascontiguousarray(tensor.detach().numpy()) for tensor in given]
     sizes = np.ascontiguousarray(image_size.numpy())
-    cameras, width = _require_fit(points, radius_squared, *arrays, sizes)
+    cameras, width = _require_fit(points, radius_squared, arrays, sizes)
     image = np.empty((count, cameras, 4, fiducials), kind)  # u, v, depth, visible
     points, *arrays = (array.reshape(count, *array.shape[len(batch) :]) for array in (points, *arrays))
     project_arrays(lens_codes(models, cameras, width), (points, radius_squared, *arrays, sizes, image))
@@ -71,12 +71,13 @@ def project_cpu(
     return Projection(torch.from_numpy(uv), torch.from_numpy(depth), torch.from_numpy(visible))
 
 
-def _require_fit(points, radius, rotation, translation, focal_length, principal_point, distortion, sizes):
+def _require_fit(points, radius, arrays, sizes):
     """Number of cameras and width of the distortion, if the arrays of `project_cpu` have the shapes that follow."""
     *batch, axes, fiducials = points.shape
     if axes != 3 or points.dtype.kind != "f":
         found = f"points of shape {(*batch, fiducials, axes)} and type {points.dtype}"
         raise InputError(f"projection: found {found}, expected three real coordinates (mm) each")
+    rotation, translation, focal_length, principal_point, distortion = arrays
     batch, cameras, width = tuple(batch), rotation.shape[-3], distortion.shape[-1]
     require_shapes(
         "projection",
