@@ -228,8 +228,8 @@ def check_detections(detections: Detections, where: str = "detections") -> None:
             f"snapshot {snapshot}, expected it once"
         )
     uv, sigma, radius = detections.uv, detections.sigma, detections.radius
-    good = ((uv >= PIXEL.low) & (uv <= PIXEL.high)).all(axis=1)
-    _check_column(detections, "uv", good, f"a pixel, {PIXEL}", where)
+    wrong = (uv < PIXEL.low) | (uv > PIXEL.high) | np.isnan(uv)
+    _check_column(detections, "uv", ~(wrong[:, 0] | wrong[:, 1]), f"a pixel, {PIXEL}", where)
     good = (sigma >= SIGMA.low) & (sigma <= SIGMA.high)
     _check_column(detections, "sigma", good, f"a standard deviation > 0, {SIGMA}", where)
     known = (radius >= 0) & (radius <= BLOB_RADIUS.high)
