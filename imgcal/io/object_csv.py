@@ -175,7 +175,10 @@ def object_text(obj: CalibrationObject, where: str | Path = "object") -> str:
     """
     if obj.board is not None:
         return board_text(obj)
-    names = obj.fiducial_names
+    names, count = obj.fiducial_names, obj.num_fiducials
+    for what, given in (("names", names), ("labels", obj.labels)):
+        if len(given) not in (0, count):
+            raise InputError(f"{where}: not written: found {len(given)} {what}, expected {count}, or none")
     for row, name in enumerate(names):
         if not _is_name(name) or name in names[:row]:
             raise InputError(f"{where}: not written: found the name {shorten(name)!r}, expected {NAME}")

@@ -127,6 +127,8 @@ def test_names_that_could_not_be_read_again_are_not_written(name: str, tmp_path:
     [
         ({"points": torch.full((8, 3), torch.nan)}, "line 2: x: found nan"),
         ({"radius": torch.full((8,), -1.0)}, r"line 2: radius: found -1\.0"),
+        ({"labels": (1, 2, 3)}, "3 labels, expected 8, or none"),
+        ({"fiducial_names": ("a", "b", "c")}, "3 names, expected 8, or none"),
         ({"labels": (1,) * 8}, "fiducial: found 1 again"),
         ({"scale_tolerance": 0.01}, r"a scale tolerance of 0\.01, for which a file has no place"),
     ],
