@@ -9,6 +9,7 @@ import contextlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NoReturn
 
 import numpy as np
 import torch
@@ -26,11 +27,12 @@ from imgcal.pipeline.late_cameras import find_late_cameras, require_same_moments
 from imgcal.pipeline.learned_measurer import LearnedMeasurer
 from imgcal.pipeline.learned_proposer import LearnedProposer
 from imgcal.pipeline.lights import add_lights, find_lights
+from imgcal.pipeline.partial_labels import name_missing_labels
 from imgcal.pipeline.repeats import Repeats, drop_repeats, hide_repeats, name_repeats
 from imgcal.pipeline.sources import Detector, Frames, as_one, as_unknown_marker, check_frames, find_blobs, make_sight
 from imgcal.pipeline.synchronization import NOTICEABLE, find_unsynchronized
 from imgcal.pipeline.turned_images import require_matching_images
-from imgcal.pipeline.units import UNSOLVABLE, require_solvable, require_units
+from imgcal.pipeline.units import UNSOLVABLE, is_solid, require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior, check_rig
 
 LEAST_USED, MOST_USED = 0.5, 0.75
@@ -99,7 +101,7 @@ def calibrate(
         return _calibrate_lights(detections, repeats, rig, obj, options, found - started)
     if obj.parts and (sight is not None or initializer is not None):
         obj.require_rigid("for detectors and networks that look for a pattern")
-    case = _Case(detections, rig, obj, options, may_be_misread=_is_solid(obj) and sight is None)
+    case = _Case(detections, rig, obj, options, may_be_misread=is_solid(obj) and sight is None)
     if case.may_be_misread and not detections.labelled.any() and lines_of_sight_miss(detections, rig):
         # Identity takes minutes to find nothing in a long capture.
         case.try_conventions(RefusedError("identity: the cameras' lines of sight to the object do not meet"))
@@ -109,7 +111,6 @@ def calibrate(
             labelled = associate(detections, rig, obj, options, progress, sight)
     except RefusedError as error:
         case.explain(error, None)
-        raise
     identified = time.perf_counter()
     try:
         fit = _fit_labels(labelled, detections if sight is None else _given_labels(labelled), case, initializer)
@@ -121,7 +122,6 @@ def calibrate(
                 )
                 return replace(fit, labelled=name_repeats(fit.labelled, repeats), repeats=repeats)
         case.explain(error, labelled)
-        raise
     used, given = len(fit.labelled.used), len(detections.snapshot_names)
     if case.may_be_misread and used < LEAST_USED * given:
         case.try_conventions(RefusedError(f"identity: only {used} of {given} snapshots could be used"))
@@ -134,11 +134,6 @@ def calibrate(
     return replace(fit, labelled=name_repeats(fit.labelled, repeats), seconds=seconds, late=late, repeats=repeats)
 
 
-def _is_solid(obj: CalibrationObject) -> bool:
-    """Tell whether its extent in an image means something; that of a light says nothing, and of a stick little."""
-    return obj.pose_rank == 6 and not obj.parts
-
-
 @dataclass(frozen=True)
 class _Case:
     """What is to be calibrated, and whether images or rig may follow other conventions than ours."""
@@ -149,25 +144,25 @@ class _Case:
     options: PipelineOptions
     may_be_misread: bool
 
-    def explain(self, error: RefusedError, labelled: Associations | None) -> None:
-        """Replace a refusal if a cause can be named: other conventions, units or images, or late cameras.
+    def explain(self, error: RefusedError, labelled: Associations | None) -> NoReturn:
+        """Raise a refusal, with a cause if one can be named: other conventions, units or images, or late cameras.
 
         Args:
             error: the refusal.
             labelled: the labels, where the refusal is not about these.
 
         Raises:
-            RefusedError: with the cause.
+            RefusedError: always.
         """
-        given = (self.detections, self.rig, self.obj)
-        with contextlib.suppress(*UNSOLVABLE):  # what cannot be solved explains nothing
-            if self.may_be_misread:
-                self.try_conventions(error)
-            if _is_solid(self.obj):
-                require_units(error, *given)
-            if labelled is not None:
-                require_matching_images(error, self.detections, labelled, self.rig, self.obj)
-                require_same_moments(error, self.detections, labelled, self.rig, self.obj, self.options)
+        with name_missing_labels(self.detections):
+            with contextlib.suppress(*UNSOLVABLE):  # what cannot be solved explains nothing
+                if self.may_be_misread:
+                    self.try_conventions(error)
+                require_units(error, self.detections, self.rig, self.obj)
+                if labelled is not None:
+                    require_matching_images(error, self.detections, labelled, self.rig, self.obj)
+                    require_same_moments(error, self.detections, labelled, self.rig, self.obj, self.options)
+            raise error
 
     def try_conventions(self, error: RefusedError) -> None:
         """Replace a refusal if images or rig follow other conventions; see `require_conventions`."""
@@ -209,10 +204,14 @@ def _calibrate_lights(
 ) -> Calibration:
     """Calibrate from unknown markers; `detecting`: seconds that detection took."""
     started = time.perf_counter()
-    with require_solvable():
-        lights = find_lights(detections, rig, obj)
-        identified = time.perf_counter()
-        fit = fit_steady(lights.labelled, lights.labelled.detections, rig, obj, options)
+    try:
+        with require_solvable():
+            lights = find_lights(detections, rig, obj)
+            identified = time.perf_counter()
+            fit = fit_steady(lights.labelled, lights.labelled.detections, rig, obj, options)
+    except RefusedError as error:
+        require_units(error, detections, rig, obj)
+        raise
     seconds = {
         "detection": detecting,
         "identity": identified - started,
