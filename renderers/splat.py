@@ -75,6 +75,10 @@ def splat(
     batch, count = uv.shape[:-2], uv.shape[-2]
     images = math.prod(batch)
     _check(uv, colours, compositing, depth)
+    for name, value in (("size", size), ("intensity", intensity), ("visible", visible)):
+        if isinstance(value, Tensor) and not _broadcasts(value.shape, uv.shape[:-1]):
+            expected = f"{tuple(uv.shape[:-1])} or broadcast to it"
+            raise ValueError(f"{name} must have shape {expected}, found {tuple(value.shape)}")
     dtype = uv.dtype if uv.dtype == torch.float64 else torch.float32
     # Autocast would round the profiles to bfloat16, and the gradient of a coordinate with them.
     with torch.autocast(uv.device.type, enabled=False):
@@ -146,10 +150,15 @@ def _over(splats: Splats, reach: float, image_size: tuple[int, int], depth: Tens
     return canvas.images
 
 
+def _broadcasts(shape: torch.Size, to: torch.Size) -> bool:
+    ends = zip(reversed(shape), reversed(to), strict=False)
+    return len(shape) <= len(to) and all(one in (1, other) for one, other in ends)
+
+
 def _check(uv: Tensor, colours: Tensor, compositing: str, depth: Tensor | None) -> None:
     if uv.ndim < 2 or uv.shape[-1] != 2 or not uv.is_floating_point():
         raise ValueError(f"uv must be floating point of shape (*B, N, 2), found {uv.dtype} of shape {tuple(uv.shape)}")
-    if colours.ndim < 2 or colours.shape[-2] != uv.shape[-2]:
+    if colours.ndim < 2 or colours.shape[-2] != uv.shape[-2] or not _broadcasts(colours.shape[:-2], uv.shape[:-2]):
         expected = f"({uv.shape[-2]}, K) or (*B, {uv.shape[-2]}, K)"
         raise ValueError(f"colours must have shape {expected}, found {tuple(colours.shape)}")
     if compositing not in ("add", "over"):

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from imgcal.errors import InputError
 from imgcal.estimation import EstimationOptions
 from imgcal.geometry import RigidTransform, geodesic_angle
 from imgcal.types import CalibrationObject, CameraRig
@@ -83,6 +84,11 @@ class PipelineOptions:
     blind_cameras: bool = False  # accept cameras that saw nothing; they keep their factory values
     after_last_move: bool = False  # if a camera moved during the capture, use the snapshots after that
     start_pose: RigidTransform | None = None  # approximate rig_from_object of the first snapshot, against symmetry
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, int | float) and not value >= 0:
+                raise InputError(f"{name}: found {value}, expected 0 or more")
 
     def of_object(self, obj: CalibrationObject) -> PipelineOptions:
         """Options for an object: a printed board's corners are labelled from the whole board.

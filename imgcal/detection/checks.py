@@ -15,7 +15,7 @@ def check_frame(frame: object, camera: str) -> Frame:
     """Return `frame` as a grey (H, W) image of 8 or 16 bit, also from equal channels; explain why if it is none."""
     if not isinstance(frame, np.ndarray):
         raise InputError(f"camera {camera}: found a {type(frame).__name__}, expected a NumPy array (H, W)")
-    if frame.dtype not in (np.uint8, np.uint16):
+    if frame.dtype.newbyteorder("=") not in (np.uint8, np.uint16):
         raise InputError(f"camera {camera}: found {frame.dtype} grey values, expected uint8 or uint16")
     frame = grey_frame(frame, f"camera {camera}")
     if min(frame.shape) < 16:

@@ -59,6 +59,8 @@ def detect(
         (10, True)
     """
     options = options or DetectionOptions()
+    if not isinstance(frames, Mapping):
+        raise InputError(f"frames: found a {type(frames).__name__}, expected {{camera name: frame or frames}}")
     names = tuple(frames)
     unknown = sorted(set(masks or ()) - set(names))
     if unknown:

@@ -18,8 +18,8 @@ from imgcal.estimation import levenberg_marquardt_cpu
 from imgcal.estimation.linearization import Problem
 from imgcal.estimation.linearization_cpu import linearize_rig
 from imgcal.estimation.map_estimate import EstimationOptions
-from imgcal.geometry import RigidTransform, kernels
-from imgcal.types import CameraRig, Observations
+from imgcal.geometry import RigidTransform, kernels, require_shapes
+from imgcal.types import CameraRig, Observations, check_rig_shapes
 from renderers.compiling import njit
 
 MOST_STEPS = 40
@@ -54,6 +54,7 @@ def fit_pose(
         options: loss and threshold.
 
     Raises:
+        InputError: shapes that do not fit together.
         RefusedError: the observations do not determine the pose.
 
     Examples:
@@ -69,6 +70,10 @@ def fit_pose(
         >>> torch.allclose(found.rig_from_object.translation, there.translation, atol=1e-4)
         True
     """
+    check_rig_shapes(rig)
+    expected = (1, rig.num_cameras, len(points))
+    given = (("seen", observations.seen, expected), ("uv", observations.uv, (*expected, 2)))
+    require_shapes("observations", (*given, ("sigma", observations.sigma, expected)))
     seen = observations.seen.numpy()
     uv = np.ascontiguousarray(np.where(seen[..., None], observations.uv.numpy(), 0.0).swapaxes(-1, -2), np.float64)
     weight = np.where(seen, 1 / np.where(seen, observations.sigma.numpy(), 1.0), 0.0)

@@ -38,7 +38,7 @@ from imgcal.estimation.linearization_cpu import (
     turn_all,
 )
 from imgcal.estimation.robust_losses import LossName, NamedLoss
-from imgcal.geometry import RigidTransform, kernels, lens_codes
+from imgcal.geometry import RigidTransform, kernels, lens_codes, require_shapes
 from imgcal.types import CameraRig
 from renderers.compiling import njit
 from renderers.interpreting import without_machine_code
@@ -82,7 +82,7 @@ def minimize(
         _minimize_all((*shared, *given), *compiled, limits, tolerances)  # type: ignore[call-arg]
     if not own_std.shape[1]:
         state = replace(state, object_offset=None)
-    return Solution(state, blocks.equations(), torch.from_numpy(converged), int(iterations.max()))
+    return Solution(state, blocks.equations(), torch.from_numpy(converged), int(iterations.max(initial=0)))
 
 
 @dataclass(frozen=True)
@@ -328,8 +328,14 @@ def _parts(state: State) -> tuple[Tensor, ...]:
 
 
 def shared_arrays(problem: Problem) -> tuple[np.ndarray | None, ...]:
-    """Inputs of `linearization_cpu` that all rigs of the batch share."""
+    """Inputs of `linearization_cpu` that all rigs of the batch share.
+
+    Raises:
+        InputError: radii of another number of fiducials.
+    """
     points, squared = problem.points, problem.radius_squared
+    if squared is not None:
+        require_shapes("fiducials", [("radius", squared, (len(points),))])
     if problem.part_of is not None:
         points = torch.cat((points, problem.part_of[:, None].to(points)), 1)
     given = _arrays((points, points.new_zeros(len(points)) if squared is None else squared))

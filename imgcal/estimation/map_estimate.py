@@ -19,17 +19,28 @@ from imgcal.estimation.linearization import (
     rig_at,
 )
 from imgcal.estimation.pose_initialization import initial_pose
-from imgcal.estimation.robust_losses import LossName, NamedLoss
+from imgcal.estimation.robust_losses import LOSSES, LossName, NamedLoss
 from imgcal.estimation.shape_modes import ModeEvidence
-from imgcal.geometry import RigidTransform
+from imgcal.geometry import RigidTransform, require_shapes
 from imgcal.messages import brief
-from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior, check_observations
+from imgcal.types import (
+    CalibrationObject,
+    CameraRig,
+    Observations,
+    Range,
+    RigPrior,
+    check_object,
+    check_observations,
+    check_rig,
+    check_rig_shapes,
+)
 
 RESTART_AFTER = 15
 """Steps after which a rig starts over; from factory values within their prior, 6 are usual."""
 COARSER = (3000.0, 300.0, 30.0, 3.0)
 """Factors on the standard deviation of the observations, in stages."""
 COARSE_TOLERANCE = 0.1
+FINITE_STD = Range(0.0, torch.finfo(torch.float64).max, "")
 
 
 @dataclass(frozen=True)
@@ -45,6 +56,16 @@ class EstimationOptions:
     threshold: float = 3.0  # standard deviations, where the loss stops being quadratic
     max_iterations: int = 100  # per attempt; see `minimize`
     tolerance: float = 1e-4  # expected decrease of the cost (half a squared standard deviation) at which to stop
+
+    def __post_init__(self) -> None:
+        if self.loss not in LOSSES:
+            raise InputError(f"loss: found {self.loss!r:.80}, expected one of {', '.join(LOSSES)}")
+        if not self.threshold > 0:
+            raise InputError(f"threshold: found {self.threshold}, expected standard deviations > 0")
+        if not self.max_iterations >= 0:
+            raise InputError(f"max_iterations: found {self.max_iterations}, expected 0 or more")
+        if not self.tolerance >= 0:
+            raise InputError(f"tolerance: found {self.tolerance}, expected a decrease of the cost of 0 or more")
 
 
 @dataclass(frozen=True)
@@ -152,7 +173,8 @@ def estimate(
         The estimate. Check `converged`: a rig that has not converged is returned in its last state.
 
     Raises:
-        InputError: inconsistent shapes; an observed fiducial with a sigma of zero or less.
+        InputError: inconsistent shapes; a rig or prior with implausible values; an observed fiducial whose pixel is
+            not finite, or with a sigma of zero or less.
 
     Examples:
         >>> import imgcal
@@ -167,8 +189,12 @@ def estimate(
         (True, True)
     """
     batch = observations.seen.shape[:-3]
+    check_rig(rig, any_batch=True)
+    check_object(obj)
     problem = make_problem(observations, rig, obj, prior_std)
     check_observations(observations)
+    if not FINITE_STD.holds_all(problem.prior_std):
+        raise InputError("prior_std: found a value below 0 or not finite, expected standard deviations of 0 or more")
     if rig_from_object is None:
         with torch.no_grad():
             rig_from_object = initial_pose(observations, initial_rig or rig, obj)
@@ -288,10 +314,12 @@ def make_problem(
     Raises:
         InputError: the observations do not fit the rig and the object, or have `shake`.
     """
-    cameras, fiducials = observations.seen.shape[-2:]
+    check_rig_shapes(rig)
+    cameras, fiducials = (0, 0, *observations.seen.shape)[-2:]
     if (
         cameras != rig.num_cameras
         or fiducials != obj.num_fiducials
+        or observations.seen.ndim < 3
         or observations.uv.shape != (*observations.seen.shape, 2)
     ):
         raise InputError(
@@ -310,6 +338,7 @@ def make_problem(
     rig, width = rig.to(uv.dtype), rig.num_parameters
     if prior_std is None:
         prior_std = (rig.prior or RigPrior()).std(rig)
+    require_shapes("estimation", [("prior_std", prior_std, (cameras, width))], any_batch=True)
     seen = observations.seen.reshape(count, *observations.seen.shape[-3:])
     uv = uv.reshape(count, *uv.shape[-4:])
     sigma = sigma.expand(observations.seen.shape).reshape(seen.shape)
@@ -344,8 +373,17 @@ def object_prior_std(obj: CalibrationObject) -> Tensor:
 
 
 def initial_state(problem: Problem, rig_from_object: RigidTransform, initial_rig: CameraRig | None) -> State:
-    """Convert a first guess, poses (B, S) in mm and rigs (B) or None, to a state of the problem."""
+    """Convert a first guess, poses (B, S) in mm and rigs (B) or None, to a state of the problem.
+
+    Raises:
+        InputError: poses of another number of snapshots, or a rig whose values do not fit together.
+    """
     count, snapshots = problem.uv.shape[:2]
+    if rig_from_object.translation.shape[-2:-1] != (snapshots,):
+        found = f"poses of shape {tuple(rig_from_object.translation.shape[:-1])}"
+        raise InputError(f"rig_from_object: found {found}, expected (..., {snapshots}), one for each snapshot")
+    if initial_rig is not None:
+        check_rig_shapes(initial_rig)
     rotation = rig_from_object.rotation.detach().to(problem.uv).reshape(count, snapshots, 3, 3)
     translation = rig_from_object.translation.detach().to(problem.uv).reshape(count, snapshots, 3)
     offset = torch.zeros_like(problem.prior_std)

@@ -48,7 +48,7 @@ def initial_pose(observations: Observations, rig: CameraRig, obj: CalibrationObj
     """Estimate the object's pose with a fixed rig.
 
     Args:
-        observations: (*B, S, C, N); each snapshot must determine the object's pose.
+        observations: (*B, S, C, N). The pose of a snapshot that does not determine it is arbitrary, but finite.
         rig: (*B) or without batch axes.
         obj: N fiducials, planar or not.
 
@@ -129,8 +129,9 @@ def _quadratic_form(rays: Tensor, origins: Tensor, seen: Tensor, points: Tensor)
     slope = torch.einsum("pnij,na->pija", across, points).flatten(-2)  # (P, 3, 9)
     matrix = torch.einsum("pnij,na,nb->piajb", across, points, points).flatten(-2).flatten(1, 2)
     linear = torch.einsum("pni,na->pia", pulled, points).flatten(-2)
-    # A single ray leaves the translation along it undetermined; slight regularization keeps the solution finite.
-    total = total + 1e-9 * total.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * eye
+    # A single ray leaves the translation along it undetermined, and none leaves all of it; slight regularization keeps
+    # the solution finite. The trace is two for each ray.
+    total = total + 1e-9 * total.diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(2.0)[:, None, None] * eye
     solved = torch.linalg.solve(total, torch.cat((slope, pulled.sum(1)[..., None]), dim=-1))
     translation_slope, constant = solved[..., :9], solved[..., 9]
     return _QuadraticForm(

@@ -76,7 +76,11 @@ def convert_rig(
             f"--to {to}: {target.title} holds {count} cameras, found {len(rig.cameras)}: choose with --cameras"
         )
     held = fit_to_target(rig, target.holds, target.title, limit)
-    notes = ["standard deviations are left out: the format has no place for them"] if rig.covariance is not None else []
+    notes: list[str] = []
+    if rig.covariance is not None:
+        notes.append("standard deviations are left out: the format has no place for them")
+    if rig.own is not None and rig.own.posterior is not None:
+        notes.append("the posterior of the calibration is left out: the format has no place for it")
     files_unit = unit or target.unit
     if unit is not None and target.states_unit and millimetres(unit) != millimetres(target.unit):
         raise InputError(f"--out-unit {unit}: {target.title} is always in {target.unit}")

@@ -9,6 +9,7 @@ from .lenses import (
     lens_label,
     lens_names,
     lens_width,
+    require_lenses,
     undistort,
 )
 from .object_turns import free_turns, pose_rank
@@ -25,6 +26,7 @@ from .rotations import (
     sixd_from_rotation,
     vector_from_rotation,
 )
+from .shapes import require_shapes
 from .transforms import Join, RigidTransform, rotate
 
 __all__ = [
@@ -53,6 +55,8 @@ __all__ = [
     "project_components",
     "project_cpu",
     "project_kornia",
+    "require_lenses",
+    "require_shapes",
     "resized_pixels",
     "rotate",
     "rotation_from_6d",

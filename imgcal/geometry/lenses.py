@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from imgcal.errors import InputError
 from imgcal.geometry.brown_conrady import BROWN_CONRADY
 from imgcal.geometry.equidistant import EQUIDISTANT
 from imgcal.geometry.lens_model import LensModel
@@ -57,11 +58,37 @@ def lens_codes(models: ModelNames, cameras: int, width: int) -> NDArray[np.int64
     """Index of each camera's model in `LENS_MODELS`, for compiled functions: (C,), not to be modified.
 
     None if all are of the default model, and their coefficients (C, D) no wider than it needs.
+
+    Raises:
+        InputError: an unknown model, models of another number of cameras, or fewer coefficients than a model has.
     """
-    if {*lens_names(models, cameras)} <= {DEFAULT} and width == len(LENS_MODELS[DEFAULT].coefficients):
+    names = lens_names(models, cameras)
+    require_lenses("lenses", names, cameras, width)
+    if {*names} <= {DEFAULT} and width == len(LENS_MODELS[DEFAULT].coefficients):
         return None
     order = list(LENS_MODELS)
-    return np.array([order.index(name) for name in lens_names(models, cameras)], dtype=np.int64)
+    return np.array([order.index(name) for name in names], dtype=np.int64)
+
+
+def require_lenses(where: str, names: Sequence[str], cameras: int, width: int) -> None:
+    """Check the names of the cameras' lens models, and the width D of their coefficients.
+
+    Args:
+        where: what they belong to, for the message.
+        names: of each camera's lens model.
+        cameras: C.
+        width: D.
+
+    Raises:
+        InputError: an unknown model, models of another number of cameras, or fewer coefficients than a model has.
+    """
+    unknown = [name for name in names if name not in LENS_MODELS]
+    if unknown or len(names) != cameras:
+        found = f"the lens model {unknown[0]}" if unknown else f"{len(names)} lens models for {cameras} cameras"
+        raise InputError(f"{where}: found {found}, expected {', '.join(LENS_MODELS)} for all cameras or each")
+    for name in dict.fromkeys(names):
+        if width < (needed := len(LENS_MODELS[name].coefficients)):
+            raise InputError(f"{where}: found distortion of width {width}, expected {needed} for {name}")
 
 
 def distort(x: Tensor, y: Tensor, distortion: Tensor, models: ModelNames = DEFAULT) -> Components:

@@ -15,13 +15,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from imgcal.errors import InputError
 from imgcal.geometry import kernels
 from imgcal.geometry.lens_kernels import CompiledLens, as_tuple, chain_models, compile_as, compile_each_lens
 from imgcal.geometry.lens_model import Formula
 from imgcal.geometry.lenses import DEFAULT, ModelNames, lens_codes
 from imgcal.geometry.projection import NEAREST_DEPTH, Projection
+from imgcal.geometry.shapes import require_shapes
 from imgcal.geometry.transforms import RigidTransform
 from renderers.compiling import njit
+
+STEPS = 25
+"""Most steps of Newton's method on the inverse of a lens."""
 
 
 def project_cpu(
@@ -45,6 +50,9 @@ def project_cpu(
         image_size: (C, 2) pixels, width and height.
         radius: (N,) mm of spherical fiducials; None = points.
         models: lens model of all cameras, or of each.
+
+    Raises:
+        InputError: shapes that do not fit together.
     """
     given = (cam_from_rig.rotation, cam_from_rig.translation, focal_length, principal_point, distortion)
     # NumPy's calls take half the time of PyTorch's, and its large arrays ask Linux for huge pages.
@@ -52,14 +60,38 @@ def project_cpu(
     batch, fiducials, kind = points.shape[:-2], points.shape[-1], points.dtype
     count = math.prod(batch)
     radius_squared = np.zeros(fiducials, kind) if radius is None else radius.detach().numpy().astype(kind) ** 2
-    image = np.empty((count, focal_length.shape[-2], 4, fiducials), kind)  # u, v, depth, visible
     arrays = [np.ascontiguousarray(tensor.detach().numpy()) for tensor in given]
-    points, *arrays = (array.reshape(count, *array.shape[len(batch) :]) for array in (points, *arrays))
     sizes = np.ascontiguousarray(image_size.numpy())
-    project_arrays(lens_codes(models, *distortion.shape[-2:]), (points, radius_squared, *arrays, sizes, image))
+    cameras, width = _require_fit(points, radius_squared, arrays, sizes)
+    image = np.empty((count, cameras, 4, fiducials), kind)  # u, v, depth, visible
+    points, *arrays = (array.reshape(count, *array.shape[len(batch) :]) for array in (points, *arrays))
+    project_arrays(lens_codes(models, cameras, width), (points, radius_squared, *arrays, sizes, image))
     image = image.reshape(*batch, *image.shape[1:])
     uv, depth, visible = image[..., :2, :].swapaxes(-1, -2), image[..., 2, :], image[..., 3, :] > 0
     return Projection(torch.from_numpy(uv), torch.from_numpy(depth), torch.from_numpy(visible))
+
+
+def _require_fit(points, radius, arrays, sizes):
+    """Number of cameras and width of the distortion, if the arrays of `project_cpu` have the shapes that follow."""
+    *batch, axes, fiducials = points.shape
+    if axes != 3 or points.dtype.kind != "f":
+        found = f"points of shape {(*batch, fiducials, axes)} and type {points.dtype}"
+        raise InputError(f"projection: found {found}, expected three real coordinates (mm) each")
+    rotation, translation, focal_length, principal_point, distortion = arrays
+    batch, cameras, width = tuple(batch), rotation.shape[-3], distortion.shape[-1]
+    require_shapes(
+        "projection",
+        (
+            ("rotation", rotation, (*batch, cameras, 3, 3)),
+            ("translation", translation, (*batch, cameras, 3)),
+            ("focal_length", focal_length, (*batch, cameras, 2)),
+            ("principal_point", principal_point, (*batch, cameras, 2)),
+            ("distortion", distortion, (*batch, cameras, width)),
+            ("image_size", sizes, (cameras, 2)),
+            ("radius", radius, (fiducials,)),
+        ),
+    )
+    return cameras, width
 
 
 def _projection(lens: CompiledLens, size: int) -> Formula:
@@ -114,15 +146,27 @@ def project_arrays(models, given):
 
 
 def undistort_cpu(xy_distorted: Tensor, distortion: Tensor, models: ModelNames = DEFAULT) -> tuple[Tensor, Tensor]:
-    """Undistort like `lenses.undistort`, for tensors on the CPU: without gradients, until it converges.
+    """Undistort like `lenses.undistort`, for tensors on the CPU: without gradients, in as many steps as it takes.
+
+    At most `STEPS`: near the edge of a lens that magnifies it many times, the start is too far off.
 
     Args:
         xy_distorted: (*B, C, N, 2) distorted coordinates on the z = 1 plane.
         distortion: (*B, C, D).
         models: lens model of all cameras, or of each.
+
+    Raises:
+        InputError: shapes that do not fit together.
     """
     cameras, points = xy_distorted.shape[-3:-1]
     width = distortion.shape[-1]
+    require_shapes(
+        "undistortion",
+        (
+            ("points", xy_distorted, (*xy_distorted.shape[:-1], 2)),
+            ("distortion", distortion, (*distortion.shape[:-2], cameras, width)),
+        ),
+    )
     distorted = xy_distorted.detach().double().reshape(-1, cameras, points, 2).contiguous().numpy()
     lenses = distortion.detach().double().expand(*xy_distorted.shape[:-2], width).reshape(-1, cameras, width)
     xy, good = np.empty_like(distorted), np.empty(distorted.shape[:-1], dtype=np.bool_)
@@ -147,11 +191,11 @@ def _inverse(lens: CompiledLens, size: int) -> Formula:
                     xd, yd = distorted[b, c, n, 0], distorted[b, c, n, 1]
                     x, y = start(xd, yd, k)
                     error, rr, slope = np.inf, 0.0, 1.0
-                    for _ in range(9):
+                    for _ in range(STEPS):
                         ux, uy, jxx, jxy, jyy, rr, slope = distort(1.0, x, y, k)
                         ex, ey = ux - xd, uy - yd
-                        error = max(abs(ex), abs(ey))
-                        if error < 4 * np.finfo(np.float64).eps:
+                        last, error = error, max(abs(ex), abs(ey))
+                        if error < 4 * np.finfo(np.float64).eps or last <= error < rounding:
                             break
                         determinant = jxx * jyy - jxy * jxy
                         x, y = x - (jyy * ex - jxy * ey) / determinant, y - (jxx * ey - jxy * ex) / determinant

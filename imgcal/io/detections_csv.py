@@ -25,7 +25,7 @@ from imgcal.io.atomic import replacing
 from imgcal.io.csv_file import Chunk, fail_row, read_chunks
 from imgcal.io.names import is_file_name, nearest, require_left_out
 from imgcal.messages import list_names, shorten
-from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections, limits
+from imgcal.types import BlobFlag, CalibrationObject, CameraRig, Detections, check_rig, limits
 
 REQUIRED = ("snapshot", "camera", "u", "v")
 OPTIONAL = ("sigma", "fiducial", "object", "radius", "flags")
@@ -45,7 +45,7 @@ MARGIN = 5.0  # pixels outside the image that are still taken: centres of cut di
 def load_detections(
     path: str | Path,
     rig: CameraRig | None = None,
-    fiducials: Fiducials | None = None,
+    fiducials: Fiducials | CalibrationObject | None = None,
     without: Collection[str] = (),
 ) -> Detections:
     r"""Read detections; a million rows take a few seconds.
@@ -53,8 +53,8 @@ def load_detections(
     Args:
         path: CSV file, with or without gzip compression.
         rig: gives the cameras and their order, and the image sizes that are checked; None = cameras in file order.
-        fiducials: number of points of the object, the limit of the column `fiducial`; or what that calls them, in the
-            order of the object; None = not checked. It is `CalibrationObject.rows`.
+        fiducials: the object; or its number of points, the limit of the column `fiducial`; or what that calls them, in
+            the order of the object (`CalibrationObject.rows`); None = not checked.
         without: cameras that the rig does not have, whose rows are left out.
 
     Returns:
@@ -73,6 +73,10 @@ def load_detections(
         (('cam01', 'cam02'), array([100.5 ,  50.25]), array([-1, -1]))
     """
     path = Path(path)
+    if rig is not None:
+        check_rig(rig)
+    if isinstance(fiducials, CalibrationObject):
+        fiducials = fiducials.rows
     cameras = {} if rig is None else {name: index for index, name in enumerate(rig.camera_names)}
     known_cameras = None if rig is None else rig.camera_names
     if known_cameras is not None:
@@ -122,7 +126,7 @@ def save_detections(detections: Detections, path: str | Path, obj: CalibrationOb
             (`CalibrationObject.of_several`) add the column `object`. None = labels are written as rows.
 
     Raises:
-        InputError: the file cannot be written, or a name could not be read again.
+        InputError: the file cannot be written; or there is no blob, or a name or value that could not be read again.
 
     Examples:
         >>> import torch, imgcal
@@ -134,6 +138,9 @@ def save_detections(detections: Detections, path: str | Path, obj: CalibrationOb
         True
     """
     path = Path(path)
+    if not len(detections):
+        raise InputError(f"{path}: not written: found no blob in any camera, expected at least one")
+    limits.check_detections(detections, f"{path}: not written")
     for name in (*detections.camera_names, *detections.snapshot_names):
         if not is_file_name(name):
             raise InputError(f"{path}: not written: found {shorten(name)!r}, expected a name that can be a file name")

@@ -236,7 +236,7 @@ class Video:
 
 
 def grey_frame(image: NDArray[Any], where: str, tolerance: float = LOSSY_TOLERANCE) -> Frame:
-    """Take the one channel of a grey image; an image in true colours is rejected.
+    """Take the one channel of a grey image, in this machine's byte order; an image in true colours is rejected.
 
     Args:
         image: (H, W), (H, W, 1), (H, W, 3) or, where it is opaque, (H, W, 4); uint8 or uint16.
@@ -244,13 +244,17 @@ def grey_frame(image: NDArray[Any], where: str, tolerance: float = LOSSY_TOLERAN
         tolerance: grey levels by which channels may differ: lossy compression tears them apart.
 
     Raises:
-        InputError: true colours, transparency, another type or shape.
+        InputError: true colours, transparency, masked pixels, another type or shape.
 
     Examples:
         >>> grey = np.arange(12, dtype=np.uint8).reshape(3, 4)
         >>> bool((grey_frame(np.stack([grey] * 3, axis=-1), "camera left") == grey).all())
         True
     """
+    if not image.dtype.isnative:
+        image = image.astype(image.dtype.newbyteorder("="))
+    if np.ma.is_masked(image):
+        raise InputError(f"{where}: found a masked array, expected a plain one, and known reflections in `masks`")
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{where}: found pixels of type {image.dtype}, expected 8 or 16 bit whole numbers")
     if image.ndim == 2:

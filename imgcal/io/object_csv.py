@@ -149,7 +149,8 @@ def save_object(obj: CalibrationObject, path: str | Path) -> None:
     """Write a calibration object in one step; every number in its shortest exact form.
 
     Raises:
-        InputError: the file cannot be written, or a name could not be read again.
+        InputError: the file cannot be written; or the object has something that a file has no place for (a scale
+            tolerance, several objects), or that could not be read again.
 
     Examples:
         >>> import imgcal
@@ -157,18 +158,27 @@ def save_object(obj: CalibrationObject, path: str | Path) -> None:
         >>> imgcal.load_object("mine.csv").name
         'mine'
     """
-    write_text(path, object_text(obj, path))
+    where = f"{path}: not written"
+    if obj.parts or obj.scale_tolerance:
+        found = "several objects" if obj.parts else f"a scale tolerance of {obj.scale_tolerance:g}"
+        raise InputError(f"{where}: found {found}, for which a file has no place")
+    text = object_text(obj, path)
+    object_from_text(text, where)  # raises what reading it again would
+    write_text(path, text)
 
 
 def object_text(obj: CalibrationObject, where: str | Path = "object") -> str:
-    """Make the text that `save_object` writes; errors begin with `where`.
+    """Make the text that `save_object` writes, which leaves out a scale tolerance; errors begin with `where`.
 
     Raises:
         InputError: the name of a fiducial could not be read again, or is not unique.
     """
     if obj.board is not None:
         return board_text(obj)
-    names = obj.fiducial_names
+    names, count = obj.fiducial_names, obj.num_fiducials
+    for what, given in (("names", names), ("labels", obj.labels)):
+        if len(given) not in (0, count):
+            raise InputError(f"{where}: not written: found {len(given)} {what}, expected {count}, or none")
     for row, name in enumerate(names):
         if not _is_name(name) or name in names[:row]:
             raise InputError(f"{where}: not written: found the name {shorten(name)!r}, expected {NAME}")

@@ -24,7 +24,7 @@ from imgcal.estimation import (
 from imgcal.geometry import RigidTransform, pose_rank
 from imgcal.nn.buffers import ObjectBuffers, RigBuffers
 from imgcal.nn.pytrees import register
-from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
+from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior, check_rig
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,9 @@ class MapEstimate(nn.Module):
         prior_std: (*B, C, K) standard deviation of each factory value in the order of `CameraRig.parameter_names`; zero
             keeps a value fixed; None = the rig's own prior.
         options: how to minimize.
+
+    Raises:
+        InputError: a rig or a prior with implausible values, or shapes that do not fit together.
 
     Shape:
         - observations: uv (*B, S, C, N, 2) pixels, sigma (*B, S, C, N) pixels, seen (*B, S, C, N).
@@ -92,6 +95,7 @@ class MapEstimate(nn.Module):
         options: EstimationOptions = EstimationOptions(),
     ) -> None:
         super().__init__()
+        check_rig(factory, any_batch=True)
         self.factory, self.obj = RigBuffers(factory), ObjectBuffers(obj)
         prior_std = (factory.prior or RigPrior()).std(factory) if prior_std is None else prior_std
         self.register_buffer("prior_std", prior_std.clone(), persistent=False)

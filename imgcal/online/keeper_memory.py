@@ -94,9 +94,11 @@ class KeeperMemory:
         Raises:
             InputError: the rig or the object is invalid, or the object's fiducials are collinear.
         """
+        check_rig(rig)
+        if drift is not None:
+            check_rig(replace(rig, drift_rate=drift))
         if not obj.unknown_markers:
             obj.require_rigid("for a running rig")
-        check_rig(rig)
         check_object(obj)
         rig = rig.to(torch.float64)
         calibration, rig = None if horizon is not None else calibration_posterior(rig), replace(rig, posterior=None)

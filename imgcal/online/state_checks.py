@@ -25,23 +25,7 @@ def _require(right: bool, found: str) -> None:
         raise ValueError(f"found {found}")
 
 
-def _check_rig(rig: CameraRig) -> None:
-    count = len(rig.camera_names)
-    shapes = {
-        "focal_length": (count, 2), "principal_point": (count, 2), "image_size": (count, 2),
-        "distortion": (count, rig.distortion.shape[-1]),
-    }  # fmt: skip
-    for name, shape in shapes.items():
-        _require(tuple(getattr(rig, name).shape) == shape, f"{name} of other cameras than {count}")
-    _require(tuple(rig.cam_from_rig.translation.shape) == (count, 3), f"places of other cameras than {count}")
-    check_rig(rig)
-
-
 def _check_object(obj: CalibrationObject) -> None:
-    _require(obj.points.ndim == 2 and obj.points.shape[1] == 3, "points of no object")
-    for name in ("radius", "tolerance"):
-        value = getattr(obj, name)
-        _require(value is None or tuple(value.shape) == (obj.num_fiducials,), f"{name} of other fiducials")
     _require(sum(part.num_fiducials for part in obj.each) == obj.num_fiducials, "parts of another object")
     check_object(obj)
 
@@ -82,7 +66,7 @@ def _check_detections(blobs: Detections) -> None:
 
 
 CHECKS: dict[type, Callable[[Any], None]] = {
-    CameraRig: _check_rig,
+    CameraRig: check_rig,
     CalibrationObject: _check_object,
     RigidTransform: _check_transform,
     RigBelief: _check_belief,

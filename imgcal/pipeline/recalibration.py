@@ -33,7 +33,7 @@ from imgcal.pipeline.sources import Detector, Frames, as_one, as_unknown_marker,
 from imgcal.pipeline.synchronization import NOTICEABLE, find_unsynchronized
 from imgcal.pipeline.turned_images import require_matching_images
 from imgcal.pipeline.units import UNSOLVABLE, is_solid, require_solvable, require_units
-from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
+from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior, check_rig
 
 LEAST_USED, MOST_USED = 0.5, 0.75
 """Share of the snapshots below which images or rig may follow other conventions, and of those tried for one to fit."""
@@ -73,7 +73,8 @@ def calibrate(
 
     Raises:
         RefusedError: the data are not sufficient; the message says why.
-        InputError: the data do not belong to this rig or object: other cameras, frames of another size.
+        InputError: the rig or the object is invalid, or the data do not belong to them: other cameras, frames of
+            another size.
 
     Examples:
         >>> import torch, imgcal
@@ -84,6 +85,7 @@ def calibrate(
         >>> result.identity, result.rig.camera_names == factory.camera_names
         ('coded', True)
     """
+    check_rig(rig)
     obj = as_one(obj)
     started, rig, options = time.perf_counter(), rig.to(torch.float64), options.of_object(obj)
     source = source if isinstance(source, Detections) else check_frames(source, rig)

@@ -24,7 +24,7 @@ from imgcal.pipeline.lights import FoundLights, find_lights
 from imgcal.pipeline.partial_labels import name_missing_labels
 from imgcal.pipeline.sources import Frames, as_one, as_unknown_marker, find_blobs
 from imgcal.pipeline.units import require_solvable, require_units
-from imgcal.types import CalibrationObject, CameraRig, Detections
+from imgcal.types import CalibrationObject, CameraRig, Detections, check_rig
 
 OUTLYING = 10.0
 """Multiple of the median distance; noise alone exceeds it once in 10^30."""
@@ -100,7 +100,8 @@ def score(
 
     Raises:
         RefusedError: no snapshot could be identified, or no pose fits most of them.
-        InputError: the data do not belong to this rig or object: other cameras, frames of another size.
+        InputError: the rig or the object is invalid, or the data do not belong to them: other cameras, frames of
+            another size.
 
     Examples:
         >>> import torch, imgcal
@@ -113,6 +114,7 @@ def score(
         >>> float(imgcal.score(blobs, factory, obj).distances.mean()) > 5
         True
     """
+    check_rig(rig)
     obj = as_one(obj)
     rig, options = rig.to(torch.float64), options.of_object(obj)
     detections = settle_labels(find_blobs(source, rig, obj, detection), rig, obj)

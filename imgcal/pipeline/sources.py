@@ -6,7 +6,7 @@ Files are checked line by line on reading; this is the same for values in memory
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from imgcal.matching import MatchedFilter
 from imgcal.messages import list_names
 from imgcal.pipeline.learned_measurer import LearnedMeasurer
 from imgcal.pipeline.learned_proposer import LearnedProposer, load_proposer
-from imgcal.types import BLOB_RADIUS, SIGMA, CalibrationObject, CameraRig, Detections
+from imgcal.types import CalibrationObject, CameraRig, Detections, limits
 
 Frames = Mapping[str, Frame | Sequence[Frame | None] | None]
 DETECTORS = ("classical", "matched", "auto", "learned", "both")
@@ -29,8 +29,6 @@ Detector = DetectorName | Proposer | Sight
 """What finds the fiducials in frames: blobs (classical), a matched filter, or the filter if blobs are not sufficient
 (auto); a network, or the network if blobs are not sufficient (both); another proposer of labels; or one of them with
 frames that are not in memory. Blobs decide if the others cannot."""
-ROWS = tuple(field.name for field in fields(Detections) if not field.name.endswith("_names"))
-WHOLE = ("camera", "snapshot", "fiducial", "flags")
 
 
 def as_unknown_marker(obj: CalibrationObject, detections: Detections) -> CalibrationObject:
@@ -40,8 +38,17 @@ def as_unknown_marker(obj: CalibrationObject, detections: Detections) -> Calibra
 
 
 def as_one(obj: CalibrationObject | Sequence[CalibrationObject]) -> CalibrationObject:
-    """One object, or several combined."""
-    return obj if isinstance(obj, CalibrationObject) else CalibrationObject.of_several(obj)
+    """One object, or several combined.
+
+    Raises:
+        InputError: something else.
+    """
+    if isinstance(obj, CalibrationObject):
+        return obj
+    if isinstance(obj, str) or not all(isinstance(part, CalibrationObject) for part in obj):
+        found = repr(obj) if isinstance(obj, str) else f"a {type(obj).__name__} of other things"
+        raise InputError(f"object: found {found:.80}, expected a CalibrationObject; load_object(...) reads one")
+    return CalibrationObject.of_several(obj)
 
 
 def find_blobs(
@@ -159,7 +166,7 @@ def _check_frame(frame: Any, camera: str, width: int, height: int, rig: CameraRi
     """Check the size of a frame; detection explains other faults."""
     if not isinstance(frame, np.ndarray):
         return frame
-    if frame.ndim == 3:
+    if frame.ndim == 3 or not frame.dtype.isnative or np.ma.is_masked(frame):
         frame = grey_frame(frame, f"camera {camera}")
     if frame.ndim == 2 and frame.shape != (height, width):
         raise InputError(
@@ -178,51 +185,19 @@ def check_detections(detections: Detections, rig: CameraRig, obj: CalibrationObj
         InputError: inconsistent columns, a camera, fiducial or pixel that does not exist, a fiducial that a camera has
             twice in a snapshot, an invalid standard deviation, or several cameras that share no snapshot.
     """
-    count = np.shape(detections.uv)[:1]
-    for name in ROWS:
-        column, expected = getattr(detections, name), (*count, 2) if name == "uv" else count
-        if not isinstance(column, np.ndarray) or column.shape != expected:
-            found = f"an array of shape {column.shape}" if isinstance(column, np.ndarray) else type(column).__name__
-            raise InputError(f"detections: {name}: found {found}, expected a NumPy array of shape {expected}")
-    for name in WHOLE:
-        kind = getattr(detections, name).dtype
-        if not np.issubdtype(kind, np.integer):
-            raise InputError(f"detections: {name}: found an array of {kind}, expected integers")
     if obj.unknown_markers:
-        detections = replace(detections, fiducial=np.full(count, -1))
+        detections = replace(detections, fiducial=np.full(np.shape(detections.uv)[:1], -1))
     elif obj.has_lights:
         nameless = detections.fiducial == obj.num_fiducials - 1
         detections = replace(detections, fiducial=np.where(nameless, -1, detections.fiducial))
-    for name, end in (("camera", len(detections.camera_names)), ("snapshot", len(detections.snapshot_names))):
-        _require(
-            detections, name, (getattr(detections, name) >= 0) & (getattr(detections, name) < end), f"0 to {end - 1}"
-        )
-    _require(
-        detections,
-        "fiducial",
-        detections.fiducial < obj.num_fiducials,
-        f"a row of the object, 0 to {obj.num_fiducials - 1}, or -1",
-    )
-    row = detections.find_repeated_label()
-    if row is not None:
-        camera = detections.camera_names[detections.camera[row]]
-        snapshot = detections.snapshot_names[detections.snapshot[row]]
+    limits.check_detections(detections)
+    beyond = detections.fiducial >= obj.num_fiducials
+    if beyond.any():
+        row = int(beyond.argmax())
         raise InputError(
-            f"detections: fiducial: found {detections.fiducial[row]} again in row {row} for camera {camera} in "
-            f"snapshot {snapshot}, expected it once"
+            f"detections: fiducial: found {detections.fiducial[row]} in row {row}, expected a row of the object, 0 to "
+            f"{obj.num_fiducials - 1}, or -1"
         )
-    _require(
-        detections,
-        "sigma",
-        (detections.sigma >= SIGMA.low) & (detections.sigma <= SIGMA.high),
-        f"a standard deviation > 0, {SIGMA}",
-    )
-    _require(
-        detections,
-        "radius",
-        np.isnan(detections.radius) | ((detections.radius >= 0) & (detections.radius <= BLOB_RADIUS.high)),
-        f"a radius, {BLOB_RADIUS}, or nan",
-    )
     detections = match_to_rig(detections, rig)
     size = rig.image_size.numpy()[detections.camera]
     inside = ((detections.uv >= -0.5 - MARGIN) & (detections.uv <= size - 0.5 + MARGIN)).all(axis=1)
@@ -254,10 +229,3 @@ def _require_shared_snapshot(detections: Detections) -> None:
         f"detections: found no snapshot in which two cameras have blobs ({'; '.join(names)}), expected what cameras "
         "see at one moment in snapshots of one name"
     )
-
-
-def _require(detections: Detections, column: str, good: np.ndarray, expected: str) -> None:
-    if not good.all():
-        row = int(good.argmin())
-        found = getattr(detections, column)[row]
-        raise InputError(f"detections: {column}: found {found} in row {row}, expected {expected}")

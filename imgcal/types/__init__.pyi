@@ -3,7 +3,19 @@ from .board import Board, BoardKind
 from .calibration_object import MOST_LIGHTS, CalibrationObject, Symmetry
 from .detections import UNUSABLE, BlobFlag, BlobKind, Detections
 from .differences import object_difference, rig_difference
-from .limits import BLOB_RADIUS, FIDUCIAL_RADIUS, MOST_PIXELS, SIGMA, Range, check_object, check_observations, check_rig
+from .limits import (
+    BLOB_RADIUS,
+    FIDUCIAL_RADIUS,
+    MOST_PIXELS,
+    SIGMA,
+    Range,
+    check_detections,
+    check_object,
+    check_observations,
+    check_rig,
+    check_rig_shapes,
+    find_repeated,
+)
 from .moved_camera import Kind, MovedCamera, MovedError
 from .observations import Observations
 from .parameter_vectors import pack21, unpack18, unpack21
@@ -58,9 +70,12 @@ __all__ = [
     "RigPrior",
     "Symmetry",
     "Views",
+    "check_detections",
     "check_object",
     "check_observations",
     "check_rig",
+    "check_rig_shapes",
+    "find_repeated",
     "limits",
     "object_difference",
     "pack21",

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.errors import InputError
-from imgcal.geometry import pose_rank
+from imgcal.geometry import pose_rank, require_shapes
 from imgcal.types.board import Board
 
 ANY_LABEL = 1_000_000
@@ -70,11 +70,14 @@ class CalibrationObject:
         return f"CalibrationObject({self.name!r}: {len(self.points)} fiducials{exact})"
 
     def __post_init__(self) -> None:
+        if not isinstance(self.points, Tensor):
+            raise InputError(f"object {self.name}: found points in a {type(self.points).__name__}, expected a tensor")
         if self.points.ndim != 2 or self.points.shape[1] != 3 or len(self.points) < 1:
             raise InputError(
                 f"object {self.name}: found points of shape {tuple(self.points.shape)}, expected (N >= 1, 3)"
             )
-
+        if self.radius is not None:
+            require_shapes(f"object {self.name}", [("radius", self.radius, (len(self.points),))])
         if self.tolerance is not None and (
             self.tolerance.shape != (len(self.points),)
             or not bool(((self.tolerance >= 0) & self.tolerance.isfinite()).all())

@@ -276,7 +276,7 @@ class CameraRig:
             radius: (N,) mm of spherical fiducials; None = points.
 
         Raises:
-            InputError: the points have other batch axes than the rigs.
+            InputError: the points have other batch axes than the rigs, or shapes do not fit together.
         """
         if points_rig.shape[:-2] != self.batch_shape:
             expected = ", ".join(map(str, (*self.batch_shape, "N", 3)))

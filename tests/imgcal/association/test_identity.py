@@ -1,5 +1,6 @@
 """Only given information decides the orientation of a symmetric object."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -125,3 +126,9 @@ def test_a_start_pose_in_single_precision_is_accepted(o10, cube):
     assert isinstance(blobs, Detections)
     options = PipelineOptions(start_pose=pose.to(torch.float32))
     assert associate(blobs, o10, cube, options).identity == "by_prior"
+
+
+def test_options_out_of_range_are_input_errors() -> None:
+    for name, value in (("identity_error", math.nan), ("outlier", -1.0)):
+        with pytest.raises(InputError, match=name):
+            PipelineOptions(**{name: value})

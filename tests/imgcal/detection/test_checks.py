@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from imgcal.detection import detect
 from imgcal.detection.checks import check_frame, check_mask, full_scale
 from imgcal.errors import InputError
 
@@ -11,12 +12,28 @@ from imgcal.errors import InputError
         ([[1, 2]], "found a list, expected a NumPy array"),
         (np.zeros((20, 20, 2), np.uint8), r"frame of shape \(20, 20, 2\), expected grey"),
         (np.zeros((20, 20), np.float32), "found float32 grey values"),
+        (np.ma.masked_equal(np.zeros((20, 20), np.uint8), 0), "found a masked array"),
         (np.zeros((15, 200), np.uint8), "frame of 200 x 15, expected at least 16 x 16"),
     ],
 )
 def test_frames_that_cannot_be_are_named(frame, message) -> None:
     with pytest.raises(InputError, match=f"camera left: .*{message}"):
         check_frame(frame, "left")
+
+
+@pytest.mark.parametrize("order", ["<u2", ">u2"])
+def test_frames_of_any_byte_order_are_taken(order: str) -> None:
+    frame = np.arange(400, dtype=np.uint16).reshape(20, 20)
+    for given in (frame.astype(order), np.repeat(frame[..., None], 3, -1).astype(order)):
+        found = check_frame(given, "left")
+        assert found.dtype == np.uint16 and np.array_equal(found, frame)
+
+
+def test_what_is_no_mapping_of_frames_is_named() -> None:
+    frame = np.zeros((20, 20), np.uint8)
+    for given in (frame, [frame]):
+        with pytest.raises(InputError, match=r"frames: found a .*, expected \{camera name"):
+            detect(given)
 
 
 def test_frames_are_taken_as_they_are_and_masks_as_bits() -> None:

@@ -1,10 +1,12 @@
 """The object's pose by a rig that is held, against the estimate with a prior of no width."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 import imgcal
-from imgcal.errors import RefusedError
+from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import EstimationOptions, estimate, fit_pose
 from imgcal.geometry import RigidTransform
 from imgcal.synthesis import PhysicalDrift, simulate_truth
@@ -42,3 +44,19 @@ def test_too_few_labels_are_refused() -> None:
     there = RigidTransform.identity(dtype=torch.float64).reshape(1)
     with pytest.raises(RefusedError, match="do not determine"):
         fit_pose(nothing, factory, obj.points, None, there)
+
+
+def test_shapes_that_do_not_fit_are_refused() -> None:
+    rig, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    seen = Observations(
+        torch.zeros(1, 4, 8, 2).double(), torch.ones(1, 4, 8).double(), torch.ones(1, 4, 8, dtype=torch.bool)
+    )
+    guess = RigidTransform.identity(1, dtype=torch.float64)
+    for points, radius, other in (
+        (obj.points[:5], None, rig),
+        (obj.points, torch.ones(1).double(), rig),
+        (obj.points, None, rig.select([0, 1])),
+        (obj.points, None, replace(rig, focal_length=rig.focal_length[:1])),
+    ):
+        with pytest.raises(InputError, match="shape"):
+            fit_pose(seen, other, points, radius, guess)

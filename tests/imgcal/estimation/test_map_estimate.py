@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from imgcal.errors import InputError
-from imgcal.estimation import Estimate, EstimationOptions, equations_at, estimate
+from imgcal.estimation import Estimate, EstimationOptions, equations_at, estimate, initial_state, minimize
 from imgcal.estimation.map_estimate import equations_by_snapshot
 from imgcal.estimation.robust_losses import NamedLoss
 from imgcal.geometry import RigidTransform
@@ -155,8 +155,41 @@ def test_nan_does_not_converge(simulate, count: int) -> None:
     uv = case.observations.uv.clone()
     uv[0, 0, 0, 0, 0] = torch.nan
     seen = torch.ones_like(case.observations.seen)
-    found = run(replace(case, observations=replace(case.observations, uv=uv, seen=seen)), rig_from_object=case.poses)
+    observations = replace(case.observations, uv=uv, seen=seen)
+    problem = replace(case, observations=observations).problem()
+    found = minimize(problem, initial_state(problem, case.poses, None), SQUARED)
     assert found.converged.tolist() == [False] + [True] * (count - 1)
+    with pytest.raises(InputError, match=r"uv\[0, 0, 0, 0\]: found nan"):
+        estimate(observations, case.factory, case.obj, case.poses)
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_a_snapshot_that_nobody_saw_does_not_converge(simulate, given: bool) -> None:
+    case = simulate(3, cameras=4)
+    seen = case.observations.seen.clone()
+    seen[1, 0] = False
+    poses = case.poses if given else None
+    found = run(replace(case, observations=replace(case.observations, seen=seen)), rig_from_object=poses)
+    assert found.converged.tolist() == [True, False, True]
+    assert found.rig.focal_length.isfinite().all() and found.rig_from_object.translation.isfinite().all()
+
+
+def test_options_out_of_range_are_input_errors() -> None:
+    for name, value in (("loss", "x"), ("threshold", 0.0), ("threshold", -3.0), ("tolerance", float("nan"))):
+        with pytest.raises(InputError, match=name):
+            EstimationOptions(**{name: value})
+
+
+def test_priors_and_poses_that_cannot_be_are_input_errors(simulate) -> None:
+    case = simulate(cameras=4)
+    for prior_std in (torch.ones(15), torch.ones(4, 10), -torch.ones(4, 15), torch.full((4, 15), torch.nan)):
+        with pytest.raises(InputError, match="prior_std"):
+            run(case, prior_std=prior_std)
+    with pytest.raises(InputError, match="rig_from_object"):
+        run(case, rig_from_object=RigidTransform.identity(3, dtype=torch.float64))
+    alone = Observations(*(part[0] for part in (case.observations.uv, case.observations.sigma, case.observations.seen)))
+    with pytest.raises(InputError, match="snapshots"):
+        estimate(alone, case.factory, case.obj)
 
 
 def test_start_behind_the_cameras_does_not_converge_silently(simulate) -> None:

@@ -8,6 +8,7 @@ from imgcal.errors import InputError
 from imgcal.formats import FORMATS, OURS, convert_rig, find_format, from_camera_rig, select_cameras
 from imgcal.geometry import lens_label
 from imgcal.io import RigCovariance, load_rig_covariance, read_rig
+from imgcal.types import RigPosterior
 from tests.imgcal.formats.rigs import brown, rig_of
 
 WRITTEN = [OURS, *(one.name for one in FORMATS if one.write is not None)]
@@ -29,6 +30,16 @@ def test_uncertainty_goes_along_where_there_is_a_place() -> None:
     )
     assert "std:" in convert_rig(rig, OURS, "x").files[""].decode()
     assert any("standard deviations are left out" in note for note in convert_rig(rig, "kalibr", "x").notes)
+
+
+def test_a_posterior_that_is_left_out_is_noted() -> None:
+    def posterior() -> RigPosterior:
+        raise AssertionError("nobody needs it")
+
+    rig = read_rig("T4").select([0, 1])
+    for known in (rig, replace(rig, posterior=posterior)):
+        notes = convert_rig(from_camera_rig(known), "kalibr", "x").notes
+        assert any("the posterior of the calibration is left out" in note for note in notes) == (known is not rig)
 
 
 def test_a_rig_of_ours_keeps_its_lens_models_and_its_covariance(tmp_path: Path) -> None:

@@ -111,6 +111,16 @@ def test_the_inverse_comes_back(name: str, inverse) -> None:
     torch.testing.assert_close(found, xy, rtol=1e-12, atol=1e-13)
 
 
+def test_a_strong_pincushion_is_inverted_far_out() -> None:
+    """The start, the distorted point, is 6 times as far out as the point at 65 degrees."""
+    lens = torch.tensor([[0.12, 0.1, 0.0, 0.0, 0.05]], dtype=torch.float64)
+    r = torch.deg2rad(torch.linspace(0.0, 65.0, 200, dtype=torch.float64)).tan()[None]
+    distorted = torch.stack(distort(r, torch.zeros_like(r), lens, "brown_conrady")[:2], dim=-1)
+    found, good = undistort_cpu(distorted, lens)
+    assert good.all()
+    torch.testing.assert_close(found[..., 0], r, rtol=1e-12, atol=1e-13)
+
+
 @pytest.mark.parametrize(
     ("name", "lens"),
     [

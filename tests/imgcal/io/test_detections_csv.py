@@ -1,6 +1,7 @@
 import gzip
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -171,6 +172,34 @@ def test_line_numbers_are_right_in_later_chunks(tmp_path: Path) -> None:
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.csv: cannot be read: No such file"):
         load_detections(tmp_path / "none.csv")
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda blobs: {"uv": blobs.uv * np.nan}, "uv: found .*nan"),
+        (lambda blobs: {"sigma": blobs.sigma * 0}, "sigma: found 0.0 in row 0"),
+        (lambda blobs: {"radius": blobs.radius - 10}, "radius: found -"),
+        (lambda blobs: {"fiducial": blobs.fiducial - 5}, "fiducial: found -"),
+        (lambda blobs: {"snapshot_names": ("0",) * len(blobs.snapshot_names)}, "the snapshot name 0 more than once"),
+        (lambda blobs: {"camera_names": ("a", "a", "b")}, "the camera name a more than once"),
+        (lambda blobs: vars(blobs.select(np.zeros(0, int))), "no blob in any camera"),
+    ],
+)
+def test_blobs_that_could_not_be_read_again_are_not_written(change: Any, found: str, tmp_path: Path) -> None:
+    blobs = make_detections(30)
+    with pytest.raises(InputError, match=rf"new\.csv: not written: .*{found}"):
+        save_detections(replace(blobs, **change(blobs)), tmp_path / "new.csv")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_object_says_what_labels_mean(tmp_path: Path) -> None:
+    rig, obj = read_rig("T4"), load_object("cube8")
+    (tmp_path / "d.csv").write_text("snapshot,camera,u,v,fiducial\n0,cam01,5,5,8\n")
+    with pytest.raises(InputError, match="fiducial: found 8"):
+        load_detections(tmp_path / "d.csv", rig, obj)
+    with pytest.raises(InputError, match="rig: found 'T4', expected a CameraRig"):
+        load_detections(tmp_path / "d.csv", "T4", obj)
 
 
 @pytest.mark.parametrize("names", [(("a\nb",), ("0",)), (("a",), ("../0",))])

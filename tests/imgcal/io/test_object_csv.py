@@ -1,5 +1,7 @@
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import pytest
 import torch
@@ -117,6 +119,23 @@ def test_names_come_back_whatever_they_are(names: list[str]) -> None:
 def test_names_that_could_not_be_read_again_are_not_written(name: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"o\.csv: not written: found the name"):
         save_object(named("p", "q", "r", name), tmp_path / "o.csv")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        ({"points": torch.full((8, 3), torch.nan)}, "line 2: x: found nan"),
+        ({"radius": torch.full((8,), -1.0)}, r"line 2: radius: found -1\.0"),
+        ({"labels": (1, 2, 3)}, "3 labels, expected 8, or none"),
+        ({"fiducial_names": ("a", "b", "c")}, "3 names, expected 8, or none"),
+        ({"labels": (1,) * 8}, "fiducial: found 1 again"),
+        ({"scale_tolerance": 0.01}, r"a scale tolerance of 0\.01, for which a file has no place"),
+    ],
+)
+def test_objects_that_could_not_be_read_again_are_not_written(change: Any, found: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=rf"o\.csv: not written: .*{found}"):
+        save_object(replace(load_object("asymmetric8"), **change), tmp_path / "o.csv")
     assert not list(tmp_path.iterdir())
 
 

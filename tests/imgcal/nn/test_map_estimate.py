@@ -51,6 +51,20 @@ def test_is_the_estimate(rig, obj, observe, batch, device, dtype):
         torch.testing.assert_close(one.cpu().double(), other.double().expand_as(one), **loose)
 
 
+def test_one_empty_snapshot_does_not_take_the_batch_down(rig, obj, observe):
+    observations = observe(3)
+    observations.seen[1, 0] = False
+    found = MapEstimate(rig, obj)(observations)
+    assert found.converged.tolist() == [True, False, True]
+    assert found.rig.focal_length.isfinite().all()
+
+
+def test_a_batch_may_be_empty(rig, obj, observe):
+    found = MapEstimate(rig, obj)(observe(2).of_snapshots([]))
+    assert found.rig.batch_shape == found.converged.shape == (0,)
+    assert found.rig_from_object.translation.shape == (0, SNAPSHOTS, 3)
+
+
 @pytest.mark.parametrize("lens", KINDS)
 def test_takes_every_lens(rig, obj, observe, lens):
     factory = lensed(rig, lens)

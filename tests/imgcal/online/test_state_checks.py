@@ -52,7 +52,6 @@ def narrow(rig: CameraRig) -> CameraRig:
     [
         narrow(RIG),
         replace(RIG, focal_length=-RIG.focal_length),
-        replace(OBJ, radius=torch.ones(3)),
         replace(OBJ, points=OBJ.points * 1e30),
         RigidTransform(POSE.rotation, POSE.translation[:1]),
         RigidTransform(POSE.rotation[..., :2], POSE.translation),
