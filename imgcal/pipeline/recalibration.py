@@ -162,7 +162,8 @@ class _Case:
             if self.may_be_misread:
                 self.try_conventions(error)
             if _is_solid(self.obj):
-                require_units(error, *given)
+                # Labels show more than the sizes of images, which reflections distort.
+                require_units(error, *(given if labelled is None else (labelled.detections, self.rig, self.obj)))
             if labelled is not None:
                 require_matching_images(error, self.detections, labelled, self.rig, self.obj)
                 require_same_moments(error, self.detections, labelled, self.rig, self.obj, self.options)
