@@ -114,7 +114,7 @@ def count_labels(
 
 
 def _least_of_whole(labelled: Associations, obj: CalibrationObject) -> Counts:
-    """Minimum number of labels for the whole object to be in view: all of a stick's, but one alone shows nothing: (S, 1)."""
+    """Minimum number of labels for the whole object to be in view (S, 1): all of a stick's; one alone shows nothing."""
     size = np.array([obj.each[snapshot.part].num_fiducials for snapshot in labelled.snapshots], dtype=np.int64)
     return np.where(size > 1, np.minimum(size, LEAST_FOUND), LEAST_FOUND)[:, None]
 

@@ -64,6 +64,8 @@ def unit_doubt(rig: CameraRig, obj: CalibrationObject, from_scratch: bool = Fals
     distance = _distance(rig)
     if distance is None:
         return ""
+    if obj.num_fiducials == 1:
+        return "" if from_scratch else _distance_doubt(distance)
     size, width = obj.size, float(rig.image_size[:, 0].double().median())
     image = float(rig.focal_length.mean()) * size / distance
     seen = f"it is {size:.3g} mm large, and {distance:.3g} mm from the cameras"
@@ -120,8 +122,10 @@ def require_units(
     Raises:
         RefusedError: a unit is in doubt.
     """
-    by_images = "" if from_scratch or _focal_doubt(rig) else image_doubt(detections, rig, obj)
-    if doubt := by_images or unit_doubt(rig, obj, from_scratch):
+    has_shape = obj.pose_rank == 6 and not obj.parts  # the image of a light says nothing, and that of a stick little
+    by_images = image_doubt(detections, rig, obj) if has_shape and not (from_scratch or _focal_doubt(rig)) else ""
+    by_lengths = (unit_doubt(rig, part, from_scratch) for part in obj.each)
+    if doubt := by_images or next(filter(None, by_lengths), ""):
         raise RefusedError(f"{doubt}; so {error.reason}") from error
 
 
@@ -152,6 +156,14 @@ def _focal_doubt(rig: CameraRig) -> str:
         f"the focal length of camera {rig.camera_names[camera]} seems to be {unit}, expected pixels: it is "
         f"{focal:.3g}, and images are {width} pixels wide"
     )
+
+
+def _distance_doubt(distance: float) -> str:
+    """Judge a rig by its distance (mm) from what it looks at: a light has no size."""
+    if LEAST_DISTANCE <= distance <= LARGEST_DISTANCE:
+        return ""
+    unit = "metres" if distance < LEAST_DISTANCE else "micrometres"
+    return f"the rig seems to be in {unit}, expected millimetres: its cameras look at places {distance:.3g} mm away"
 
 
 def _doubt_by_poses(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> str:

@@ -14,6 +14,9 @@ from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate, score, unit_doubt
 from imgcal.pipeline.units import image_doubt
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+from imgcal.types import MovedError
+from scripts.benchmarks import camera_faults as damage
+from tests.imgcal.association.stick_scenes import TRIPLE, capture
 
 RIGS = ("O10", "O6", "U7", "T4", "room10")
 
@@ -165,3 +168,28 @@ def test_a_refusal_begins_with_the_unit():
         RefusedError, match=r"^the rig is .* times too small for the object, as if it were in metres; .*; so "
     ):
         calibrate(blobs, in_metres(rig), obj)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [(object_times(1e-3), "the object seems to be in metres"), (rig_times(1e-3), "the rig seems to be in metres")],
+)
+def test_the_lengths_of_a_stick_and_its_rig_show_a_unit(change, expected):
+    rig, obj, blobs, _ = capture(TRIPLE, 4, false=0)
+    with pytest.raises(RefusedError, match=f"^{expected}, expected millimetres: .*; so "):
+        calibrate(blobs, *change(rig, obj))
+
+
+def test_a_light_shows_the_unit_of_the_rig():
+    rig, obj, blobs, _ = capture(((0.0, 0.0, 0.0),), 24, false=0)
+    with pytest.raises(RefusedError, match=r"^the rig seems to be in metres, expected millimetres: its cameras"):
+        calibrate(blobs, in_metres(rig), obj)
+    assert unit_doubt(rig, obj) == "" == unit_doubt(in_metres(rig), obj, from_scratch=True)
+
+
+def test_reflections_beside_a_body_make_no_unit_of_a_move():
+    rig, obj, truth = damage.wand_in_a_room(30, 1)
+    moved = damage.changed_from(truth, obj, 3, 15, lambda r: damage.turned(r, 3, 1.0))
+    table = damage.blobs(moved, 1, clutter=2.0, missed=0.4)
+    with pytest.raises(MovedError, match=r"^camera cam04 moved before snapshot"):
+        calibrate(table, rig, obj)
