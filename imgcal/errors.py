@@ -44,3 +44,8 @@ class RefusedError(RuntimeError):
         super().__init__(f"{reason}; {python}" if python else reason)
         self.reason = reason
         self.for_command = f"{reason}; {command}" if command else reason
+
+    def append(self, finding: str) -> None:
+        """Add a finding that may be the cause to all wordings."""
+        self.args = (f"{self}; {finding}",)
+        self.reason, self.for_command = f"{self.reason}; {finding}", f"{self.for_command}; {finding}"

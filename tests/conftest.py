@@ -121,6 +121,13 @@ def asymmetric8() -> CalibrationObject:
     return load_object("asymmetric8")
 
 
+@pytest.fixture
+def few_timings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`imgcal evaluate` and `imgcal compare` measure latencies on two rigs: tests do not ask how precise they are."""
+    monkeypatch.setattr("imgcal.cli.evaluate.TIMED_RIGS", 2)
+    monkeypatch.setattr("imgcal.cli.evaluate.TIMED_RIGS_SLOW", 2)
+
+
 @pytest.fixture(scope="module")  # no longer than that: while it lives, this thread has a running loop
 def browser(tmp_path_factory):
     """Headless Chromium; tests that need it are skipped, visibly, where there is none."""

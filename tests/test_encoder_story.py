@@ -17,6 +17,7 @@ STORY = PAGE.partition("## An encoder of yours\n")[2].partition("\n## ")[0]
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 
+@pytest.mark.usefixtures("few_timings")
 def test_it_is_trained_refused_and_evaluated_once_it_is_trusted(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     blocks = FENCE.findall(STORY)

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from imgcal.association.hypotheses import Poses
-from imgcal.geometry import RigidTransform
+from imgcal.geometry import RigidTransform, geodesic_angle
 from imgcal.types import CalibrationObject
 
 LEAST_OVERLAP = 0.6  # minimum share of fiducials that fall onto others for a shift to be confusing
@@ -170,8 +170,7 @@ def _turns_of_pair(points: NDArray[np.float64], first: int, second: int, toleran
 
 def _angles(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
     """Angles (*B,) rad between rotations (*B, 3, 3) and one (3, 3)."""
-    half = np.linalg.norm(first - second, axis=(-2, -1)) / math.sqrt(8)
-    return np.asarray(2 * np.arcsin(np.minimum(half, 1)))
+    return geodesic_angle(torch.tensor(first), torch.tensor(second)).numpy()
 
 
 def relabel(

@@ -64,7 +64,7 @@ def associate_several(
     order: Iterable[int] = range(count)
     scene.decide(progress(order, count) if progress else order, count)
     incomplete = [s for s in range(count) if not scene.coded[s] and len(scene.found[s]) < len(trackers)]
-    if len(incomplete) < count:  # the rig learnt from the others may help
+    if len(incomplete) < count:  # the rig learned from the others may help
         for tracker in trackers:
             tracker.in_vain = 0
         scene.decide(incomplete, len(incomplete))

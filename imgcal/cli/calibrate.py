@@ -55,7 +55,6 @@ from imgcal.pipeline import (
     calibrate_from_scratch,
     capture_sight,
     load_initializer,
-    unit_doubt,
 )
 from imgcal.types import CalibrationObject, CameraRig, Detections, limits
 from imgcal.watch import STATE
@@ -143,8 +142,6 @@ class Calibrate(arguments.Calibrate):
         for move in outcome.moved:
             print(f"{move}: only the snapshots since then are used")
         print_outcome(result, found, self.out, draws)
-        if doubt := unit_doubt(rig, obj, outcome.from_scratch):
-            print(f"note: {doubt}", file=sys.stderr)
         for note in doubtful_cameras(outcome):
             print(f"note: {note}; see the report", file=sys.stderr)
 

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 CHECKED_RIGS = 32
 """On which encoders are checked."""
+TIMED_RIGS, TIMED_RIGS_SLOW = 50, 10
+"""On which the latency of fast methods is measured, and that of slow ones."""
 FEW = 8
 """Batches, or captures, that are done before Ray has started."""
 WORK = ".work"
@@ -161,7 +163,7 @@ def _measure(
     with progress_bar("evaluating", total) as advance:
         evaluation = evaluate(methods, conditions, protocol, advance, mapped)
         sweeps = tuple(sweep(fast, conditions, axis, along, progress=advance, mapped=mapped) for axis in setting.sweep)
-    repeats = {name: 50 if method.most is None else 10 for name, method in methods.items()}
+    repeats = {name: TIMED_RIGS if method.most is None else TIMED_RIGS_SLOW for name, method in methods.items()}
     took = {name: latency(method, conditions, repeats[name]) for name, method in methods.items()}
     return Summary(evaluation, took, {}, sweeps)
 

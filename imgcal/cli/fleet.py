@@ -81,8 +81,8 @@ class Fleet(arguments.Fleet):
             except (InputError, RefusedError) as error:
                 taught.append((kind, None, str(error)))
         if taught and (learnt := taught[0][1]) is not None:
-            learned = {"prior": learnt.prior(), "drift_rate": learnt.drift_rate()}
-            blocks = {name: _round(asdict(values)) for name, values in learned.items() if values is not None}
+            found = {"prior": learnt.prior(), "drift_rate": learnt.drift_rate()}
+            blocks = {name: _round(asdict(values)) for name, values in found.items() if values is not None}
             write_text(self.out / "prior.yaml", yaml_text(blocks))
             write_text(self.out / "lessons.json", json.dumps(_summary(taught[0][0], learnt), indent=2) + "\n")
             for spread in learnt.spreads:

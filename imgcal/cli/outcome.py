@@ -28,6 +28,7 @@ from imgcal.pipeline import (
     measure_coverage,
     motion_since_factory,
     rms_length,
+    unit_doubt,
 )
 from imgcal.types import CalibrationObject, CameraRig, Detections, MovedCamera, MovedError
 
@@ -188,6 +189,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "predicted_error": calibration.predicted_error.summary(),
         "scale": calibration.scale.values,
         "repeats": calibration.repeats.values,
+        "unit_doubt": unit_doubt(calibration.factory, calibration.obj, calibration.from_scratch) or None,
         "seconds": seconds,
     }
 
@@ -267,6 +269,7 @@ def refused_summary(
         "per_camera": blobs_by_camera(detections, rig), "per_snapshot": {},
         "object": [], "object_displaced": [], "object_lost": [], "object_scale_sigma": None, "object_bent_sigma": None,
         "board_bend": None, "covariance": None, "predicted_error": None, "scale": None, "repeats": None,
+        "unit_doubt": None,
         "motion": None, "timing_untested": None, "knowledge": None, "seconds": seconds,
     }  # fmt: skip
 
@@ -322,6 +325,8 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
         print(line)
     if result["unsynchronized"]:
         print(f"note: {result['unsynchronized']['note']}", file=sys.stderr)
+    if result["unit_doubt"]:
+        print(f"note: {result['unit_doubt']}", file=sys.stderr)
     if result["repeats"]["note"]:
         print(f"note: {result['repeats']['note']}", file=sys.stderr)
     for kind, factor in result["prior_too_narrow"].items():

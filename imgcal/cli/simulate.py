@@ -106,8 +106,8 @@ class Simulate(arguments.Simulate):
             (out / "frames" / camera).mkdir(parents=True)
         shots = simulate_shots(truth, obj, model, generator)
         rows = ["snapshot,camera,object,fiducial,seen" if obj.parts else "snapshot,camera,fiducial,seen"]
-        parts = [(f"{part.name}," if obj.parts else "", part) for part in obj.each]
-        labels = [f"{name}{n}" for name, part in parts for n in part.labels or range(part.num_fiducials)]
+        given = range(obj.rows) if isinstance(obj.rows, int) else obj.rows
+        labels = [",".join(map(str, label)) if isinstance(label, tuple) else str(label) for label in given]
         for snapshot, shot in enumerate(progress(shots, self.snapshots, "rendering frames")):
             for (camera, image), shares in zip(shot.frames.items(), shot.seen.tolist(), strict=True):
                 write_frame(out / "frames" / camera / f"{snapshot:05d}.png", image)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from imgcal.io import holding, load_objects
 from imgcal.live_page import Address, parse_address
 from imgcal.messages import plural, shorten
 from imgcal.online import Event, RigKeeper
-from imgcal.pipeline import DETECTORS, DetectorName, LearnedMeasurer, choose_proposer
+from imgcal.pipeline import DETECTORS, DetectorName, LearnedMeasurer, choose_proposer, unit_doubt
 from imgcal.types import CalibrationObject, CameraRig, object_difference, rig_difference
 from imgcal.watch import (
     CURRENT,
@@ -44,6 +44,7 @@ from imgcal.watch import (
     LearningTask,
     Metrics,
     Page,
+    Poses,
     Progress,
     Qualisys,
     Source,
@@ -51,6 +52,7 @@ from imgcal.watch import (
     Tally,
     Timing,
     forget_after,
+    forget_rows,
     put_aside,
     run_networks,
 )
@@ -88,9 +90,13 @@ class Watch(arguments.Watch):
         with contextlib.ExitStack() as stack:
             keeper = stack.enter_context(self._open_keeper(earlier.state, rig, obj, detector))
             stack.enter_context(intake).wait_until_open()  # before anything is written
+            if earlier.known is not None and not intake.resumes:
+                earlier = earlier.as_another()
             if len(given.points) > 1 and obj is not given:
                 note = f"note: markers of {given.name} are followed one by one; where their distances fit, they count"
                 print(note, file=sys.stderr)
+            if doubt := unit_doubt(rig, given):
+                print(f"note: {doubt}", file=sys.stderr)
             poses = stack.enter_context(open_pose_outputs(self.poses, rig, obj))
             learning = stack.enter_context(self._learning(keeper, obj, folder, earlier.networks))
             page = stack.enter_context(_serve(page_at, rig, obj, display))
@@ -100,7 +106,7 @@ class Watch(arguments.Watch):
             )  # fmt: skip
             if metrics_at is not None:
                 stack.enter_context(Metrics(loop.tally, intake, hook, metrics_at))
-            restart = self._prepare(folder, earlier)
+            restart = self._prepare(folder, earlier, poses)
             stack.enter_context(loop)
             stopped = stack.enter_context(stop_at_signals())
             stack.enter_context(display.show_tally(loop.tally))
@@ -162,10 +168,13 @@ class Watch(arguments.Watch):
             print(f"learning from the frames of this rig: {folder / LEARNING}")
             yield learning
 
-    def _prepare(self, folder: Path, earlier: EarlierRun) -> str | None:
+    def _prepare(self, folder: Path, earlier: EarlierRun, poses: Sequence[Poses]) -> str | None:
         """Remove from the output folder what this run does not continue, and say how it starts after an earlier one."""
         if earlier.logged is not None:
             forget_after(folder / EVENTS, earlier.logged)
+        for path, _ in (output.table for output in poses if output.table is not None):
+            if path in earlier.tables:
+                forget_rows(Path(path), earlier.tables[path], earlier.snapshot)
         if self.fresh and put_aside(folder):
             return "started anew from the factory calibration"
         return None if earlier.state is None else "resumed from the saved state"
@@ -276,7 +285,7 @@ def _explain_no_learning(tally: Tally, intake: SourceReader, refusals: FirstRefu
 
 
 def _make_remover(source: Source) -> Callable[[Progress], None]:
-    """What deletes frames that have been learnt from."""
+    """What deletes frames that have been learned from."""
     if not isinstance(source, Folder):
         return lambda progress: None
     return lambda progress: None if progress.name is None else source.delete_read(progress.name)

@@ -24,6 +24,10 @@ LARGER = 32.0  # px, largest radius that a search with the usual limit still fin
 LARGEST = 48.0  # px, largest radius that fits the windows
 FEW = 4  # usable blobs of a frame below which the search for much larger ones is finer
 
+ANGLES = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+OUTLINE = np.concatenate(([[0.0, 0.0]], np.stack((np.cos(ANGLES), np.sin(ANGLES)), axis=1)))
+"""Centre and outline of a blob of radius 1, where it is compared with a mask."""
+
 Mask = NDArray[np.bool_] | NDArray[np.uint8]  # (H, W) non-zero inside known reflections
 
 
@@ -39,7 +43,7 @@ def detect(
     Args:
         frames: camera name -> frame (H, W) uint8 or uint16, or one frame per snapshot; None = no frame.
         options: what counts as a blob.
-        masks: camera name -> (H, W), non-zero inside known reflections; blobs there are flagged.
+        masks: camera name -> (H, W), non-zero inside known reflections; blobs that reach there are flagged.
         board: a printed board to detect instead of blobs; its points are labelled.
 
     Raises:
@@ -139,7 +143,9 @@ def _detect_one(
     else:
         blobs = _find(contiguous, block_means(contiguous, options, scale), options, scale)
     if mask is not None:
-        blobs.flags[_is_in_mask(mask, blobs.uv)] |= np.uint8(BlobFlag.MASKED)
+        reach = blobs.uv[:, None] + blobs.radius[:, None, None] * OUTLINE
+        touching = _is_in_mask(mask, reach.reshape(-1, 2)).reshape(-1, len(OUTLINE)).any(axis=1)
+        blobs.flags[touching] |= np.uint8(BlobFlag.MASKED)
     return blobs
 
 
@@ -168,7 +174,7 @@ def _find(frame: Frame, means: Frame, options: DetectionOptions, scale: int) -> 
 
 
 def _is_in_mask(mask: NDArray[np.bool_], uv: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Check which centres (K, 2) lie inside a mask (H, W)."""
+    """Check which pixels (K, 2) lie inside a mask (H, W)."""
     pixel = np.clip(np.rint(uv).astype(np.int64), 0, np.array(mask.shape[::-1]) - 1)
     return mask[pixel[:, 1], pixel[:, 0]]
 

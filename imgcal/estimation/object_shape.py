@@ -69,6 +69,7 @@ class ShapeEvidence:
     places: Array  # (N, 3) mm, the fiducials as in the object's file, relative to their centroid
     points: Array  # (N, 3) mm, the fiducials as fitted, relative to the same point
     tolerance: Array  # (N,) mm, their tolerances in this fit
+    scale_tolerance: float  # relative, that of all distances together
     chi2: float  # of the fit, data and priors
     freedom: float  # its degrees of freedom
 
@@ -79,6 +80,19 @@ class ShapeEvidence:
         sure = values > UNSURE * values[-1]
         vectors, variance = vectors[:, sure], 1 / values[sure]
         return vectors, variance, variance * (vectors.T @ self.pull)
+
+    def marginalize_scale(self) -> ShapeEvidence:
+        """Take out what the common scale may explain within its tolerance, so that no fiducial is blamed for it."""
+        if self.scale_tolerance == 0:
+            return self
+        scale = self.information @ self.places.ravel()
+        variance = 1 / (float(self.places.ravel() @ scale) + self.scale_tolerance**-2.0)
+        return replace(
+            self,
+            information=self.information - variance * np.outer(scale, scale),
+            pull=self.pull - variance * float(self.places.ravel() @ self.pull) * scale,
+            scale_tolerance=0.0,
+        )
 
     def _covariance(self, tolerance: Array) -> Array:
         """Covariance (D, D) of those displacements if the fiducials had tolerances (N,) mm."""
@@ -205,9 +219,10 @@ def shape_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Sha
     gradient = own.gradient[0, :-1].cpu().double().numpy()
     places = problem.points.cpu().double().numpy()
     displaced = (points.cpu().double().numpy() - places).ravel()
-    tolerance, cost = np.zeros(len(places)), float(equations.cost)
+    tolerance, scale_tolerance, cost = np.zeros(len(places)), 0.0, float(equations.cost)
     if problem.object_prior_std is not None and state.object_offset is not None:
-        tolerance = problem.object_prior_std[0, :-1:3].cpu().double().numpy()
+        given = problem.object_prior_std[0].cpu().double().numpy()
+        tolerance, scale_tolerance = given[:-1:3], float(given[-1])
         cost += 0.5 * float(state.object_offset.square().sum())
     return ShapeEvidence(
         information=information,
@@ -215,6 +230,7 @@ def shape_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Sha
         places=places,
         points=points.cpu().double().numpy(),
         tolerance=tolerance,
+        scale_tolerance=scale_tolerance,
         chi2=2 * cost,
         freedom=2 * int((problem.root_weight > 0).sum()) - int(problem.pose_freedom),
     )
@@ -260,6 +276,7 @@ def learnt_tolerances(shape: ShapeEvidence) -> Array:
 
     Source: MacKay, "Bayesian interpolation" (Neural Computation 1992), one precision per fiducial.
     """
+    shape = shape.marginalize_scale()
     size = float(np.sqrt(np.square(shape.places).sum(1).mean()))
     floor = np.maximum(shape.tolerance, NARROW * size)
     one, freedom = _learn_one(shape, size)

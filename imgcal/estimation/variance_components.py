@@ -336,12 +336,14 @@ def _free_object(
     prior_std = learnt_tolerances(shape)
     if not (prior_std > 1.01 * shape.tolerance).any():
         return None
-    before = problem.object_prior_std
-    scale = problem.points.new_zeros(1) if before is None else before[0, -1:]
+    scale = grown = problem.points.new_zeros(1)
+    if problem.object_prior_std is not None and solution.state.object_offset is not None:
+        scale = problem.object_prior_std[0, -1:]
+        grown = scale * solution.state.object_offset[0, -1:]
     free = torch.cat((torch.from_numpy(prior_std).to(problem.uv).repeat_interleave(3), scale))
     # Keep the displacements in the new units; a fiducial whose tolerance is still zero has none.
-    displaced = (points_at(problem, solution.state)[0] - problem.points).flatten()
-    whitened = torch.where(free > 0, torch.cat((displaced, torch.zeros_like(scale))) / free.clamp_min(1e-30), 0.0)
+    displaced = points_at(problem, solution.state)[0] - problem.points * (1 + grown)
+    whitened = torch.where(free > 0, torch.cat((displaced.flatten(), grown)) / free.clamp_min(1e-30), 0.0)
     problem = replace(problem, object_prior_std=free[None])
     state = replace(solution.state, object_offset=whitened[None])
     found = minimize(problem, state, options.estimation)
@@ -368,14 +370,19 @@ def _require_scale(shape: ShapeEvidence | ScaleEvidence, fit: _Fit, least: float
     error, deviation = shape.scale_error
     granted = 0.0 if problem.object_prior_std is None else float(problem.object_prior_std[0, -1])
     if MOST_SCALE > abs(error) > max(least, WRONG_SCALE * np.hypot(deviation * usual**0.5, granted)):
-        size = "larger" if error > 0 else "smaller"
+        size = f"{100 * abs(error):.2g} +- {100 * deviation:.1g} % {'larger' if error > 0 else 'smaller'}"
+        if problem.part_of is not None:  # of several objects, the scale has no tolerance
+            advice = "measure them again, and check their units"
+            raise RefusedError(
+                f"object: all cameras have moved together, as if all objects were {size} than their files say",
+                python=advice,
+                command=advice,
+            )
+        advice = f"measure it again, check its unit, or give its scale a tolerance (now {granted:g})"
         raise RefusedError(
-            f"object: all cameras have moved together, as if it were {100 * abs(error):.2g} +- {100 * deviation:.1g} % "
-            f"{size} than its file says",
-            python=f"measure it again, check its unit, or give its scale a tolerance (now {granted:g}): "
-            "replace(obj, scale_tolerance=...)",
-            command=f"measure it again, check its unit, or give its scale a tolerance (now {granted:g}): "
-            "--object-scale-tolerance",
+            f"object: all cameras have moved together, as if it were {size} than its file says",
+            python=f"{advice}: replace(obj, scale_tolerance=...)",
+            command=f"{advice}: --object-scale-tolerance",
         )
 
 

@@ -20,7 +20,7 @@ from imgcal.messages import list_names, plural
 from imgcal.types import PINHOLE, parameter_names
 
 HOURS = "hours"
-"""Column of the manifest: since the factory calibration. With it, rates of drift are learnt."""
+"""Column of the manifest: since the factory calibration. With it, rates of drift are learned."""
 COLUMNS = (
     "device", "capture", "time", "status", "given", "cameras", "lenses", "prior_std", "unit", "whitened_offset",
     "information_factor", "inflation",

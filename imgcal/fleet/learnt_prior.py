@@ -135,7 +135,7 @@ def learn_prior(
         drift: D devices, each seen by its own images.
         start: where the search begins; it has no other influence.
         hours: (D,) since the factory calibration; where they differ, the variance grows with them, and rates are
-            learnt, too.
+            learned, too.
         covariates: (D,) each, temperature for example: every parameter gets a mean and a slope, taken out before the
             spread.
         by_camera: learn a spread for each camera, not one for all.
@@ -188,7 +188,7 @@ def outlier_cameras(drift: DriftInformation, prior: RigPrior) -> tuple[OutlierCa
 
     Args:
         drift: D devices.
-        prior: of the fleet, learnt or known.
+        prior: of the fleet, learned or known.
     """
     model = _model(drift, None, False)
     theta = torch.tensor([getattr(prior, kind) ** 2 for kind, _, _ in model.names], dtype=torch.float64)

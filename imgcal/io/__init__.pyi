@@ -19,6 +19,7 @@ from .names import (
     read_bytes,
     sample_path,
     shipped_names,
+    snapshot_name,
     title_from_name,
 )
 from .object_csv import load_object, load_objects, object_from_text, object_text, save_object
@@ -103,6 +104,7 @@ __all__ = [
     "save_object",
     "save_rig",
     "shipped_names",
+    "snapshot_name",
     "title_from_name",
     "validate",
     "write_bytes",

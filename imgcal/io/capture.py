@@ -1,12 +1,15 @@
 """Captured frames: `frames/<camera name>/<snapshot>.<png|tif|...>` or `frames/<camera name>.<png|tif|mp4|...>`.
 
-One file a camera holds one snapshot a page (TIFF) or frame (video), named "0", "1", ...; an image is snapshot "0".
+Frames of one moment have the same name in all cameras, before or behind which the camera's own may stand
+(`cam01_0002.png`). One file a camera holds one snapshot a page (TIFF) or frame (video), named "0", "1", ...; an image
+is snapshot "0".
 Optional beside `frames/`: `capture.yaml` (format, bit_depth, note) and `masks/<camera name>.png` (not black = ignored).
 """
 
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,13 +22,15 @@ from imgcal.errors import InputError
 from imgcal.io.atomic import is_unfinished, write_text
 from imgcal.io.detections_csv import Fiducials, load_detections
 from imgcal.io.frames import IMAGE_SUFFIXES, TIFF_SUFFIXES, VIDEO_SUFFIXES, Frame, Video, count_frames, read_frame
-from imgcal.io.names import is_file_name, natural_key, nearest, require_left_out, sample_path
+from imgcal.io.names import is_file_name, natural_key, nearest, require_left_out, sample_path, snapshot_name
 from imgcal.io.validation import StrictModel, validate
 from imgcal.io.yaml_file import read_yaml, yaml_text
 from imgcal.messages import list_names
 from imgcal.types import CameraRig, Detections
 
 FORMAT = "imgcal-capture/1"
+LEFT_BEHIND = ("thumbs.db", "desktop.ini")
+"""Files that systems put into folders of images."""
 DIFFER = "--videos-differ (in Python videos_differ=True) matches them by number anyway"
 
 
@@ -138,7 +143,8 @@ def open_capture(
         without: cameras that the rig does not have, whose files are left out.
 
     Raises:
-        InputError: one line with the file or folder, what was found and what was expected.
+        InputError: one line with the file or folder, what was found and what was expected; with a rig also where no
+            frame of a camera has the name of another camera's: what was exposed at the same moment would be unknown.
 
     Examples:
         >>> from imgcal.io import data_path
@@ -160,11 +166,12 @@ def open_capture(
         camera = path.name if path.is_dir() else path.stem
         if camera in files:
             raise InputError(f"{frames}: found camera {camera} more than once, expected one folder or file for it")
-        files[camera] = _folder_snapshots(path) if path.is_dir() else _file_snapshots(path)
+        files[camera] = _folder_snapshots(path, camera) if path.is_dir() else _file_snapshots(path)
     if rig is not None:
         require_left_out(frames, without, files)
         files = {camera: found for camera, found in files.items() if camera not in without}
         _check_cameras(frames, files, rig)
+        _require_shared_names(frames, files)
     if not any(files.values()):
         raise InputError(f"{frames}: found no frames, expected images or videos of the cameras")
     if not videos_differ:
@@ -223,7 +230,7 @@ def _listing(folder: Path) -> list[Path]:
     """Entries in natural order, without hidden files."""
     if not folder.is_dir():
         raise InputError(f"{folder}: found a file, expected a folder")
-    entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    entries = [path for path in folder.iterdir() if path.name[0] != "." and path.name.lower() not in LEFT_BEHIND]
     for path in entries:
         if not is_file_name(path.name):
             raise InputError(f"{path}: found a name that is not valid text, or is too long: rename it")
@@ -243,15 +250,16 @@ def _find_masks(folder: Path, cameras: Sequence[str]) -> dict[str, Path]:
     return found
 
 
-def _folder_snapshots(folder: Path) -> dict[str, tuple[Path, int]]:
+def _folder_snapshots(folder: Path, camera: str) -> dict[str, tuple[Path, int]]:
     """One image a snapshot."""
     found: dict[str, tuple[Path, int]] = {}
     for path in _listing(folder):
         if path.suffix.lower() not in IMAGE_SUFFIXES:
             raise InputError(f"{path}: expected an image of one snapshot ({', '.join(sorted(IMAGE_SUFFIXES))})")
-        if path.stem in found:
-            raise InputError(f"{path}: found snapshot {path.stem} more than once, also in {found[path.stem][0].name}")
-        found[path.stem] = (path, 0)
+        name = snapshot_name(path.stem, camera)
+        if name in found:
+            raise InputError(f"{path}: found snapshot {name} more than once, also in {found[name][0].name}")
+        found[name] = (path, 0)
     return found
 
 
@@ -261,6 +269,18 @@ def _file_snapshots(path: Path) -> dict[str, tuple[Path, int]]:
         expected = ", ".join(sorted(IMAGE_SUFFIXES | VIDEO_SUFFIXES))
         raise InputError(f"{path}: expected a folder, an image or a video of one camera ({expected})")
     return {str(index): (path, index) for index in range(count_frames(path))}
+
+
+def _require_shared_names(frames: Path, files: Mapping[str, Mapping[str, object]]) -> None:
+    """Require of each camera a snapshot that another camera has, too."""
+    shown = Counter(snapshot for found in files.values() for snapshot in found)
+    alone = [camera for camera, found in files.items() if found and all(shown[name] == 1 for name in found)]
+    others = [camera for camera, found in files.items() if found and camera not in alone] or alone[1:]
+    if alone and others:
+        raise InputError(
+            f"{frames / alone[0]}: found {list_names(files[alone[0]])}, of which no other camera has one "
+            f"({others[0]}: {list_names(files[others[0]])}), expected frames of one moment to have the same name"
+        )
 
 
 def check_times(videos: Sequence[Video], snapshot: str) -> None:

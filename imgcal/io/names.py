@@ -79,6 +79,21 @@ def natural_key(name: str) -> tuple[list[str | int], str]:
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)], name
 
 
+def snapshot_name(stem: str, camera: str) -> str:
+    """Name a frame's snapshot by its file name, without the camera's own name at either end, as recorders put it there.
+
+    Cameras called by numbers alone are left: those may be part of a date or a count.
+
+    Examples:
+        >>> snapshot_name("cam01_0002", "cam01"), snapshot_name("0002-CAM01", "cam01"), snapshot_name("1_2", "1")
+        ('0002', '0002', '1_2')
+    """
+    if not any(letter.isalpha() for letter in camera):
+        return stem
+    own = re.escape(camera)
+    return re.sub(rf"^{own}[ _.-]+(?=.)|(?<=.)[ _.-]+{own}$", "", stem, count=1, flags=re.IGNORECASE)
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Suggest the known name that was probably meant: `, nearest: cam01`, or nothing if none is near."""
     names = {candidate.lower(): candidate for candidate in known}

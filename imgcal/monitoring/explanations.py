@@ -16,12 +16,13 @@ from functools import partial
 from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions
 from imgcal.monitoring.case import Case, Explained, Explanation, Finding, Snapshot, Start, Variant, mean_evidence
+from imgcal.monitoring.change_search import FIT_CHI2_PER_DOF
 from imgcal.monitoring.change_test import JUMPS
 from imgcal.monitoring.clock_slip import ClockSlipExplanation
 from imgcal.monitoring.lens_misfit import LensMisfit
 from imgcal.monitoring.lens_warming import Warmed
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
-from imgcal.monitoring.object_change import ObjectChanged
+from imgcal.monitoring.object_change import MISFIT_LEAD, ObjectChanged
 from imgcal.monitoring.pending_change import free_cameras
 from imgcal.monitoring.rig_belief import RigBelief
 from imgcal.monitoring.shaking import Shaking, shake_cameras
@@ -213,6 +214,29 @@ class Diagnosis:
             return False
         self.waited += self.waited > 0
         return True
+
+
+def explained_by_moves(
+    before: RigBelief, snapshots: Sequence[Snapshot], pauses: Sequence[float], options: EstimationOptions
+) -> bool:
+    """Tell whether snapshots that fit nowhere surely fit if all cameras have moved before them, and none is shaking.
+
+    Args:
+        before: the belief before them.
+        snapshots: all of them need an explanation.
+        pauses: s before each.
+        options: how to minimize.
+
+    Raises:
+        RefusedError: nothing explains these snapshots.
+    """
+    cameras = tuple(range(before.rig.num_cameras))
+    case = Case(before, snapshots, pauses, len(snapshots), options, cameras)
+    verdict = weigh(case, (Steady(), Moved(), Shaking()))
+    if verdict.best.name != Moved.name or verdict.lead < MISFIT_LEAD:
+        return False
+    fit = absorb(verdict.best.before, *stack_snapshots(verdict.best.snapshots), options)
+    return fit.chi2 <= FIT_CHI2_PER_DOF * max(fit.dof, 1)
 
 
 def doubtful_cameras(

@@ -28,7 +28,15 @@ from imgcal.monitoring.change_search import (
 from imgcal.monitoring.change_test import JUMPS, LARGE
 from imgcal.monitoring.clock_slip import project_fiducials
 from imgcal.monitoring.drift_pace import DriftLearning, DriftPaces
-from imgcal.monitoring.explanations import Diagnosis, Moved, Steady, Verdict, doubtful_cameras, weigh
+from imgcal.monitoring.explanations import (
+    Diagnosis,
+    Moved,
+    Steady,
+    Verdict,
+    doubtful_cameras,
+    explained_by_moves,
+    weigh,
+)
 from imgcal.monitoring.lens_misfit import LensMisfit
 from imgcal.monitoring.lens_warming import Warmed
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
@@ -322,7 +330,7 @@ class RigMonitor:
             changes: changes decided on the way are appended.
 
         Raises:
-            RefusedError: the case cannot be decided yet, or the snapshots cannot be learnt.
+            RefusedError: the case cannot be decided yet, or the snapshots cannot be learned.
         """
         free: dict[int, str | None] = {}
         pending, camera = self._pending, likeliest_camera(self._recent.test(age))
@@ -552,13 +560,25 @@ class RigMonitor:
             self.quarantine.unsynchronized, self.quarantine.seconds = sure, sum(pauses[1:])
         return new
 
+    def have_all_moved(self, snapshots: Sequence[Snapshot], pauses: Sequence[float]) -> bool:
+        """Tell whether labels no longer fit in most cameras because these have moved at once.
+
+        Args:
+            snapshots: the latest ones, with those labels; not absorbed.
+            pauses: s before each of them.
+        """
+        before = age_belief(self.filter.belief, self.filter.waited + pauses[0], self.filter.walk)
+        with contextlib.suppress(RefusedError):  # nothing explains these snapshots
+            return explained_by_moves(before, snapshots, pauses, self.filter.options)
+        return False
+
     def _adopt_object(
         self, before: RigBelief, snapshots: Sequence[Snapshot], pauses: Sequence[float], new: bool = False
     ) -> MonitorUpdate | None:
         """Learn the object again if its change explains some snapshots; `new`: the filter has not absorbed them.
 
         Returns:
-            The update; None = the change does not explain them, or cannot be learnt.
+            The update; None = the change does not explain them, or cannot be learned.
         """
         case = Case(before, snapshots, pauses, len(snapshots), self.filter.options)
         with contextlib.suppress(RefusedError):  # nothing explains these snapshots

@@ -65,7 +65,7 @@ def take_health(memory: KeeperMemory, event: Event) -> None:
 
 
 def describe_health(health: Mapping[str, CameraHealth], learnt: int) -> str:
-    """Describe a rig's health in a sentence; `learnt` is the number of learnt snapshots.
+    """Describe a rig's health in a sentence; `learnt` is the number of learned snapshots.
 
     Examples:
         >>> describe_health({"cam01": "ok", "cam02": "lost", "cam03": "lost"}, 9)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,6 @@ from imgcal.medians import median, median_of_known
 from imgcal.monitoring import ClockSlip, MeasurementUpdate
 from imgcal.online.events import Event
 from imgcal.online.rig_state import UNTRUSTED, RigState
-from imgcal.online.sequential_test import check_like
 
 # Residuals that count.
 MEMORY_SECONDS = 5.0
@@ -36,7 +35,7 @@ LEAST_MEMORY = 0.75
 # When motion and shift can be separated.
 LEAST_MOTION, LEAST_SIGMAS = 0.5, 5.0
 """Pixels, and standard deviations, by which blobs (their median) must move between snapshots: less is noise of the
-pose, which correlates with the residuals. Predictions would not do: they also move as the rig is learnt."""
+pose, which correlates with the residuals. Predictions would not do: they also move as the rig is learned."""
 CAMERA_STEP, STEP_SNAPSHOTS = 0.2, 3
 """Change (px) of a camera's image, and number of snapshots that it must last, to restart that camera's estimate ..."""
 LASTING_STEP = 2.0
@@ -55,6 +54,16 @@ class ClockOffsets:
     """
 
     name = "clock"
+    STATE: ClassVar = {
+        "normal": ("_normal", NDArray[np.float64]),
+        "right": ("_right", NDArray[np.float64]),
+        "other": ("_other", NDArray[np.int64]),
+        "seconds": ("_seconds", NDArray[np.float64]),
+        "told": ("_told", NDArray[np.float64]),
+        "late": ("late", NDArray[np.float64]),
+        "period": ("_period", float),
+        "last": ("_last", tuple[float, RigidTransform, NDArray[np.float64]] | None),
+    }
 
     def __init__(self, cameras: int) -> None:
         """Start without knowledge."""
@@ -82,7 +91,7 @@ class ClockOffsets:
         least = max(LEAST_MOTION, LEAST_SIGMAS * median(state.detections.sigma))
         if not len(went) or median(went) < least:
             return ()
-        # Use the current rig for both: what is learnt about cameras is no motion.
+        # Use the current rig for both: what is learned about cameras is no motion.
         self._add(state, (state.predicted - self._predict(state, last[1])) / self._period)
         offset, sigma = self.offsets()
         changed = np.abs(offset - self.late)
@@ -220,27 +229,6 @@ class ClockOffsets:
             message = f"{name} exposes at the same time as the other cameras again"
         frames = (offset / self._period, sigma / self._period)
         return Event(state.time, state.snapshot, "clock_slip", name, since, None, *frames, "frames", evidence, message)
-
-    def saved(self) -> dict[str, Any]:
-        """See `SequentialTest`."""
-        last = None
-        if self._last is not None:
-            time, pose, places = self._last
-            last = (time, pose.rotation, pose.translation, places)
-        return {name.strip("_"): getattr(self, name) for name in _ARRAYS} | {"period": self._period, "last": last}
-
-    def restored(self, values: dict[str, Any]) -> None:
-        """See `SequentialTest`."""
-        for name in _ARRAYS:
-            key = name.strip("_")
-            setattr(self, name, check_like(f"{self.name}: {key}", getattr(self, name), values[key]))
-        self._period, self._last, self._solved = float(values["period"]), None, None
-        if values["last"] is not None:
-            time, rotation, translation, places = values["last"]
-            self._last = float(time), RigidTransform(rotation, translation), np.array(places, dtype=np.float64)
-
-
-_ARRAYS = ("_normal", "_right", "_other", "_seconds", "_told", "late")
 
 
 def unsynchronized_event(camera: str, since: float, time: float, snapshot: int) -> Event:

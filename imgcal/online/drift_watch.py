@@ -23,7 +23,7 @@ DRIFT_SIGMAS = 5.0
 """Significance of the drift, in standard deviations of the values at the start of the measurement."""
 LEAST_SHIFT_RATIO = 0.5
 """Least ratio of two shifts of the labels: by the changes of all values of a camera, and by the drift alone. Values
-that change together so that the labels hardly move, such as a focal length and a distortion, are being learnt."""
+that change together so that the labels hardly move, such as a focal length and a distortion, are being learned."""
 HOW = {
     "rotation": "has slowly turned by",
     "position": "has slowly shifted by",
@@ -34,7 +34,7 @@ HOW = {
 
 @dataclass
 class DriftWatch:
-    """Compares a rig with its state when drift was last reported, or when it was learnt."""
+    """Compares a rig with its state when drift was last reported, or when it was learned."""
 
     names: tuple[str, ...]
     looked: float | None = None  # time of the last check, s since the epoch

@@ -6,7 +6,7 @@ Labels that fit in no camera are another matter: that is the object, and most ca
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 
@@ -30,6 +30,7 @@ class ForeignObject:
     """Reports once that the cameras no longer see the object; again only after the object has been seen."""
 
     name = "foreign object"
+    STATE: ClassVar = {"known": ("_known", bool), "since": ("_since", float | None), "times": ("_times", int)}
 
     def __init__(self) -> None:
         """Start before the object has been seen."""
@@ -61,12 +62,3 @@ class ForeignObject:
         self._known = False
         message = "what the cameras see is not the object, or it is bent beyond recognition"
         return (Event(state.time, state.snapshot, "object_exchanged", None, self._since, message=message),)
-
-    def saved(self) -> dict[str, Any]:
-        """See `SequentialTest`."""
-        return {"known": self._known, "since": self._since, "times": self._times}
-
-    def restored(self, values: dict[str, Any]) -> None:
-        """See `SequentialTest`."""
-        since, self._known, self._times = values["since"], bool(values["known"]), int(values["times"])
-        self._since = None if since is None else float(since)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,6 @@ from imgcal.monitoring import Cusum, MeasurementUpdate
 from imgcal.online.camera_visibility import well_inside
 from imgcal.online.events import Event, EventKind
 from imgcal.online.rig_state import RigState
-from imgcal.online.sequential_test import check_like
 
 Array = NDArray[np.float64]
 
@@ -39,7 +38,7 @@ TERM_WIDTH = 0.5
 """... and the standard deviation of each."""
 FEATURES = 1 + len(TERM_CENTRES) ** 2 + 2 + 3  # constant, local terms, log distance and its square, direction
 
-# What is known beforehand, and how it is learnt.
+# What is known beforehand, and how it is learned.
 LEAST_SPREAD = np.array((0.03, 0.15, 0.1))
 """Minimum standard deviations of a block: size (3 %), sigma (15 %), share missing (0.1, on the real stream)."""
 PRIOR = np.array(((10.0, 0.1, 0.3, 0.1), (10.0, 0.5, 2.0, 0.5), (0.3, 0.2, 0.2, 0.2)))
@@ -50,9 +49,9 @@ MEMORY_BLOCKS = 600
 """Number of blocks over which the spread is averaged."""
 LEARNT = 0.1
 """A place is known if the variance of its expected value is below this, in variances of a block. Only known places are
-tested; nothing is learnt there, so that slow changes are not absorbed."""
+tested; nothing is learned there, so that slow changes are not absorbed."""
 SUSPICION = 0.3
-"""Share of the alarm threshold above which nothing is learnt: it may be the fault itself."""
+"""Share of the alarm threshold above which nothing is learned: it may be the fault itself."""
 
 # The test.
 RUN_LENGTH = 1e7
@@ -77,11 +76,24 @@ class ImageQuality:
     """Tracks three measures of each camera: size and sigma of its blobs, and the share of fiducials that it misses.
 
     Each is averaged over a second and compared with a regression on the object's place in the image, its distance and
-    the viewing direction, learnt from the camera's own history. New places are learnt, known ones are tested. The
+    the viewing direction, learned from the camera's own history. New places are learned, known ones are tested. The
     remainder is correlated in time, so its innovations feed Page's cumulative sum.
     """
 
     name = "image quality"
+    STATE: ClassVar = {
+        "began": ("_began", float | None),
+        "collected": ("_collected", float),
+        "bad": ("_bad", NDArray[np.bool_]),
+        "test": ("_test", Cusum),
+        **{
+            name: (f"_{name}", Array)
+            for name in (
+                "distance", "count", "sum", "place", "last_time", "last_value", "last_place", "coefficients",
+                "covariance", "variance", "blocks", "usual", "good",
+            )
+        },
+    }  # fmt: skip
 
     def __init__(self, cameras: int) -> None:
         """Start with cameras whose images are good."""
@@ -205,27 +217,6 @@ class ImageQuality:
             message = f"{names[camera]} shows its blobs as before"
             events.append(Event(state.time, state.snapshot, "clean", names[camera], message=message))
         return events
-
-    def saved(self) -> dict[str, Any]:
-        """See `SequentialTest`."""
-        arrays = {name: getattr(self, f"_{name}") for name in _ARRAYS}
-        test = {name: getattr(self._test, name) for name in Cusum.STATE}
-        return arrays | test | {"began": self._began, "collected": self._collected}
-
-    def restored(self, values: dict[str, Any]) -> None:
-        """See `SequentialTest`."""
-        for name in _ARRAYS:
-            setattr(self, f"_{name}", check_like(f"{self.name}: {name}", getattr(self, f"_{name}"), values[name]))
-        for name in Cusum.STATE:
-            setattr(self._test, name, check_like(f"{self.name}: {name}", getattr(self._test, name), values[name]))
-        began, self._collected = values["began"], float(values["collected"])
-        self._began = None if began is None else float(began)
-
-
-_ARRAYS = (
-    "distance", "count", "sum", "place", "last_time", "last_value", "last_place", "coefficients", "covariance",
-    "variance", "blocks", "usual", "bad", "good",
-)  # fmt: skip
 
 
 def _prior() -> Array:

@@ -91,10 +91,9 @@ class RigKeeper:
             raise InputError("horizon: with unknown lights, the rig needs all snapshots; leave the horizon out")
         self.options = _for_keeping(options)
         self._memory = KeeperMemory.from_factory(rig, obj, drift, self.options, horizon)
-        if tests is None:
-            cameras, rigid = rig.num_cameras, not obj.unknown_markers  # these tests all need a rigid object
-            tests = (ImageQuality(cameras), ClockOffsets(cameras), ForeignObject()) if rigid else ()
-        self.tests = tuple(tests)
+        self.tests: tuple[SequentialTest, ...] = tuple(tests or ())
+        if tests is None and not obj.unknown_markers:  # these tests all need a rigid object
+            self.tests = (ImageQuality(rig.num_cameras), ClockOffsets(rig.num_cameras), ForeignObject())
         clocks = (test for test in self.tests if isinstance(test, ClockOffsets))
         self._clock = next(clocks, ClockOffsets(rig.num_cameras))
         self._labelling = Labelling(self._memory.factory, obj, self.options, detection, detector)
@@ -349,7 +348,7 @@ class RigKeeper:
         state = {
             "memory": writer.write(KeeperMemory, memory),
             "labelling": writer.write(Labelling, self._labelling),
-            "tests": {test.name: writer.write_plain(test.saved()) for test in self.tests},
+            "tests": {test.name: writer.write(type(test), test) for test in self.tests},
         }
         return KeeperFile(
             time=memory.time,
@@ -406,7 +405,7 @@ class RigKeeper:
             keeper._labelling.rig = keeper.factory
             for test in keeper.tests:
                 if test.name in found["tests"]:
-                    test.restored(reader.read_plain(found["tests"][test.name], f"tests.{test.name}"))
+                    reader.read_object(type(test), found["tests"][test.name], f"tests.{test.name}", test)
         except (ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
             raise unusable_error(path, error) from error
         except InputError as error:

@@ -15,7 +15,7 @@ from imgcal.online.events import iso_time, snapshot_name
 from imgcal.online.state_document import StateReader, StateWriter
 from imgcal.types import CalibrationObject, CameraRig
 
-FORMAT = "imgcal-keeper/8"
+FORMAT = "imgcal-keeper/9"
 """Raise the number when a key or type of `state_document` changes; a state of another version is not read."""
 MOST_BYTES = 2**28
 
@@ -88,8 +88,9 @@ def read_state(path: str | Path) -> tuple[dict[str, Any], StateReader]:
         raise InputError(f"{path}: not valid JSON: {shorten(str(error))}") from error
     found = values.get("format") if isinstance(values, dict) else None
     if found != FORMAT and isinstance(found, str) and found.startswith(FORMAT[: FORMAT.index("/") + 1]):
+        age = "earlier" if (len(found), found) < (len(FORMAT), FORMAT) else "later"
         raise InputError(
-            f"{path}: state files from {'earlier' if found < FORMAT else 'later'} versions cannot be resumed: found "
+            f"{path}: state files from {age} versions cannot be resumed: found "
             f'{shorten(found)}, expected {FORMAT}; the file holds the last rig as "rig"'
         )
     if found != FORMAT:

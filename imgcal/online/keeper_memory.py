@@ -65,7 +65,7 @@ class KeeperMemory:
     drift_watch: DriftWatch
     doubts: ObjectChecks
     search: Search
-    looks: NDArray[np.int64]  # (C,) snapshots learnt of each camera in its current pose
+    looks: NDArray[np.int64]  # (C,) snapshots learned of each camera in its current pose
     before: RigBelief  # before the pending changes
     lights: LightTracks | None = None  # None = an object is known
     count: int = 0

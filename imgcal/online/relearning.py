@@ -1,4 +1,4 @@
-"""Cameras that moved: what is reported about them until they are relearnt."""
+"""Cameras that moved: what is reported about them until they are relearned."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from imgcal.online.events import ChangeKind, Event
 from imgcal.types import SHOWN_UNITS
 
 RELEARNT = 1.1
-"""Largest standard deviations of a relearnt camera, relative to those before it moved."""
+"""Largest standard deviations of a relearned camera, relative to those before it moved."""
 RELEARNING_SNAPSHOTS = 4
 """Number of snapshots between two checks for that."""
 EXTRINSICS_AND_PINHOLE = 10

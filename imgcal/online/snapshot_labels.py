@@ -26,7 +26,7 @@ Correct = Callable[[Detections, RigidTransform], Detections]
 """Moves labelled blobs of late cameras to where they would have been in time, given the object's pose (1,)."""
 
 MOST_VAIN = 64
-"""Successive snapshots that fit in no camera, after which the rig is relearnt from the factory calibration."""
+"""Successive snapshots that fit in no camera, after which the rig is relearned from the factory calibration."""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import numpy as np
 
 from imgcal.monitoring import MonitorUpdate, RigFilter, RigMonitor
 from imgcal.online.drift_watch import DriftWatch
+from imgcal.online.events import Event
 from imgcal.online.keeper_memory import LEAST_LOOKS, KeeperMemory
 from imgcal.online.label_consistency import Checked
 from imgcal.online.object_checks import ObjectChecks
@@ -73,6 +74,8 @@ def learn_snapshot(memory: KeeperMemory, checked: Checked) -> MonitorUpdate:
 def test_object(memory: KeeperMemory, learnt: bool) -> MonitorUpdate | None:
     """Test whether labels do not fit because the object differs from its file; return the update in that case.
 
+    Otherwise report where most cameras have moved at once.
+
     Args:
         memory: the keeper's memory; updated.
         learnt: test the snapshots absorbed without those labels; otherwise the refused ones.
@@ -80,10 +83,15 @@ def test_object(memory: KeeperMemory, learnt: bool) -> MonitorUpdate | None:
     doubted = memory.doubts.learnt if learnt else memory.doubts.refused
     snapshots = [(memory.observed(one.blobs), one.rig_from_object) for one in doubted]
     first = memory.monitor.filter.count
-    found = memory.monitor.diagnose_object(snapshots, [one.seconds for one in doubted], learnt)
+    pauses = [one.seconds for one in doubted]
+    found = memory.monitor.diagnose_object(snapshots, pauses, learnt)
     if found is not None and not learnt:
         memory.times.extend((first + n, one.time) for n, one in enumerate(doubted))
         memory.learnt = doubted[-1].time
+    if found is None and not learnt and memory.monitor.have_all_moved(snapshots, pauses):
+        message = "most cameras have moved at once, and labels fit in none; if this lasts, the rig is learned anew"
+        event = Event(memory.time, memory.count - 1, "moved", None, doubted[0].time, "unknown", message=message)
+        memory.pending.append(event)
     memory.doubts.record_test(found is not None)
     return found
 

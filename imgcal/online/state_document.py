@@ -151,25 +151,6 @@ class StateWriter:
             self._arrays.append((np.array(array.T if by_columns else array, order="C"), by_columns))
         return self._numbers[key]
 
-    def write_plain(self, value: Any) -> Any:
-        """Write a value without a declared type: text, numbers, arrays, and lists, tuples and dictionaries of them.
-
-        Raises:
-            TypeError: the value is of another type.
-        """
-        kind = type(value)
-        if kind in SIMPLE or kind is float:
-            return self.write(kind, value)
-        if isinstance(value, list):
-            return [self.write_plain(item) for item in value]
-        if isinstance(value, tuple):
-            return {"tuple": [self.write_plain(item) for item in value]}
-        if isinstance(value, dict):
-            return {"dict": [[self.write_plain(key), self.write_plain(item)] for key, item in value.items()]}
-        if isinstance(value, torch.Tensor):
-            return {"tensor": self._array(value)}
-        return self.write(None | bool | int | float | str | np.ndarray, value)
-
     def tables(self) -> dict[str, Any]:
         """The tables that values refer to; for an array: type, shape, base64 of its bytes, whether by columns."""
         arrays = [
@@ -238,25 +219,6 @@ class StateReader:
         if origin in (list, tuple, set, frozenset):
             return origin(self.read(args[0], item, where) for item in plain)
         return self.read_object(kind, plain, where, fresh)
-
-    def read_plain(self, plain: Any, where: str) -> Any:
-        """Read a value written by `StateWriter.write_plain`.
-
-        Raises:
-            ValueError: it is no such value.
-        """
-        if isinstance(plain, list):
-            return [self.read_plain(item, where) for item in plain]
-        if not isinstance(plain, dict) or len(plain) != 1:
-            return self.read(None | bool | int | float | str, plain, where)
-        (name, inner), *_ = plain.items()
-        if name == "tuple":
-            return tuple(self.read_plain(item, where) for item in inner)
-        if name == "dict":
-            return {self.read_plain(key, where): self.read_plain(item, where) for key, item in inner}
-        if name == "tensor":
-            return self.read(torch.Tensor, {"array": inner}, where)
-        return self.read(float | np.ndarray, plain, where)
 
     def read_object(self, kind: type, plain: Any, where: str, fresh: Any = None) -> Any:
         """Read an object; `fresh` is filled with it where it can change, see `read`."""

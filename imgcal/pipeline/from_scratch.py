@@ -33,6 +33,7 @@ from imgcal.pipeline.board_turns import require_one_turn
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.late_cameras import find_late_cameras, require_same_moments
 from imgcal.pipeline.lights_from_scratch import calibrate_lights_from_scratch, place_by_stick
+from imgcal.pipeline.partial_labels import name_missing_labels
 from imgcal.pipeline.recalibration import fit_with_timing, label_again
 from imgcal.pipeline.repeats import drop_repeats, name_repeats
 from imgcal.pipeline.sources import Frames, as_unknown_marker, find_blobs
@@ -118,7 +119,8 @@ def calibrate_from_scratch(
     found = time.perf_counter()
     is_labelled, is_stick = (detections.fiducial >= 0).any(), obj.pose_rank == 5
     alone = detections if is_labelled or is_stick else label_images(detections, cameras, obj, options, progress)
-    first = place_by_stick(detections, cameras, obj) if is_stick else _first_rig(alone, cameras, obj).rig
+    with name_missing_labels(detections):
+        first = place_by_stick(detections, cameras, obj) if is_stick else _first_rig(alone, cameras, obj).rig
     placed = replace(first, prior=PLACED)
     labelled: Associations | None = None
     try:
@@ -130,11 +132,12 @@ def calibrate_from_scratch(
                 with contextlib.suppress(RefusedError), require_solvable():
                     fit = _fit(again, first, cameras, obj, options)
     except RefusedError as error:
-        with contextlib.suppress(*UNSOLVABLE):
-            require_units(error, detections, placed, obj, from_scratch=True)
-            if labelled is not None:
-                require_same_moments(error, alone, labelled, placed, obj, options)
-        raise
+        with name_missing_labels(detections):
+            with contextlib.suppress(*UNSOLVABLE):
+                require_units(error, detections, placed, obj, from_scratch=True)
+                if labelled is not None:
+                    require_same_moments(error, alone, labelled, placed, obj, options)
+            raise
     late = find_late_cameras(alone, fit.tally, placed, obj, options)
     seconds = {
         "detection": found - started,

@@ -9,6 +9,7 @@ import contextlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NoReturn
 
 import numpy as np
 import torch
@@ -26,11 +27,12 @@ from imgcal.pipeline.late_cameras import find_late_cameras, require_same_moments
 from imgcal.pipeline.learned_measurer import LearnedMeasurer
 from imgcal.pipeline.learned_proposer import LearnedProposer
 from imgcal.pipeline.lights import add_lights, find_lights
+from imgcal.pipeline.partial_labels import name_missing_labels
 from imgcal.pipeline.repeats import Repeats, drop_repeats, hide_repeats, name_repeats
 from imgcal.pipeline.sources import Detector, Frames, as_one, as_unknown_marker, check_frames, find_blobs, make_sight
 from imgcal.pipeline.synchronization import NOTICEABLE, find_unsynchronized
 from imgcal.pipeline.turned_images import require_matching_images
-from imgcal.pipeline.units import UNSOLVABLE, require_solvable, require_units
+from imgcal.pipeline.units import UNSOLVABLE, is_solid, require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior
 
 LEAST_USED, MOST_USED = 0.5, 0.75
@@ -97,7 +99,7 @@ def calibrate(
         return _calibrate_lights(detections, repeats, rig, obj, options, found - started)
     if obj.parts and (sight is not None or initializer is not None):
         obj.require_rigid("for detectors and networks that look for a pattern")
-    case = _Case(detections, rig, obj, options, may_be_misread=_is_solid(obj) and sight is None)
+    case = _Case(detections, rig, obj, options, may_be_misread=is_solid(obj) and sight is None)
     if case.may_be_misread and not detections.labelled.any() and lines_of_sight_miss(detections, rig):
         # Identity takes minutes to find nothing in a long capture.
         case.try_conventions(RefusedError("identity: the cameras' lines of sight to the object do not meet"))
@@ -107,7 +109,6 @@ def calibrate(
             labelled = associate(detections, rig, obj, options, progress, sight)
     except RefusedError as error:
         case.explain(error, None)
-        raise
     identified = time.perf_counter()
     try:
         fit = _fit_labels(labelled, detections if sight is None else _given_labels(labelled), case, initializer)
@@ -119,7 +120,6 @@ def calibrate(
                 )
                 return replace(fit, labelled=name_repeats(fit.labelled, repeats), repeats=repeats)
         case.explain(error, labelled)
-        raise
     used, given = len(fit.labelled.used), len(detections.snapshot_names)
     if case.may_be_misread and used < LEAST_USED * given:
         case.try_conventions(RefusedError(f"identity: only {used} of {given} snapshots could be used"))
@@ -132,11 +132,6 @@ def calibrate(
     return replace(fit, labelled=name_repeats(fit.labelled, repeats), seconds=seconds, late=late, repeats=repeats)
 
 
-def _is_solid(obj: CalibrationObject) -> bool:
-    """Tell whether its extent in an image means something; that of a light says nothing, and of a stick little."""
-    return obj.pose_rank == 6 and not obj.parts
-
-
 @dataclass(frozen=True)
 class _Case:
     """What is to be calibrated, and whether images or rig may follow other conventions than ours."""
@@ -147,27 +142,29 @@ class _Case:
     options: PipelineOptions
     may_be_misread: bool
 
-    def explain(self, error: RefusedError, labelled: Associations | None) -> None:
-        """Replace a refusal if a cause can be named: other conventions, units or images, or late cameras.
+    def explain(self, error: RefusedError, labelled: Associations | None) -> NoReturn:
+        """Raise a refusal, with a cause if one can be named: other conventions, units or images, or late cameras.
 
         Args:
             error: the refusal.
             labelled: the labels, where the refusal is not about these.
 
         Raises:
-            RefusedError: with the cause.
+            RefusedError: always.
         """
-        given = (self.detections, self.rig, self.obj)
-        with contextlib.suppress(*UNSOLVABLE):  # what cannot be solved explains nothing
-            if self.may_be_misread:
-                self.try_conventions(error)
-            # Labels show more than the sizes of images, which reflections distort.
-            require_units(error, *(given if labelled is None else (labelled.detections, self.rig, self.obj)))
-            if labelled is None or not _is_solid(self.obj):
-                require_meeting_rays(error, self.detections, self.rig)
-            if labelled is not None:
-                require_matching_images(error, self.detections, labelled, self.rig, self.obj)
-                require_same_moments(error, self.detections, labelled, self.rig, self.obj, self.options)
+        with name_missing_labels(self.detections):
+            with contextlib.suppress(*UNSOLVABLE):  # what cannot be solved explains nothing
+                if self.may_be_misread:
+                    self.try_conventions(error)
+                # Labels show more than the sizes of images, which reflections distort.
+                shown = self.detections if labelled is None else labelled.detections
+                require_units(error, shown, self.rig, self.obj)
+                if labelled is None or not is_solid(self.obj):
+                    require_meeting_rays(error, self.detections, self.rig)
+                if labelled is not None:
+                    require_matching_images(error, self.detections, labelled, self.rig, self.obj)
+                    require_same_moments(error, self.detections, labelled, self.rig, self.obj, self.options)
+            raise error
 
     def try_conventions(self, error: RefusedError) -> None:
         """Replace a refusal if images or rig follow other conventions; see `require_conventions`."""
@@ -215,8 +212,8 @@ def _calibrate_lights(
             identified = time.perf_counter()
             fit = fit_steady(lights.labelled, lights.labelled.detections, rig, obj, options)
     except RefusedError as error:
+        require_units(error, detections, rig, obj)
         with contextlib.suppress(*UNSOLVABLE):
-            require_units(error, detections, rig, obj)
             require_meeting_rays(error, detections, rig)
         raise
     seconds = {

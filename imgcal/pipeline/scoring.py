@@ -21,6 +21,7 @@ from imgcal.detection import DetectionOptions
 from imgcal.errors import RefusedError
 from imgcal.pipeline.board_turns import settle_labels
 from imgcal.pipeline.lights import FoundLights, find_lights
+from imgcal.pipeline.partial_labels import name_missing_labels
 from imgcal.pipeline.sources import Frames, as_one, as_unknown_marker, find_blobs
 from imgcal.pipeline.units import require_solvable, require_units
 from imgcal.types import CalibrationObject, CameraRig, Detections
@@ -116,17 +117,16 @@ def score(
     rig, options = rig.to(torch.float64), options.of_object(obj)
     detections = settle_labels(find_blobs(source, rig, obj, detection), rig, obj)
     obj = as_unknown_marker(obj, detections)
-    if obj.unknown_markers:
-        with require_solvable():
-            lights = find_lights(detections, rig, obj)
-            return replace(_fit_poses(lights.labelled, rig, obj, options), lights=lights)
     try:
         with require_solvable():
+            if obj.unknown_markers:
+                lights = find_lights(detections, rig, obj)
+                return replace(_fit_poses(lights.labelled, rig, obj, options), lights=lights)
             return _fit_poses(associate(detections, rig, obj, options, progress), rig, obj, options)
     except RefusedError as error:
-        if obj.pose_rank == 6 and not obj.parts:  # as in `calibrate`
+        with name_missing_labels(detections):
             require_units(error, detections, rig, obj)
-        raise
+            raise
 
 
 def _fit_poses(labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions) -> RigScore:

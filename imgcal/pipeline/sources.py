@@ -16,6 +16,7 @@ from imgcal.detection import DetectionOptions, Frame, detect
 from imgcal.errors import InputError
 from imgcal.io import MARGIN, grey_frame, model_file, nearest
 from imgcal.matching import MatchedFilter
+from imgcal.messages import list_names
 from imgcal.pipeline.learned_measurer import LearnedMeasurer
 from imgcal.pipeline.learned_proposer import LearnedProposer, load_proposer
 from imgcal.types import BLOB_RADIUS, SIGMA, CalibrationObject, CameraRig, Detections
@@ -175,7 +176,7 @@ def check_detections(detections: Detections, rig: CameraRig, obj: CalibrationObj
 
     Raises:
         InputError: inconsistent columns, a camera, fiducial or pixel that does not exist, a fiducial that a camera has
-            twice in a snapshot, or an invalid standard deviation.
+            twice in a snapshot, an invalid standard deviation, or several cameras that share no snapshot.
     """
     count = np.shape(detections.uv)[:1]
     for name in ROWS:
@@ -232,7 +233,27 @@ def check_detections(detections: Detections, rig: CameraRig, obj: CalibrationObj
             f"detections: found ({u:g}, {v:g}) in row {row}, expected a pixel of the {width}x{height} image of camera "
             f"{rig.camera_names[detections.camera[row]]}"
         )
+    if len(detections.snapshot_names) > 1:
+        _require_shared_snapshot(detections)
     return detections
+
+
+def _require_shared_snapshot(detections: Detections) -> None:
+    """Require a snapshot in which two cameras have blobs: without one, nothing relates the cameras to each other."""
+    seen = np.unique(np.stack((detections.snapshot, detections.camera)), axis=1)
+    snapshots, cameras = seen
+    if len(np.unique(snapshots)) < len(snapshots) or len(np.unique(cameras)) < 2:
+        return
+    first, second = np.unique(cameras)[:2]
+    names = [
+        f"{detections.camera_names[camera]}: "
+        f"{list_names(detections.snapshot_names[each] for each in snapshots[cameras == camera])}"
+        for camera in (first, second)
+    ]
+    raise InputError(
+        f"detections: found no snapshot in which two cameras have blobs ({'; '.join(names)}), expected what cameras "
+        "see at one moment in snapshots of one name"
+    )
 
 
 def _require(detections: Detections, column: str, good: np.ndarray, expected: str) -> None:

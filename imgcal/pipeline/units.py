@@ -24,8 +24,10 @@ UNSOLVABLE = (np.linalg.LinAlgError, torch.linalg.LinAlgError)
 """Raised where equations have no solution."""
 LEAST_IMAGE, LARGEST_IMAGE = 3.0, 5.0
 """If an object's image is smaller (pixels) or larger (times the image width) than this, its unit is wrong."""
-LEAST_DISTANCE, LEAST_SIZE = 20.0, 2.0
-"""Millimetres: objects nearer and smaller than this are in metres."""
+LEAST_DISTANCE, LEAST_SIZE = 20.0, 1.0
+"""Millimetres: objects nearer and smaller than this are in metres; an endoscope sees larger ones from there."""
+NARROW = 5.0
+"""Focal length in image widths from which the rig may be of microscopes, which are as near to objects as small."""
 LARGEST_DISTANCE, LARGEST_SIZE = 200_000.0, 20_000.0
 """Millimetres: objects farther and larger than this are in micrometres."""
 THOUSAND = 1000.0
@@ -43,11 +45,12 @@ LEAST_TURN = math.radians(20)
 def unit_doubt(rig: CameraRig, obj: CalibrationObject, from_scratch: bool = False) -> str:
     """Say which of a rig and an object seems to be in another unit; empty if neither does.
 
-    This only makes a message: images alone cannot tell.
+    This only makes a message: images alone cannot tell. A rig and an object both in inches are not noticed: millimetres
+    would be as plausible.
 
     Args:
         rig: its positions, or distance from the object, define what is plausible.
-        obj: the calibration object.
+        obj: the calibration object; a single marker, or unknown markers, show no size.
         from_scratch: the rig's lengths are those of the object.
 
     Examples:
@@ -64,9 +67,12 @@ def unit_doubt(rig: CameraRig, obj: CalibrationObject, from_scratch: bool = Fals
     distance = _distance(rig)
     if distance is None:
         return ""
-    if obj.num_fiducials == 1:
-        return "" if from_scratch else _distance_doubt(distance)
-    size, width = obj.size, float(rig.image_size[:, 0].double().median())
+    width = float(rig.image_size[:, 0].double().median())
+    unit = _implausible_unit(distance, obj, float(rig.focal_length.mean()) / width)
+    if obj.pose_rank == 3:
+        seen = f"the markers are {distance:.3g} mm from the cameras"
+        return f"the rig seems to be in {unit}, expected millimetres: {seen}" if unit else ""
+    size = obj.size
     image = float(rig.focal_length.mean()) * size / distance
     seen = f"it is {size:.3g} mm large, and {distance:.3g} mm from the cameras"
 
@@ -77,17 +83,26 @@ def unit_doubt(rig: CameraRig, obj: CalibrationObject, from_scratch: bool = Fals
         return f"the object seems to be in metres, expected millimetres: {seen}"
     if not plausible(image) and image > LARGEST_IMAGE * width and plausible(image / THOUSAND):
         return f"the rig seems to be in metres, expected millimetres: the object is {seen.removeprefix('it is ')}"
-    other = ""
-    if distance < LEAST_DISTANCE and size < LEAST_SIZE:
-        other = "metres"
-    elif distance > LARGEST_DISTANCE and size > LARGEST_SIZE:
-        other = "micrometres"
-    if other and from_scratch:
-        return f"the object seems to be in {other}, expected millimetres: {seen}"
-    if other:
-        return (
-            f"rig and object seem to be in {other}, expected millimetres: the object is {seen.removeprefix('it is ')}"
-        )
+    if unit and from_scratch:
+        return f"the object seems to be in {unit}, expected millimetres: {seen}"
+    if unit:
+        return f"rig and object seem to be in {unit}, expected millimetres: the object is {seen.removeprefix('it is ')}"
+    return ""
+
+
+def _implausible_unit(distance: float, obj: CalibrationObject, focal_share: float) -> str:
+    """Name the unit of a rig and its object if no such rig can be in millimetres; empty if it can.
+
+    Args:
+        distance: from the cameras to the object.
+        obj: the object; the size of a single marker, or of unknown ones, does not count.
+        focal_share: focal length in image widths.
+    """
+    has_size = obj.pose_rank > 3
+    if distance < LEAST_DISTANCE and focal_share < NARROW and (obj.size < LEAST_SIZE or not has_size):
+        return "metres"
+    if distance > LARGEST_DISTANCE and (obj.size > LARGEST_SIZE or not has_size):
+        return "micrometres"
     return ""
 
 
@@ -107,6 +122,11 @@ def image_doubt(detections: Detections, rig: CameraRig, obj: CalibrationObject) 
     return _doubt_by_directions(detections, rig) or _doubt_by_size(detections, rig, obj)
 
 
+def is_solid(obj: CalibrationObject) -> bool:
+    """Tell whether its extent in an image means something; that of a light says nothing, and of a stick little."""
+    return obj.pose_rank == 6 and not obj.parts
+
+
 def require_units(
     error: RefusedError, detections: Detections, rig: CameraRig, obj: CalibrationObject, from_scratch: bool = False
 ) -> None:
@@ -122,10 +142,10 @@ def require_units(
     Raises:
         RefusedError: a unit is in doubt.
     """
-    has_shape = obj.pose_rank == 6 and not obj.parts  # the image of a light says nothing, and that of a stick little
-    by_images = image_doubt(detections, rig, obj) if has_shape and not (from_scratch or _focal_doubt(rig)) else ""
-    by_lengths = (unit_doubt(rig, part, from_scratch) for part in obj.each)
-    if doubt := by_images or next(filter(None, by_lengths), ""):
+    by_images = ""
+    if is_solid(obj) and not from_scratch and not _focal_doubt(rig):
+        by_images = image_doubt(detections, rig, obj)
+    if doubt := by_images or unit_doubt(rig, obj, from_scratch):
         raise RefusedError(f"{doubt}; so {error.reason}") from error
 
 
@@ -156,14 +176,6 @@ def _focal_doubt(rig: CameraRig) -> str:
         f"the focal length of camera {rig.camera_names[camera]} seems to be {unit}, expected pixels: it is "
         f"{focal:.3g}, and images are {width} pixels wide"
     )
-
-
-def _distance_doubt(distance: float) -> str:
-    """Judge a rig by its distance (mm) from what it looks at: a light has no size."""
-    if LEAST_DISTANCE <= distance <= LARGEST_DISTANCE:
-        return ""
-    unit = "metres" if distance < LEAST_DISTANCE else "micrometres"
-    return f"the rig seems to be in {unit}, expected millimetres: its cameras look at places {distance:.3g} mm away"
 
 
 def _doubt_by_poses(detections: Detections, rig: CameraRig, obj: CalibrationObject) -> str:

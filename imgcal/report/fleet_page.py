@@ -37,7 +37,7 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Taught:
-    """One kind of rig, and the prior learnt from its devices, or why there is none."""
+    """One kind of rig, and the prior learned from its devices, or why there is none."""
 
     kind: KindOfRig
     learnt: LearntPrior | None
@@ -49,8 +49,8 @@ def write_fleet_report(dataset: Dataset, taught: Sequence[Taught], before: RigPr
 
     Args:
         dataset: results of the fleet.
-        taught: what was learnt, kind by kind of rig.
-        before: the prior that captures were recalibrated with, beside which the learnt one stands.
+        taught: what was learned, kind by kind of rig.
+        before: the prior that captures were recalibrated with, beside which the learned one stands.
         path: HTML file, replaced in one step.
 
     Raises:

@@ -18,7 +18,7 @@ class BlobFlag(IntFlag):
     BORDER = 1  # touches the image border: part of the blob is outside
     MERGED = 2  # two or more blobs in one
     SATURATED = 4  # clipped grey values; the centre is less certain, its sigma says by how much
-    MASKED = 8  # inside a mask of known reflections
+    MASKED = 8  # reaches into a mask of known reflections
     OUTLIER = 16  # labelled, but not where the calibrated rig predicts this fiducial
     REFLECTION = 32  # not a marker, according to a learned measurer
 

@@ -29,7 +29,7 @@ from .loop import EVENTS, Keeper, Page, Watch
 from .marker_files import MarkerFile
 from .metrics import Metrics, Tally
 from .open_igt_link import OpenIGTLink, listening_address
-from .pose_files import PoseFile
+from .pose_files import PoseFile, forget_rows
 from .pose_zeromq import PosePublisher
 from .poses import PoseRecord, Poses, PoseSink
 from .qualisys import Qualisys
@@ -97,6 +97,7 @@ __all__ = [
     "adapted_networks",
     "check_exposure",
     "forget_after",
+    "forget_rows",
     "holds_videos",
     "listening_address",
     "put_aside",

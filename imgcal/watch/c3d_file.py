@@ -21,10 +21,11 @@ from imgcal.watch.line_file import create_whole, write_whole
 BLOCK = 512  # bytes
 PARAMETERS_AT = 2  # block of the parameters, counted from 1
 INTEL = 84
-MOST_FRAMES = 65_534  # limit of its header; to some readers, one more means "unknown"
+MOST_SHORT = 65_535  # in 16 bits; to readers it means: this many or more, see the longer counts
 MOST_LABELS = 255  # per parameter; more go into LABELS2, LABELS3, ...
 MOST_BYTE, MASKED_CAMERAS = 255, 7
 INVALID = -1.0
+MISSING = struct.pack("<4f", 0.0, 0.0, 0.0, INVALID)  # a point that was not seen
 CHARACTER, INTEGER, REAL = -1, 2, 4
 
 
@@ -53,16 +54,31 @@ class C3DFile:
 
     def _begin(self, labels: Sequence[str]) -> bytes:
         """Make the part before the frames, and note the positions of its counts."""
-        parameters, self._counts = _parameters(labels, self._rate, self._scale, self.frames)
+        parameters, self._places = _parameters(labels, self._rate, self._scale)
         blocks = -(-len(parameters) // BLOCK)
         self._data_at = PARAMETERS_AT + blocks
         content = bytearray(BLOCK) + parameters.ljust(blocks * BLOCK, b"\0")
         content[BLOCK : BLOCK + 4] = bytes((1, 80, blocks, INTEL))
         struct.pack_into("<BB", content, 0, PARAMETERS_AT, 80)
-        struct.pack_into("<HHHHH", content, 2, len(labels), 0, 1, self.frames, 0)
+        struct.pack_into("<HHHHH", content, 2, len(labels), 0, 1, 0, 0)
         struct.pack_into("<fHHf", content, 12, -self._scale, self._data_at, 0, self._rate)
-        struct.pack_into("<H", content, BLOCK + self._counts["POINT:DATA_START"], self._data_at)
+        struct.pack_into("<H", content, BLOCK + self._places["POINT:DATA_START"], self._data_at)
+        for place, count in self._frame_counts():
+            content[place : place + len(count)] = count
         return bytes(content)
+
+    def _frame_counts(self) -> list[tuple[int, bytes]]:
+        """The number of frames wherever the file states it, in bytes, with the positions.
+
+        The format counted in 16 bits once; where these do not suffice, readers take one of the longer counts.
+        """
+        short, long = struct.pack("<H", min(self.frames, MOST_SHORT)), struct.pack("<I", self.frames)
+        parameters = {
+            "POINT:FRAMES": short,
+            "POINT:LONG_FRAMES": struct.pack("<f", self.frames),
+            "TRIAL:ACTUAL_END_FIELD": long,
+        }
+        return [(8, short), *((BLOCK + self._places[name], count) for name, count in parameters.items())]
 
     def widen(self, labels: Sequence[str]) -> None:
         """Add columns for more points, missing in all frames so far, atomically.
@@ -78,13 +94,13 @@ class C3DFile:
         rows = np.zeros((self.frames, len(labels), 4), "<f4")
         rows[..., 3] = INVALID
         rows[:, : self._points] = np.frombuffer(given, "<f4").reshape(self.frames, self._points, 4)
-        counts, data_at = self._counts, self._data_at
+        places, data_at = self._places, self._data_at
         self._file.close()
         try:
             write_bytes(self._path, self._begin(labels) + rows.tobytes())
             self._points = len(labels)
         except InputError:
-            self._counts, self._data_at = counts, data_at
+            self._places, self._data_at = places, data_at
             raise
         finally:
             self._file = open(self._path, "r+b", buffering=0)  # noqa: SIM115  # open until close
@@ -98,10 +114,8 @@ class C3DFile:
             cameras: (F, N) bits: which of the first seven cameras saw the point.
 
         Raises:
-            OSError: the frames cannot be written, or exceed the limit of the format; the file holds the frames so far.
+            OSError: the frames cannot be written; the file holds the frames so far.
         """
-        if self.frames + len(points) > MOST_FRAMES:
-            raise OSError(f"a C3D file holds no more than {MOST_FRAMES:,} frames")
         valid = np.asarray(np.isfinite(points).all(-1))
         steps = np.ceil(np.where(valid, error, 0) / self._scale).clip(1, MOST_BYTE)  # 0 means: not measured
         rows = np.empty((*points.shape[:2], 4), "<f4")
@@ -110,31 +124,32 @@ class C3DFile:
         self._file.seek(0, os.SEEK_END)
         self._write(rows.tobytes())
         self.frames += len(points)
-        for place in (8, *(BLOCK + self._counts[name] for name in ("POINT:FRAMES", "TRIAL:ACTUAL_END_FIELD"))):
+        for place, count in self._frame_counts():
             self._file.seek(place)  # after the frames that it counts
-            self._write(struct.pack("<H", self.frames))
+            self._write(count)
 
     def close(self) -> None:
-        """Fill the last block, and close."""
+        """Fill the last block with missing points, since some readers take it for frames, and close."""
         if not self._file.closed:
             with contextlib.suppress(OSError):  # the points can be read without it
                 self._file.seek(0, os.SEEK_END)
-                self._write(b"\0" * (-self._file.tell() % BLOCK))
+                self._write(MISSING * (-self._file.tell() % BLOCK // len(MISSING)))
             self._file.close()
 
     def _write(self, content: bytes) -> None:
         write_whole(self._file.fileno(), content, self._path)
 
 
-def _parameters(labels: Sequence[str], rate: float, scale: float, frames: int) -> tuple[bytes, dict[str, int]]:
-    """The parameter section, and the offsets of the values in it."""
+def _parameters(labels: Sequence[str], rate: float, scale: float) -> tuple[bytes, dict[str, int]]:
+    """The parameter section of a file without frames, and the offsets of the values in it."""
     groups: dict[str, dict[str, tuple[int, tuple[int, ...], bytes]]] = {
         "POINT": {
             "USED": _integers(len(labels)),
             "SCALE": _real(-scale),
             "RATE": _real(rate),
             "DATA_START": _integers(0),
-            "FRAMES": _integers(frames),
+            "FRAMES": _integers(0),
+            "LONG_FRAMES": _real(0.0),
             "UNITS": _text("mm"),
             **_labels("LABELS", labels),
             **_labels("DESCRIPTIONS", labels),  # some readers need them
@@ -142,7 +157,7 @@ def _parameters(labels: Sequence[str], rate: float, scale: float, frames: int) -
         "ANALOG": {"USED": _integers(0), "GEN_SCALE": _real(1.0), "RATE": _real(0.0)},
         "TRIAL": {
             "ACTUAL_START_FIELD": _integers(1, 0),
-            "ACTUAL_END_FIELD": _integers(frames, 0),
+            "ACTUAL_END_FIELD": _integers(0, 0),
             "CAMERA_RATE": _real(rate),
         },
         "MANUFACTURER": {"COMPANY": _text("imgcal"), "SOFTWARE": _text("imgcal")},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 import time
@@ -11,10 +12,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from imgcal.errors import InputError
-from imgcal.io import IMAGE_SUFFIXES, is_file_name, natural_key, nearest, read_frame
+from imgcal.io import IMAGE_SUFFIXES, is_file_name, natural_key, nearest, read_frame, snapshot_name
 from imgcal.messages import list_names
 from imgcal.types import CameraRig
 from imgcal.watch.exposures import Exposure, FileStamp, Item, Unreadable
+from imgcal.watch.timing import LEAP
 
 TICK = 0.05  # s between two scans
 GIVEN_UP = 2.0  # s for which an unreadable file may still be incomplete
@@ -23,7 +25,7 @@ REMEMBERED = 4096  # names of read files kept per camera; earlier names count as
 
 @dataclass(frozen=True)
 class Folder:
-    """Frames of a growing capture; the name of a file is that of its snapshot.
+    """Frames of a growing capture; the name of a file, without the camera's, is that of its snapshot.
 
     No file is read half-written: its size must be equal in two scans, and the image must be complete. Names that begin
     with a dot or do not end in an image suffix (`1.png.part`) are ignored.
@@ -46,17 +48,32 @@ class Folder:
         """Count the existing snapshots that were processed before."""
         if self.after is None:
             return 0
-        files = (path for name in self.rig.camera_names for path in (self.folder / "frames" / name).glob("*"))
-        stems = {path.stem for path in files if path.suffix.lower() in IMAGE_SUFFIXES and is_file_name(path.stem)}
-        return sum(natural_key(stem) <= natural_key(self.after) for stem in stems)
+        return sum(
+            natural_key(name) <= natural_key(self.after) for name in {_snapshot(path) for path in self._frames()}
+        )
 
-    def holds(self, files: Mapping[str, FileStamp]) -> bool:
-        """Tell whether files that were read, by camera, are in this folder and unchanged."""
-        try:
-            found = {name: (self.folder / "frames" / name / file.name).stat() for name, file in files.items()}
-        except (OSError, ValueError):  # missing, or a name that no file has
-            return False
-        return all(FileStamp.of(file.name, found[name]) == file for name, file in files.items())
+    def compare(self, files: Mapping[str, FileStamp]) -> tuple[int, int]:
+        """Count how many files that were read, by camera, are in this folder unchanged, and how many are missing."""
+        paths = {name: self.folder / "frames" / name / file.name for name, file in files.items()}
+        there = {name: path for name, path in paths.items() if path.is_file()}
+        kept = 0
+        for name, path in there.items():
+            with contextlib.suppress(InputError, OSError):  # it is no frame now
+                kept += FileStamp.of(path.name, read_frame(path)) == files[name]
+        return kept, len(files) - len(there)
+
+    def begins_anew(self, after: str, time: float) -> bool:
+        """Tell whether frames up to snapshot `after` were written later than `time` (s since the epoch)."""
+        for path in self._frames():
+            with contextlib.suppress(OSError):  # deleted meanwhile
+                if natural_key(_snapshot(path)) <= natural_key(after) and path.stat().st_mtime > time + LEAP:
+                    return True
+        return False
+
+    def _frames(self) -> list[Path]:
+        """The frames in this folder."""
+        files = (path for name in self.rig.camera_names for path in (self.folder / "frames" / name).glob("*"))
+        return [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES and is_file_name(path.stem)]
 
     def delete_read(self, name: str) -> None:
         """Delete the frames read so far, up to snapshot `name`; they are not needed again.
@@ -68,7 +85,7 @@ class Folder:
         problem: OSError | None = None
         for _ in range(len(self._read_files)):
             path = self._read_files.popleft()
-            if natural_key(path.stem) > natural_key(name):
+            if natural_key(_snapshot(path)) > natural_key(name):
                 self._read_files.append(path)
                 continue
             try:
@@ -89,7 +106,7 @@ class Folder:
         while self.until_idle is None or time.monotonic() - heard < self.until_idle:
             now = time.monotonic()
             ready = [(path, name) for name, camera in cameras.items() for path in camera.stable_files()]
-            for path, name in sorted(ready, key=lambda pair: (natural_key(pair[0].stem), pair[1])):
+            for path, name in sorted(ready, key=lambda pair: (natural_key(_snapshot(pair[0])), pair[1])):
                 item = self._read(cameras[name], name, path, now)
                 if item is not None:
                     yield item
@@ -128,7 +145,7 @@ class Folder:
         camera.mark_done(path)
         if self.remove:
             self._read_files.append(path)
-        return Exposure(name, found.st_mtime, frame, path.stem, FileStamp.of(path.name, found))
+        return Exposure(name, found.st_mtime, frame, _snapshot(path), FileStamp.of(path.name, frame))
 
 
 class _Camera:
@@ -168,7 +185,7 @@ class _Camera:
         self._read[path.name] = None
         if len(self._read) > REMEMBERED:
             first, _ = self._read.popitem(last=False)
-            key = natural_key(Path(first).stem)
+            key = natural_key(_snapshot(self._folder / first))
             self._floor = key if self._floor is None else max(self._floor, key)
 
     def gives_up(self, path: Path, now: float) -> bool:
@@ -182,4 +199,11 @@ class _Camera:
         stem, _, suffix = name.rpartition(".")
         if name.startswith(".") or f".{suffix.lower()}" not in IMAGE_SUFFIXES or name in self._read:
             return False
-        return is_file_name(stem) and (self._floor is None or natural_key(stem) > self._floor)
+        if self._floor is None or not is_file_name(stem):
+            return is_file_name(stem)
+        return natural_key(snapshot_name(stem, self._folder.name)) > self._floor
+
+
+def _snapshot(path: Path) -> str:
+    """Name the snapshot of a frame, `frames/<camera name>/<file>`."""
+    return snapshot_name(path.stem, path.parent.name)

@@ -182,7 +182,7 @@ class Learning:
 
     @property
     def summary(self) -> str:
-        """What was learnt, in a few words."""
+        """What was learned, in a few words."""
         why = "" if self.kept else " (none qualified, or the source ended before the learning process was ready)"
         trained = f"{plural(self.trainings, 'training')}, {self.adopted} adopted"
         return f"learning: {plural(self.kept, 'snapshot')}{why}, {trained}"

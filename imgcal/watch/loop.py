@@ -122,6 +122,7 @@ class Watch:
         self._saved = -math.inf  # the first snapshot is saved at once
         self._progress: Progress | None = None
         self._unsaved = self._hook_told = False
+        self._first: int | None = None  # digest of the source's first snapshot that shows anything
         self._kept: float | None = None  # s, time of the latest rig in the history
 
     def __enter__(self) -> Watch:
@@ -168,6 +169,7 @@ class Watch:
             self._report_hook()
             self._report_poses()
             self._apply_learning()
+            self._first = intake.first
             if snapshot is not None:
                 self.process(snapshot)
             if time.monotonic() - self._saved >= SAVED_EVERY:
@@ -195,7 +197,8 @@ class Watch:
         for exposure in snapshot.exposures.values():
             self.tally.count_time_stamp(exposure.camera, exposure.time - snapshot.time)
         files = {name: exposure.file for name, exposure in snapshot.exposures.items() if exposure.file is not None}
-        self._progress = Progress(snapshot.time, snapshot.name, source=self._source, rate=self._rate, files=files)
+        position = snapshot.time, snapshot.name, snapshot.era, self._first
+        self._progress = Progress(*position, source=self._source, rate=self._rate, files=files)
         self._unsaved = True
         for event in state.events:
             self.publish_event(event)
@@ -230,7 +233,8 @@ class Watch:
             return
         self._saved = time.monotonic()
         self._report_problems()
-        progress = replace(self._progress, logged=self._log.size)
+        tables = dict(output.table for output in self.poses if output.table is not None)
+        progress = replace(self._progress, logged=self._log.size, tables=tables, snapshot=state.snapshot)
         memory = self.keeper.saved(asdict(progress))
         self._files.write(
             state, also=lambda: memory.write(self.folder / STATE), then=lambda: self._when_saved(progress)

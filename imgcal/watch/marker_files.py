@@ -13,7 +13,7 @@ from imgcal.errors import InputError
 from imgcal.online import LightPoints, LightTracks
 from imgcal.types import CalibrationObject, CameraRig
 from imgcal.watch.c3d_file import MASKED_CAMERAS, C3DFile
-from imgcal.watch.poses import PoseRecord, UnwrittenError
+from imgcal.watch.poses import PoseRecord, PoseSink, UnwrittenError
 from imgcal.watch.trc_file import TRCFile
 
 TO_FIND_RATE = 32
@@ -28,7 +28,7 @@ MOST_LIGHTS = 255
 Frame = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]  # points (N, 3), error (N,), cameras (N,)
 
 
-class MarkerFile:
+class MarkerFile(PoseSink):
     """Writes the fiducials, or the lights, of every snapshot to a new file at a constant frame rate.
 
     Both formats have one rate for the whole file: the usual rate of the first snapshots. Missing snapshots become

@@ -6,6 +6,7 @@ Source: the OpenIGTLink protocol, version 1 of its header: http://openigtlink.or
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 import socket
 import struct
@@ -14,7 +15,7 @@ from dataclasses import dataclass, field
 
 from imgcal.errors import InputError
 from imgcal.messages import shorten
-from imgcal.watch.poses import PoseRecord, PoseStatus
+from imgcal.watch.poses import PoseRecord, PoseSink, PoseStatus
 
 PORT = 18944
 """Usual port of OpenIGTLink."""
@@ -31,6 +32,8 @@ MOST_PENDING = 2**16
 STALLED = 10.0
 """Time (s) after which a client that does not read is disconnected."""
 STATUS_EVERY = 1.0  # s
+SILENT_SECONDS, SILENT_INTERVALS = 2.0, 3.0
+"""Time without a snapshot, in seconds and in multiples of the last interval, from which STATUS says so."""
 POLYNOMIAL, WHOLE = 0x42F0E1EBA9EA3693, 2**64 - 1
 
 
@@ -103,7 +106,7 @@ class _Client:
     moved: float = field(default_factory=time.monotonic)  # s, time of its last read
 
 
-class OpenIGTLink:
+class OpenIGTLink(PoseSink):
     """Serves any number of clients without blocking; a client that does not read misses poses, then is disconnected."""
 
     def __init__(self, host: str = "127.0.0.1", port: int = PORT, stalled: float = STALLED) -> None:
@@ -114,6 +117,8 @@ class OpenIGTLink:
         """
         self._stalled, self._clients = stalled, list[_Client]()
         self._said: tuple[PoseStatus, float] | None = None  # last status, and its time in s
+        self._last: PoseRecord | None = None
+        self._came, self._interval = -math.inf, 0.0  # s, when the last snapshot came, and after how long
         self._listening = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
         try:
             self._listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -128,13 +133,33 @@ class OpenIGTLink:
 
     def send(self, record: PoseRecord) -> None:
         """See `PoseSink`: send STATUS when it changes, to new clients, and if the last one is a second old."""
-        came = self._accept()
         now = time.monotonic()
+        self._interval = 0.0 if self._last is None else now - self._came
+        self._last, self._came = record, now
+        self._serve(record, b"" if record.pose is None else transform_message(record), now)
+
+    def idle(self) -> None:
+        """See `PoseSink`: go on with STATUS."""
+        now = time.monotonic()
+        self._serve(self._record(now), b"", now)
+
+    def _record(self, now: float) -> PoseRecord:
+        """What is known at a time (s, monotonic): the last record, or that no snapshot comes."""
+        if self._last is None:
+            return PoseRecord(time.time(), 0, None, "no_object", "no snapshot has come yet")
+        silent = now - self._came
+        if silent <= max(SILENT_SECONDS, SILENT_INTERVALS * self._interval):
+            return self._last
+        message = f"no snapshot has come for {silent:.0f} s"
+        return PoseRecord(self._last.time + silent, self._last.snapshot, None, "no_object", message)
+
+    def _serve(self, record: PoseRecord, transform: bytes, now: float) -> None:
+        """Send every client a transform, with STATUS where it is due."""
+        came = self._accept()
         due = self._said is None or self._said[0] != record.status or now - self._said[1] >= STATUS_EVERY
         if due:
             self._said = record.status, now
         status = status_message(record)
-        transform = b"" if record.pose is None else transform_message(record)
         for client in tuple(self._clients):
             self._give(client, (status if due or client in came else b"") + transform, now)
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from imgcal.errors import InputError
 from imgcal.messages import shorten
-from imgcal.watch.poses import PoseRecord
+from imgcal.watch.poses import PoseRecord, PoseSink
 from imgcal.watch.zeromq import ADDRESS
 
 QUEUED = 1000  # messages kept for a slow subscriber
 
 
-class PosePublisher:
+class PosePublisher(PoseSink):
     """Publishes a line of JSON per snapshot, as written by `PoseRecord.to_json`."""
 
     def __init__(self, address: str) -> None:

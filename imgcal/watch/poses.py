@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import math
 import threading
+from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from imgcal.geometry import vector_from_rotation
 from imgcal.online import LightPoints, ObjectPose, RigState
@@ -15,6 +16,7 @@ from imgcal.online import LightPoints, ObjectPose, RigState
 PoseStatus = Literal["ok", "degraded", "no_object"]
 MOST_WAITING = 128
 """Maximum number of snapshots that wait for a sink; the oldest is dropped beyond that."""
+IDLE_EVERY = 0.25  # s between two calls of `PoseSink.idle`
 LONGEST_END = 5.0
 """Time (s) a sink has at the end for waiting poses."""
 COVARIANCE = tuple((i, j) for i in range(6) for j in range(i, 6))
@@ -29,7 +31,7 @@ COLUMNS = (
 class PoseRecord:
     """The object's pose in a snapshot.
 
-    Status: `ok`, all cameras are calibrated; `degraded`, some are not (lost, in doubt, being relearnt), and the
+    Status: `ok`, all cameras are calibrated; `degraded`, some are not (lost, in doubt, being relearned), and the
     pose comes from the others; `no_object`, there is no pose.
     """
 
@@ -107,9 +109,15 @@ class UnwrittenError(OSError):
         self.count = count
 
 
-class PoseSink(Protocol):
+class PoseSink(ABC):
     """Takes poses."""
 
+    @property
+    def table(self) -> tuple[str, int] | None:
+        """Path and size (bytes) of a table from which a restart removes the rows that come again; None = no table."""
+        return None
+
+    @abstractmethod
     def send(self, record: PoseRecord) -> None:
         """Take the pose of a snapshot.
 
@@ -118,6 +126,15 @@ class PoseSink(Protocol):
             UnwrittenError: the same of several poses.
         """
 
+    def idle(self) -> None:
+        """Do what is due while no snapshot comes; called several times a second.
+
+        Raises:
+            OSError: it cannot be done now.
+        """
+        return
+
+    @abstractmethod
     def close(self) -> None:
         """Close the sink.
 
@@ -133,7 +150,14 @@ class Poses:
     A separate thread computes covariances and serves the sink, so that neither blocks the caller.
     """
 
-    def __init__(self, name: str, sink: PoseSink, most_waiting: int = MOST_WAITING, end: float = LONGEST_END) -> None:
+    def __init__(
+        self,
+        name: str,
+        sink: PoseSink,
+        most_waiting: int = MOST_WAITING,
+        end: float = LONGEST_END,
+        idle: float = IDLE_EVERY,
+    ) -> None:
         """Start the thread.
 
         Args:
@@ -141,12 +165,13 @@ class Poses:
             sink: closed together with this object.
             most_waiting: maximum number of waiting snapshots.
             end: seconds for waiting poses at the end.
+            idle: seconds without a snapshot after which the sink may do something else.
         """
         self.name, self.dropped, self.failed = name, 0, 0
         """Number of snapshots that were dropped, or could not be written."""
         self.problem: str | None = None
         """The first problem; None = no problem."""
-        self._sink, self._most, self._end = sink, most_waiting, end
+        self._sink, self._most, self._end, self._idle = sink, most_waiting, end, idle
         self._waiting: deque[RigState] = deque()
         self._changed, self._closing = threading.Condition(), False
         self._thread = threading.Thread(target=self._work, name="poses", daemon=True)
@@ -156,6 +181,11 @@ class Poses:
     def lost(self) -> int:
         """Number of poses that the sink did not get."""
         return self.dropped + self.failed
+
+    @property
+    def table(self) -> tuple[str, int] | None:
+        """See `PoseSink`."""
+        return self._sink.table
 
     def publish(self, state: RigState) -> None:
         """Take the state after a snapshot; returns at once."""
@@ -186,14 +216,17 @@ class Poses:
     def _work(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._waiting or self._closing)
-                if not self._waiting:
+                self._changed.wait_for(lambda: self._waiting or self._closing, self._idle)
+                if self._closing and not self._waiting:
                     break
-                state = self._waiting.popleft()
+                state = self._waiting.popleft() if self._waiting else None
             try:
-                self._sink.send(PoseRecord.of(state))
+                if state is None:
+                    self._sink.idle()
+                else:
+                    self._sink.send(PoseRecord.of(state))
             except Exception as error:  # a bad pose must not stop the next ones
-                self.failed += error.count if isinstance(error, UnwrittenError) else 1
+                self.failed += error.count if isinstance(error, UnwrittenError) else state is not None
                 self._fail(f"cannot be written: {error}")
         try:
             self._sink.close()

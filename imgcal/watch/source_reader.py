@@ -58,6 +58,10 @@ class SourceReader:
         """Why the latest ones could not be read."""
         self.known_before = 0
         """Number of a recording's snapshots that an earlier run has processed."""
+        self.first: int | None = None
+        """Digest of the first snapshot of the source that shows anything; None = nothing yet."""
+        self.resumes = known is not None and known.is_same
+        """Whether this surely is the recording of which an earlier run has processed a part."""
         self._source, self._rig, self._most, self._keep_all = source, rig, waiting, keep_all
         self._known = known
         self._snapshots: deque[TimedSnapshot] = deque()
@@ -99,14 +103,20 @@ class SourceReader:
     def wait_until_open(self) -> SourceReader:
         """Wait until the source has been opened, at most `LONGEST_OPENING` seconds; return `self`.
 
+        If an earlier run has processed a part of a recording, also wait until it is clear whether this is that one.
+
         Raises:
-            InputError: the source cannot be opened.
+            InputError: the source cannot be opened, or not be resumed.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._begun or self._ended, LONGEST_OPENING)
-            if self._error is not None and not self._begun:
+            self._changed.wait_for(lambda: self._ended or (self._begun and self._is_known()), LONGEST_OPENING)
+            if self._error is not None and not (self._begun and self._is_known()):
                 raise self._error
         return self
+
+    def _is_known(self) -> bool:
+        """Tell whether it is clear how much of the source is known."""
+        return self._known is None or self._known.is_same
 
     def next(self, timeout: float) -> TimedSnapshot | None:
         """Take the oldest snapshot from the queue; None = none came within `timeout` seconds.
@@ -180,13 +190,8 @@ class SourceReader:
         self.reasons.append(one_line(item.reason))
 
     def _put(self, snapshot: TimedSnapshot) -> None:
-        if self._known is not None:
-            included = self._known.includes(snapshot)
-            self.known_before += included
-            if not included or self._known.ends_with(snapshot):
-                self._known = None  # everything from now on is new
-            if included:
-                return
+        if self._is_included(snapshot):
+            return
         with self._changed:
             while self._is_full(snapshot) and not self._closing:
                 if self.live:
@@ -197,6 +202,26 @@ class SourceReader:
             self._snapshots.append(snapshot)
             self._bytes += snapshot.num_bytes
             self._changed.notify_all()
+
+    def _is_included(self, snapshot: TimedSnapshot) -> bool:
+        """Tell whether an earlier run has processed a snapshot.
+
+        Raises:
+            InputError: the source cannot be resumed.
+        """
+        with self._changed:
+            if self.first is None and (digest := snapshot.digest) is not None:
+                self.first = digest
+                self._known = None if self._known is None else self._known.compare(digest)
+                self.resumes = self._known is not None and self._known.is_same
+            if self._known is None:
+                return False
+            included = self._known.includes(snapshot)
+            self.known_before += included
+            if not included or self._known.ends_with(snapshot):
+                self._known = None  # everything from now on is new
+            self._changed.notify_all()
+            return included
 
     def _is_full(self, snapshot: TimedSnapshot) -> bool:
         """Tell whether the queue has no room for a snapshot; an empty one has."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import zlib
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -12,7 +13,7 @@ import numpy as np
 
 from imgcal.io import Frame
 from imgcal.types import Detections
-from imgcal.watch.exposures import CameraBlobs, Exposure
+from imgcal.watch.exposures import CameraBlobs, Exposure, frame_digest
 from imgcal.watch.timing import LEAP, Timing
 
 MOST_PENDING = 32
@@ -55,6 +56,18 @@ class TimedSnapshot:
     time: float  # s, median time stamp
     exposures: Mapping[str, Exposure]  # by camera, as far as present
     name: str | None = None  # if the source names snapshots
+    era: int = 0  # number of joint jumps of all clocks before it
+
+    @property
+    def digest(self) -> int | None:
+        """Number that differs between snapshots that show something else, at whatever time; None = no blobs."""
+        shown = [(name, self.exposures[name].content) for name in sorted(self.exposures)]
+        digests = [
+            (name, zlib.crc32(content.uv.tobytes()) if isinstance(content, CameraBlobs) else frame_digest(content))
+            for name, content in shown
+            if not isinstance(content, CameraBlobs) or len(content.uv)
+        ]
+        return zlib.crc32(repr(digests).encode()) if digests else None
 
     def frames(self, camera_names: tuple[str, ...]) -> dict[str, Frame | None]:
         """Frame (H, W) of each camera; None = no frame, or blobs."""
@@ -113,9 +126,9 @@ class _Pending:
         """Tell whether a time stamp belongs to it, by the tolerances of its camera and of those already present."""
         return max(self.latest, time) - min(self.earliest, time) <= min(self.tolerance, tolerance)
 
-    def finished(self) -> TimedSnapshot:
+    def finished(self, era: int) -> TimedSnapshot:
         times = sorted(exposure.time for exposure in self.exposures.values())
-        return TimedSnapshot(times[len(times) // 2], self.exposures, self.name)
+        return TimedSnapshot(times[len(times) // 2], self.exposures, self.name, era)
 
 
 class Synchronizer:
@@ -275,7 +288,7 @@ class Synchronizer:
         for name in pending.exposures:
             self._alone[name] = self._alone[name] + 1 if self._is_beside(name, pending) else 0
         self.alone = tuple(name for name in self.camera_names if self._alone[name] >= ALONE)
-        return pending.finished()
+        return pending.finished(self.leaps)
 
     def _rest(self, name: str, least: int = LEAST_INTERVALS) -> float:
         """Usual interval between a camera's exposures; nan = fewer than `least` intervals are known."""

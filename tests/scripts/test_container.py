@@ -104,14 +104,15 @@ USE = (
     + """
 import json, sys
 
-assert main(["detect", sys.argv[1], "--out", "blobs.csv"]) == 0
+known = ["--rig", sys.argv[1] + "/rig.yaml", "--object", sys.argv[1] + "/object.csv"]
+assert main(["simulate", *known, "--snapshots", "1", "--out", "simulated"]) == 0
 print(json.dumps(Compiled.names))
 """
 )
-DETECTION_ALONE = """
+PROJECTION_ALONE = """
 
 def warm_up(all_lenses: bool = False) -> None:
-    _compile_bloom()
+    simulate_truth(read_rig(RIG), load_object(OBJECT), 1, _make_generator(), DRIFT)
 """
 
 
@@ -124,14 +125,14 @@ def installed_files(folder):
 def test_the_image_is_built_keeps_what_it_compiles_and_its_page_answers(capfd, monkeypatch):
     """Copying, building, installing, compiling, starting, health: all but the base image and pip's downloads.
 
-    `imgcal warmup` compiles the detection only: all it compiles is in tests/imgcal/online/test_warmup.py.
+    `imgcal warmup` compiles the projection only: all it compiles is in tests/imgcal/online/test_warmup.py.
     """
     run_step = steps.Image.step
 
     def step(image, keyword, rest):
         if (keyword, rest) == ("RUN", "imgcal warmup"):
             (file,) = image.root.glob("opt/imgcal/lib/python*/site-packages/imgcal/online/warmup.py")
-            file.write_text(file.read_text() + DETECTION_ALONE)
+            file.write_text(file.read_text() + PROJECTION_ALONE)
         run_step(image, keyword, rest)
 
     monkeypatch.setattr(steps.Image, "step", step)

@@ -2,6 +2,7 @@
 
 import json
 import math
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -25,7 +26,7 @@ def script(name):
 
 
 @pytest.fixture
-def trained(tmp_path):
+def trained(tmp_path, monkeypatch):
     """Pretend that an experiment was trained; returns its file."""
 
     def make(name, *changes, folder=None):
@@ -41,6 +42,8 @@ def trained(tmp_path):
         save_checkpoint(run / "model.safetensors", checkpoint)
         return run / "model.safetensors"
 
+    measuring = script("measuring")
+    monkeypatch.setattr(measuring, "latency", partial(measuring.latency, repeats=2))
     return make
 
 

@@ -14,7 +14,9 @@ from imgcal.io import load_object, read_rig
 from imgcal.networks import Checkpoint, build_network, save_checkpoint
 from imgcal.training import load_experiment
 from tests.imgcal.cli.calibrating import one_line
-from tests.imgcal.fleet.conftest import engine  # noqa: F401  one Ray for all tests
+from tests.imgcal.fleet.conftest import engine  # noqa: F401  one Ray for the file
+
+pytestmark = pytest.mark.usefixtures("few_timings")
 
 EXPERIMENT = """
 format: imgcal-experiment/1

@@ -7,7 +7,7 @@ import yaml
 from imgcal import load_rig
 from imgcal.cli.main import main
 from imgcal.fleet import Dataset, Engine, write_manifest
-from tests.imgcal.fleet.conftest import engine  # noqa: F401  one Ray for all tests
+from tests.imgcal.fleet.conftest import engine  # noqa: F401  one Ray for the file
 from tests.imgcal.fleet.small_captures import write_capture
 
 

@@ -52,6 +52,7 @@ PAPER = "{preset: paper-points, change: {width: 16, depth: 1, heads: 2}}"
 IMAGES = "{preset: hue-centroids, change: {trunk: {width: 16, depth: 1, later_depth: 1, heads: 2}}}"
 
 
+@pytest.mark.usefixtures("few_timings")
 def test_a_rig_of_other_lenses_is_trained_for_compared_and_calibrated(tmp_path, capsys):
     """From an experiment file to a first guess; OpenCV's methods, which know one lens, are left out."""
     rig = tmp_path / "rig.yaml"

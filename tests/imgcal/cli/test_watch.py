@@ -100,6 +100,22 @@ def test_lines_on_standard_input_and_garbage_among_them(blobs, tmp_path, monkeyp
     assert json.loads((tmp_path / "out" / "state.json").read_text())["progress"]["time"] == pytest.approx(19 / 60)
 
 
+def test_what_comes_on_standard_input_is_known_by_its_content(blobs, tmp_path, monkeypatch, capsys):
+    def read(first, last, *more):
+        (tmp_path / "lines").write_text("".join(lines(blobs)[4 * first : 4 * last]))
+        with open(tmp_path / "lines") as file:
+            monkeypatch.setattr(sys, "stdin", file)
+            return watch("-", tmp_path / "out", *more), "".join(capsys.readouterr())
+
+    assert read(0, 10)[0] == 0
+    code, said = read(0, 12)
+    assert code == 0 and "2 snapshots" in said and "10 had been read before" in said
+    code, said = read(20, 30)
+    assert code == 0 and "10 snapshots" in said and "before" not in said
+    code, said = read(5, 15)
+    assert code == 2 and "found a different recording that begins at" in said
+
+
 def test_a_killed_process_goes_on_and_ctrl_c_ends_it_cleanly(blobs, tmp_path):
     zmq = pytest.importorskip("zmq")
     given, out, address = lines(blobs)[: 4 * BUMPED_AT], tmp_path / "out", f"ipc://{tmp_path}/blobs"
@@ -298,16 +314,21 @@ def test_a_recording_is_gone_on_with_by_its_names_and_rate_and_another_one_is_no
     assert watch(tmp_path / "first.csv", out) == 0
     progress = json.loads((out / "state.json").read_text())["progress"]
     expected = {"time": 0.1, "name": "003", "source": str(tmp_path / "first.csv"), "rate": 30.0, "files": {}}
-    assert progress == expected | {"logged": 0}
+    expected |= {"logged": 0, "tables": {}, "snapshot": 3, "era": 0, "first": progress["first"]}
+    assert progress == expected and progress["first"] is not None
     (tmp_path / "second.csv").replace(tmp_path / "first.csv")  # it has grown
     capsys.readouterr()
     assert watch(tmp_path / "first.csv", out, "--rate", "60") == 2
     assert f"--rate: found 60, expected 30 as in {out}/state.json; --fresh" in capsys.readouterr().err
     assert watch(tmp_path / "first.csv", out) == 0
     assert "2 snapshots, 1 event:" in (said := capsys.readouterr().out) and "| 4 had been read before" in said
-    save_detections(blobs.of_snapshots(0, 6), tmp_path / "second.csv")
-    assert watch(tmp_path / "second.csv", out) == 2
+    (tmp_path / "first.csv").replace(tmp_path / "moved.csv")
+    assert watch(tmp_path / "moved.csv", out) == 0 and "all 6 snapshots" in capsys.readouterr().out
+    save_detections(blobs.of_snapshots(6, 12), tmp_path / "first.csv")
+    known = events(out)
+    assert watch(tmp_path / "first.csv", out) == 2
     assert "found a different recording that begins at 0 s, expected one after" in capsys.readouterr().err
+    assert events(out) == known
 
 
 def test_a_rig_that_was_accepted_as_factory_is_gone_on_with_by_the_file_it_began_with(known, tmp_path, capsys):
@@ -334,7 +355,7 @@ def test_the_state_of_another_version_is_told_and_nothing_is_lost(blobs, tmp_pat
     out = tmp_path / "out"
     assert watch(tmp_path / "blobs.csv", out) == 0
     state = out / "state.json"
-    state.write_text(state.read_text().replace("imgcal-keeper/8", "imgcal-keeper/7", 1))
+    state.write_text(state.read_text().replace("imgcal-keeper/9", "imgcal-keeper/8", 1))
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     capsys.readouterr()
     assert watch(tmp_path / "blobs.csv", out) == 2

@@ -113,7 +113,7 @@ def blobs(tmp_path_factory):
                 uv = found.uv[found.camera == camera].tolist()
                 line = {"camera": name, "time": 1e9 + s / 60, "uv": uv, "sigma": 0.07}
                 file.write(json.dumps(line) + "\n")
-    return "-", path, ["--rig", "T4", "--object", "asymmetric8"]
+    return "-", path, ("--rig", "T4", "--object", "asymmetric8")
 
 
 @pytest.fixture(scope="module")
@@ -174,12 +174,15 @@ def assert_same(out, whole, snapshots):
 def test_blobs_in_lines(watch, blobs, piped, tmp_path):
     watch(blobs, tmp_path / "whole", piped=piped)
     assert {event["camera"] for event in events(tmp_path / "whole") if event["event"] == "moved"} == {"cam02"}
-    out = tmp_path / "out"
+    out, table = tmp_path / "out", tmp_path / "poses.csv"
+    blobs = (*blobs[:2], (*blobs[2], "--poses", str(table)))
     for moment in ("learnt:7", "told:1", "saving:2"):
         watch(blobs, out, killed=moment, piped=piped)
     assert Progress.load(out).time < 1e9 + (SNAPSHOTS - 2) / 60
     assert f"{SNAPSHOTS} snapshots" not in watch(blobs, out, piped=piped)  # it went on
     assert_same(out, tmp_path / "whole", SNAPSHOTS)
+    numbers = [int(row.split(",")[1]) for row in table.read_text().splitlines()[1:]]
+    assert numbers == sorted(set(numbers)) and numbers[-1] == SNAPSHOTS - 1  # no row twice
 
 
 def test_frames_in_a_folder(watch, frames, tmp_path):

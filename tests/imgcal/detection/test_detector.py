@@ -7,7 +7,7 @@ import pytest
 
 from imgcal.detection import DetectionOptions, detect, detect_frame
 from imgcal.errors import InputError
-from imgcal.types import BlobFlag
+from imgcal.types import UNUSABLE, BlobFlag
 from tests.imgcal.detection.discs import draw_discs, draw_patches, exposed, nearest, scattered
 
 SHAPE = (480, 640)
@@ -218,10 +218,23 @@ def test_masked_blobs_are_flagged_and_kept():
     mask = np.zeros(SHAPE, np.uint8)
     mask[:, :200] = 1
     found = detect({"a": frame, "b": frame}, masks={"a": mask})
-    expected = (found.camera == 0) & (np.rint(found.uv[:, 0]) < 200)
+    expected = (found.camera == 0) & (np.rint(found.uv[:, 0] - found.radius) < 200)
     np.testing.assert_array_equal((found.flags & BlobFlag.MASKED) > 0, expected)
     assert expected.any()
     assert len(found) == 2 * len(uv)
+
+
+def test_a_blob_that_a_mask_cuts_is_not_used():
+    """As where a recorder pads the frames of a part of the sensor to full size, and the padding is masked."""
+    row = 100
+    uv = np.array([[40.0 + 60 * k, row + offset] for k, offset in enumerate((-3.0, -1.0, 0.0, 1.5, 3.5, 12.0))])
+    frame = exposed(draw_discs(SHAPE, uv, np.full(len(uv), 5.0), contrast=150.0), 1.0, np.random.default_rng(3))
+    frame[:row] = 0
+    mask = np.zeros(SHAPE, np.uint8)
+    mask[:row] = 255
+    found = detect_frame(frame, DetectionOptions(), mask)
+    usable = found.uv[(found.flags & UNUSABLE) == 0]
+    assert len(usable) == 1 and np.abs(usable[0] - uv[-1]).max() < 0.05
 
 
 def test_threshold_and_radius_limits_select():

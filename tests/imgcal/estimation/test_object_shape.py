@@ -153,8 +153,20 @@ def test_the_scale_of_an_object_that_no_image_shows_is_as_uncertain_as_few_fiduc
     for _ in range(400):
         off = random.normal(0, 0.24, places.size)
         pull = information @ (seen @ off + seen @ random.normal(0, 0.01, places.size))
-        shape = ShapeEvidence(information, pull, places, places, np.zeros(len(places)), 1.0, 100.0)
+        shape = ShapeEvidence(information, pull, places, places, np.zeros(len(places)), 0.0, 1.0, 100.0)
         tolerance = learnt_tolerances(shape)
         covariance = np.linalg.inv(information + np.diag(np.repeat(np.maximum(tolerance, 1e-4) ** -2.0, 3)))
         squared.append((scale @ (off - covariance @ pull)) ** 2 / (scale @ covariance @ scale))
     assert 0.8 < np.mean(squared) < 1.2
+
+
+def test_the_scale_within_its_tolerance_adds_to_the_noise_of_the_fiducials():
+    random = np.random.default_rng(0)
+    places, root = random.normal(size=(4, 3)), random.normal(size=(12, 12))
+    information, displacement = root @ root.T, random.normal(size=12)
+    shape = ShapeEvidence(information, information @ displacement, places, places, np.zeros(4), 0.3, 1.0, 100.0)
+    found = shape.marginalize_scale()
+    noise = np.linalg.inv(information) + 0.3**2 * np.outer(places, places)
+    assert np.allclose(found.information, np.linalg.inv(noise))
+    assert np.allclose(found.pull, np.linalg.solve(noise, displacement))
+    assert found.marginalize_scale() is found

@@ -1,4 +1,4 @@
-"""A small fleet on disk, and one Ray for all tests."""
+"""A small fleet on disk, and one Ray for all tests of a file."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +9,7 @@ from imgcal.fleet import Engine, write_manifest
 from tests.imgcal.fleet.small_captures import write_capture
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # no longer: Ray's processes take 4 % of a core even if nothing is asked of them
 def engine() -> Iterator[Engine]:
     with Engine(cores=2) as engine:
         yield engine

@@ -58,6 +58,34 @@ def test_folders_with_missing_frames_and_a_missing_camera(tmp_path: Path) -> Non
     assert open_capture(tmp_path).camera_names == ("left", "right")
 
 
+def test_a_camera_s_name_in_its_files_is_not_part_of_the_snapshot_s(tmp_path: Path) -> None:
+    for number in (1, 2):
+        put(tmp_path, f"frames/cam1/cam1_{number:03}.png", grey(number))
+        put(tmp_path, f"frames/cam2/{number:03}-Cam2.png", grey(10 + number))
+        put(tmp_path, f"frames/cam3/{number:03}.png", grey(20 + number))
+    capture = open_capture(tmp_path, make_rig("cam1", "cam2", "cam3"))
+    assert levels(capture) == {"001": [1, 11, 21], "002": [2, 12, 22]}
+
+
+def test_frames_that_share_no_name_are_an_error_that_shows_the_names(tmp_path: Path) -> None:
+    for number in (1, 2):
+        put(tmp_path, f"frames/cam1/{number:03}.png")
+        put(tmp_path, f"frames/cam2/{number:03}.png")
+        put(tmp_path, f"frames/cam3/{number}.png")
+    message = r"frames/cam3: found 1, 2, of which no other camera has one \(cam1: 001, 002\), expected frames of one"
+    with pytest.raises(InputError, match=message):
+        open_capture(tmp_path, make_rig("cam1", "cam2", "cam3"))
+    assert open_capture(tmp_path, make_rig("cam1", "cam2"), without=("cam3",)).snapshot_names == ("001", "002")
+    assert len(open_capture(tmp_path).snapshot_names) == 4  # to look at single cameras
+
+
+def test_files_that_systems_leave_behind_are_no_frames(tmp_path: Path) -> None:
+    put(tmp_path, "frames/a/0.png")
+    for name in ("Thumbs.db", "frames/desktop.ini", "frames/a/Thumbs.db"):
+        (tmp_path / name).write_bytes(b"x")
+    assert open_capture(tmp_path, make_rig("a")).snapshot_names == ("0",)
+
+
 def test_frames_by_camera_are_those_of_the_snapshots(tmp_path: Path) -> None:
     capture = open_capture(data_path("samples", "O10"))
     frames = capture.frames(1, 3)

@@ -1,9 +1,11 @@
-"""States of a known rig, for tests of the watching code."""
+"""States of a known rig for tests of the watching code, and their tests after a restart."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from functools import cache
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -11,12 +13,22 @@ import torch
 import imgcal
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.monitoring import RigBelief
-from imgcal.online import RigState
+from imgcal.online import RigState, SequentialTest
+from imgcal.online.state_document import StateReader, StateWriter
 from imgcal.types import Detections
 
 NOISE = 0.1
 RIG, OBJECT = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
 BELIEF = RigBelief.of_prior(RIG, OBJECT)
+Test = TypeVar("Test", bound=SequentialTest)
+
+
+def restart(test: Test, fresh: Test) -> Test:
+    """Give a new test the state of another, as a keeper does."""
+    writer = StateWriter()
+    plain = json.loads(json.dumps(writer.write(type(test), test), allow_nan=False))
+    restored: Test = StateReader(writer.tables()).read_object(type(test), plain, "test", fresh)
+    return restored
 
 
 def expose_together(camera: int) -> float:

@@ -8,7 +8,7 @@ import torch
 
 from imgcal.geometry import RigidTransform
 from imgcal.online import ClockOffsets
-from tests.imgcal.online.states import state_at
+from tests.imgcal.online.states import restart, state_at
 
 
 def watched(late: dict[int, float], bump: float = 0.0) -> tuple[ClockOffsets, list]:
@@ -115,8 +115,7 @@ def test_errors_that_last_do_not_look_like_a_late_clock() -> None:
 
 def test_what_was_told_is_kept() -> None:
     test, _ = watched({2: 0.01})
-    again = ClockOffsets(4)
-    again.restored(test.saved())
+    again = restart(test, ClockOffsets(4))
     assert again.late[2] != 0
     for number in (1000, 1001):  # where motion goes on, it is that since the last snapshot before
         for one in (test, again):

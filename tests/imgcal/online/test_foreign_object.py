@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imgcal.online import ForeignObject
-from tests.imgcal.online.states import state_at
+from tests.imgcal.online.states import restart, state_at
 
 
 def watched(test: ForeignObject, refused: str | None, blobs: bool, first: float, count: int) -> list:
@@ -25,16 +25,15 @@ def test_a_foreign_object_is_told_once() -> None:
     (event,) = watched(test, "identity", True, 11.0, 200)
     assert (event.kind, event.camera, event.since) == ("object_exchanged", None, 11.0)
     assert 14.0 <= event.time < 14.2
-    again = ForeignObject()
-    again.restored(test.saved())
+    again = restart(test, ForeignObject())
     assert watched(again, "identity", True, 30.0, 200) == []
 
 
 def test_a_restart_takes_nothing_of_what_has_been_seen() -> None:
-    test, again = ForeignObject(), ForeignObject()
+    test = ForeignObject()
     watched(test, None, True, 10.0, 1)
     watched(test, "identity", True, 11.0, 30)
-    again.restored(test.saved())
+    again = restart(test, ForeignObject())
     (event,) = watched(again, "identity", True, 12.5, 200)
     assert event.since == 11.0 and 14.0 <= event.time < 14.2
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imgcal.online import ImageQuality
-from tests.imgcal.online.states import state_at
+from tests.imgcal.online.states import restart, state_at
 
 
 def watched(spoil: str | None, until: int = 260, restarts: int = 1000) -> tuple[ImageQuality, list]:
@@ -14,8 +14,7 @@ def watched(spoil: str | None, until: int = 260, restarts: int = 1000) -> tuple[
     test, events = ImageQuality(4), []
     for number in range(until if spoil == "missing" else min(until + 40, 200)):
         if number % restarts == restarts - 1:
-            known, test = test, ImageQuality(4)
-            test.restored(known.saved())
+            test = restart(test, ImageQuality(4))
         state = state_at(number, number / 3)
         blobs, camera = state.detections, state.detections.camera == 1
         if spoil and 120 <= number < until:
@@ -83,9 +82,8 @@ def test_good_cameras_are_left_alone_and_a_clean_one_is_told() -> None:
     assert watched(None)[1] == []
     test, events = watched("large", until=150)
     assert [event.kind for event in events] == ["defocused", "clean"]
-    again = ImageQuality(4)
-    with pytest.raises(ValueError, match=r"image quality: distance: expected float64 \(4,\)"):
-        again.restored({name: np.ones((1, 1)) for name in test.saved()})
+    with pytest.raises(ValueError, match=r"test\.bad: found another array than one of \(3, 3\)"):
+        restart(test, ImageQuality(3))
 
 
 def test_a_restart_takes_nothing_of_what_has_been_seen() -> None:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -162,25 +163,26 @@ def test_an_object_that_jumps_between_snapshots_is_found_again() -> None:
     assert all(float(np.nanmax(state.residual)) < 1.5 for state in states[4:])
 
 
-def test_tests_see_every_snapshot_and_tell_of_cameras() -> None:
+def test_tests_see_every_snapshot_tell_of_cameras_and_go_on_after_a_restart(tmp_path: Path) -> None:
     class Dirty:
-        name = "dirty"
+        name, STATE = "dirty", MappingProxyType({"told": ("told", int)})
+
+        def __init__(self):
+            self.told = 0
 
         def __call__(self, state, frames, absorbed):
             assert frames is None
             assert (absorbed is None) == (state.refused is not None)
             kind = {1: "dirty", 3: "clean"}.get(state.snapshot)
+            self.told += kind is not None
             return [] if kind is None else [Event(state.time, state.snapshot, kind, "cam03", message="a lens")]
-
-        def saved(self):
-            return {}
-
-        def restored(self, values):
-            assert not values
 
     made = stream(8, absent=[(2, 3)])
     with RigKeeper(made.factory, made.obj, tests=[Dirty()]) as keeper:
         states = [keeper.update(blobs, time) for time, blobs in made.snapshots(4)]
+        keeper.save(tmp_path / "state.json")
+    with RigKeeper.restore(tmp_path / "state.json", tests=[Dirty()]) as keeper:
+        assert keeper.tests[0].told == 2
     assert [state.cameras["cam03"] for state in states] == ["ok", "dirty", "dirty", "ok"]
     assert [event.kind for state in states for event in state.events] == ["dirty", "clean"]
     assert states[1].sentence == "cam03 is dirty"
@@ -318,7 +320,7 @@ def test_a_knock_that_turns_all_cameras_is_told_as_that_and_not_as_another_objec
     obj = imgcal.load_object("asymmetric8")
     made = Stream(imgcal.load_rig("O6"), obj, 1, Conditions(rate=10.0, labelled=True), knock)
     events, last = events_of(made, 120)
-    assert [event.kind for event in events] == ["restart"]
+    assert [(event.kind, event.camera) for event in events] == [("moved", None), ("restart", None)]
     assert last.refused is None
 
 
@@ -384,6 +386,16 @@ def test_a_camera_that_is_late_from_the_first_snapshot_on_does_not_move_again_an
     events, last = events_of(made, 130)  # 28 and 33 events without doubt
     assert [event.kind for event in events].count("moved") <= 2 and {event.camera for event in events} <= {"cam02"}
     assert last.cameras["cam02"] != "ok" or last.clock_offset[1] == pytest.approx(late, rel=0.1)
+
+
+def test_cameras_that_all_move_at_once_are_told_within_nine_snapshots() -> None:
+    """A truck has passed, and the tripods have settled."""
+    made = stream(4, bumps=[Bump(40, camera, "rotation", math.radians(0.17)) for camera in range(4)])
+    (state, *_) = told = [state for state in kept(made, 52) if state.events]
+    (event,) = state.events
+    assert len(told) == 1 and (event.kind, event.camera, event.change) == ("moved", None, "unknown")
+    assert event.snapshot <= 48 and event.since == pytest.approx(40 / 60)
+    assert set(state.cameras.values()) == {"doubtful"}
 
 
 @pytest.mark.parametrize("leap", [1.7e9, 3.2e6])

@@ -77,7 +77,7 @@ def test_a_camera_that_was_turned_far_is_reported_once_and_then_stays_known(reco
     _, obj, blobs = recording
     reported = []
     with imgcal.RigKeeper(calibrated.rig, obj) as keeper:
-        for number, snapshot in frames(blobs, 2600, 3190):
+        for number, snapshot in frames(blobs, 2800, 3190):
             seen = turned(snapshot, calibrated.rig, 5, 1.0) if number >= 3000 else snapshot
             state = keeper.update(seen, number / RATE)
             reported += [event for event in state.events if event.kind not in QUIET]

@@ -66,6 +66,21 @@ def test_labels_that_fit_nowhere_are_refused_until_the_rig_is_given_up() -> None
     assert [event.kind for event in memory.pending] == ["restart"]
 
 
+@pytest.mark.parametrize("of_each", ["snapshot", "camera"])
+def test_labels_that_are_wrong_are_no_move_of_all_cameras(of_each: str) -> None:
+    made = Remembered(conditions=Conditions(labelled=True, clutter=0.0, hidden=0.0))
+    memory = made.learn(10)
+    for number in range(8):
+        wrong = replace(made.blobs())
+        by = wrong.camera + 1 if of_each == "camera" else number % 7 + 1
+        wrong.fiducial[:] = (wrong.fiducial + by) % 8
+        with pytest.raises(RefusedError, match="off in most cameras"):
+            made.labelled(wrong)
+    doubted = memory.doubts.refused
+    snapshots = [(memory.observed(one.blobs), one.rig_from_object) for one in doubted]
+    assert memory.doubts.due and not memory.monitor.have_all_moved(snapshots, [one.seconds for one in doubted])
+
+
 @pytest.mark.parametrize("board", [Board("circles", 7, 6, 20.0), Board("circles", 7, 7, 20.0, bend=(1.0, -0.5))])
 def test_images_that_do_not_say_the_turn_of_a_board_are_learnt_from(board: Board) -> None:
     rig, obj, random = imgcal.load_rig("T4"), CalibrationObject.of_board(board), np.random.default_rng(0)

@@ -13,6 +13,7 @@ from imgcal.pipeline import LateCamera, calibrate
 from imgcal.pipeline.clock_offset import timing_motion
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from imgcal.types import MovedError
+from tests.imgcal.pipeline.short_search import SHORT
 
 COUNT = 14
 
@@ -46,7 +47,7 @@ def moving_object(*, camera=2, first=COUNT, by=0, bump=0.0, step=30.0, tilt=0.15
 def test_a_slip_is_named_with_camera_and_snapshot(first, by, words):
     rig, obj, blobs = moving_object(first=first, by=by)
     with pytest.raises(RefusedError) as refused:
-        calibrate(blobs, rig, obj)
+        calibrate(blobs, rig, obj, SHORT)
     assert str(refused.value).startswith(f"camera cam03: from snapshot {blobs.snapshot_names[first]} on, its frames")
     assert words in str(refused.value) and "--without cam03" in refused.value.for_command
 
@@ -60,7 +61,7 @@ def test_a_slip_is_named_where_labels_are_given_and_the_object_jumps():
     shown = np.where(late, blobs.snapshot + 1, blobs.snapshot)
     blobs = replace(blobs, uv=blobs.uv + noise, sigma=np.full(len(blobs), 0.05), snapshot=shown).select(shown < 24)
     with pytest.raises(RefusedError, match=r"camera cam04: from snapshot 00011 on, its frames show .* earlier"):
-        calibrate(blobs, rig, obj)
+        calibrate(blobs, rig, obj, SHORT)
 
 
 def test_a_slip_near_the_end_is_said_beside_the_result():
@@ -105,4 +106,4 @@ def test_even_motion_is_what_a_turned_camera_shows():
 def test_a_bump_is_no_slip():
     rig, obj, blobs = moving_object(first=7, bump=25.0)
     with pytest.raises(MovedError, match="camera cam03 moved before snapshot"):
-        calibrate(blobs, rig, obj)
+        calibrate(blobs, rig, obj, SHORT)

@@ -17,6 +17,7 @@ from imgcal.pipeline.turned_images import WAYS, turn, undo
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from imgcal.types import CameraRig, Detections
 from tests.imgcal.association.stick_scenes import TRIPLE, capture
+from tests.imgcal.pipeline.short_search import SHORT
 
 
 @cache
@@ -86,7 +87,7 @@ def test_another_convention_is_refused_and_named(name: str, mistake: str, labell
         blobs = replace(blobs, fiducial=np.full_like(blobs.fiducial, -1))
     rig, blobs = change(rig, blobs)
     with pytest.raises(RefusedError, match=rf"^{expected}.*; so "):
-        imgcal.calibrate(blobs, rig, imgcal.load_object("asymmetric8"))
+        imgcal.calibrate(blobs, rig, imgcal.load_object("asymmetric8"), SHORT)
 
 
 def keep_little(blobs: Detections, snapshots: int) -> Detections:
@@ -103,7 +104,7 @@ def test_a_snapshot_that_few_cameras_see_hides_no_convention() -> None:
     rig, blobs = MISTAKES["v from the bottom"][0](*seen("O10"))
     blobs = keep_little(replace(blobs, fiducial=np.full_like(blobs.fiducial, -1)), 1)
     with pytest.raises(RefusedError, match=r"^all images seem to be mirrored top to bottom"):
-        imgcal.calibrate(blobs, rig, imgcal.load_object("asymmetric8"))
+        imgcal.calibrate(blobs, rig, imgcal.load_object("asymmetric8"), SHORT)
 
 
 def test_snapshots_that_many_cameras_see_are_asked() -> None:

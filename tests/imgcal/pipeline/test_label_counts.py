@@ -5,15 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imgcal.association import PipelineOptions, associate
+from imgcal.association import associate
 from imgcal.errors import RefusedError
 from imgcal.pipeline import LabelCounts, calibrate, fit_labelled
 from scripts.benchmarks import camera_faults as damage
+from tests.imgcal.pipeline.short_search import SHORT
 
 CAMERA = 3
-BLIND = PipelineOptions(
-    blind_cameras=True
-)  # a camera without any label would be refused otherwise, as one that sees nothing
+BLIND = replace(SHORT, blind_cameras=True)  # a camera without any label is refused otherwise, as one that sees nothing
 WAYS = {
     "u": "mirrored left to right",
     "v": "mirrored top to bottom",
@@ -44,7 +43,7 @@ WRONG = ("u", "v", "both", "turned", "lens", "place", "late", "swapped")
 
 # Every mistake in both scenes, and with both options.
 @pytest.mark.parametrize(("kind", "how", "options"), [
-    (kind, how, (PipelineOptions(), BLIND)[(number + (kind == "ring")) % 2])
+    (kind, how, (SHORT, BLIND)[(number + (kind == "ring")) % 2])
     for number, how in enumerate(WRONG)
     for kind in MAKE
 ])  # fmt: skip
@@ -65,7 +64,7 @@ def test_labels_do_not_hide_that_an_image_is_turned():
     rig, obj, truth = damage.wand_in_a_room(8)
     table = damage.mirrored(damage.blobs(truth, labelled=True), rig, CAMERA, "both")
     with pytest.raises(RefusedError, match=r"^camera cam04: .*once the image is turned by 180 degrees"):
-        calibrate(table, rig, obj)
+        calibrate(table, rig, obj, SHORT)
 
 
 @pytest.mark.parametrize("crowd", [0, 5, 40])
@@ -95,7 +94,7 @@ def test_a_camera_whose_frames_are_mostly_of_other_moments_is_refused(kind):
     late, wrong = damage.late(table, CAMERA), (table.camera == CAMERA) & (table.snapshot % 3 > 0)
     table = damage.joined(table.select(~wrong), late.select((late.camera == CAMERA) & (late.snapshot % 3 > 0)))
     with pytest.raises(RefusedError, match="cam04"):
-        calibrate(table, rig, obj)
+        calibrate(table, rig, obj, SHORT)
 
 
 def test_counts_add_up():

@@ -16,6 +16,7 @@ from imgcal.synthesis import Truth
 from imgcal.types import MovedError, RigPrior
 from scripts.benchmarks import camera_faults as damage
 from scripts.benchmarks import merging_wands
+from tests.imgcal.pipeline.short_search import SHORT
 
 CAMERA = 3
 MAKE = {"room": damage.wand_in_a_room, "ring": damage.object_before_a_ring}
@@ -41,7 +42,7 @@ def capture(kind, snapshots, first, change, seed=1, **what):
 def test_a_bump_is_named_with_its_time_and_size(kind, snapshots, first, degrees):
     table, rig, obj, _ = capture(kind, snapshots, first, lambda r: damage.turned(r, CAMERA, degrees))
     with pytest.raises(MovedError) as found:
-        calibrate(table, rig, obj)
+        calibrate(table, rig, obj, SHORT)
     (move,) = found.value.moved
     assert (move.camera, move.snapshot, move.kind, move.unit) == ("cam04", f"{first:05d}", "rotation", "deg")
     assert abs(move.size - degrees) < 5 * move.sigma + 0.02 * degrees
@@ -54,7 +55,7 @@ def test_a_bump_is_named_with_its_time_and_size(kind, snapshots, first, degrees)
 def test_a_move_beyond_what_the_prior_expects_is_named_without_a_size():
     table, rig, obj, _ = capture("ring", 12, 6, lambda r: damage.turned(r, CAMERA, 8.0))
     with pytest.raises(MovedError, match="camera cam04 moved before snapshot 00006: no rig is right"):
-        calibrate(table, rig, obj)
+        calibrate(table, rig, obj, SHORT)
 
 
 @pytest.mark.parametrize(
@@ -67,7 +68,7 @@ def test_a_move_beyond_what_the_prior_expects_is_named_without_a_size():
 def test_the_kind_of_a_move_is_told(change, kind, size):
     table, rig, obj, _ = capture("room", 40, 20, change)
     with pytest.raises(MovedError) as found:
-        calibrate(table, rig, obj)
+        calibrate(table, rig, obj, SHORT)
     (move,) = found.value.moved
     assert (move.kind, move.snapshot) == (kind, "00020")
     assert abs(move.size - size) < 5 * move.sigma + 0.03 * size
@@ -122,7 +123,7 @@ def test_of_two_cameras_alone_nobody_knows_which_one_moved():
     pair = Truth(truth.rig.select([0, 3]), truth.rig_from_object, truth.uv[:, [0, 3]])
     pair = damage.changed_from(pair, obj, 1, 6, lambda r: damage.turned(r, 1, 0.2))
     with pytest.raises(MovedError) as found:
-        calibrate(damage.blobs(pair), rig.select([0, 3]), obj)
+        calibrate(damage.blobs(pair), rig.select([0, 3]), obj, SHORT)
     assert {m.camera for m in found.value.moved} <= {"cam01 or cam04", "cam04 or cam01"}
 
 
@@ -132,7 +133,7 @@ def test_a_camera_that_cannot_be_labelled_after_a_move_is_named_without_a_size()
     mirrored = damage.mirrored(table, rig, CAMERA, "u")
     first = damage.joined(table.select(table.snapshot < 18), mirrored.select(mirrored.snapshot >= 18))
     with pytest.raises(MovedError, match=r"cam04 moved before snapshot 00018:") as found:
-        calibrate(first, rig, obj)
+        calibrate(first, rig, obj, SHORT)
     assert found.value.moved[0].kind == "unknown" and found.value.moved[0].size is None
 
 

@@ -11,6 +11,7 @@ from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate, score
 from imgcal.synthesis import PhysicalDrift, simulate_truth, simulate_volume, true_detections
 from imgcal.types import RigPrior
+from tests.imgcal.pipeline.short_search import SHORT
 
 DRIFT = PhysicalDrift()
 PRIOR = RigPrior(DRIFT.focal_length, DRIFT.principal_point, DRIFT.distortion, np.radians(DRIFT.rotation_deg), 2.0)
@@ -67,7 +68,18 @@ def right(points):
 def test_another_scale_is_refused(rig_name: str, factor: float, snapshots: int) -> None:
     rig, obj, _, _, table = capture(rig_name, snapshots, scaled(factor))
     with pytest.raises(RefusedError, match=r"all cameras have moved together.*(larger|smaller) than its file says"):
+        calibrate(table, rig, obj, SHORT)
+
+
+def test_a_tolerance_of_the_scale_is_advised_only_where_it_can_be_given() -> None:
+    rig, obj, _, _, table = capture("O10", 6, scaled(1.1))
+    with pytest.raises(RefusedError, match="give its scale a tolerance") as single:
         calibrate(table, rig, obj)
+    with pytest.raises(RefusedError, match="all cameras have moved together") as several:
+        calibrate(table, rig, [obj, load_object("wand4")])
+    assert "--object-scale-tolerance" in single.value.for_command
+    assert "toleranc" not in several.value.for_command and "toleranc" not in str(several.value)
+    assert several.value.for_command.endswith("than their files say; measure them again, and check their units")
 
 
 def test_a_scale_that_may_be_off_is_estimated() -> None:
@@ -94,13 +106,24 @@ def test_a_displaced_fiducial_is_named_beside_a_scale_that_may_be_off(factor: fl
     assert only.fiducial == 5 and only.distance == pytest.approx(1.0, abs=4 * only.sigma) and only.sigma < 0.1
 
 
+def test_the_tolerances_of_fiducials_are_learned_without_the_scale_that_may_be_off() -> None:
+    tolerances = []
+    for factor in (0.95, 1.0, 1.05):
+        rig, obj, *_, table = capture("O10", 12, lambda points, by=factor: moved(5, (0.6, 0.8, 0))(scaled(by)(points)))
+        found = calibrate(table, rig, replace(obj, scale_tolerance=0.05))
+        tolerance = found.estimate.problem.object_prior_std[0, :-1:3]
+        assert [offset.fiducial for offset in found.displaced] == tolerance.nonzero().flatten().tolist() == [5]
+        tolerances.append(float(tolerance[5]))
+    assert tolerances == pytest.approx([1 / 3**0.5] * 3, rel=0.03)
+
+
 @pytest.mark.parametrize("snapshots", [1, 5])
 @pytest.mark.parametrize("factor", [1.15, 1.3])
 @pytest.mark.parametrize("rig_name", ["T4", "O10"])
 def test_a_stretched_object_is_refused(rig_name: str, factor: float, snapshots: int) -> None:
     rig, obj, _, _, table = capture(rig_name, snapshots, stretched(factor))
     with pytest.raises(RefusedError):
-        calibrate(table, rig, obj)
+        calibrate(table, rig, obj, SHORT)
 
 
 @pytest.mark.parametrize(
@@ -145,7 +168,7 @@ def test_of_a_symmetric_object_nobody_says_which_fiducial_is_off() -> None:
         calibrate(table, rig, replace(obj, tolerance=torch.full((8,), 0.2, dtype=torch.float64)))
     rig, obj, table = jumping_cube(moved(1, (0.5, 0, 0)))
     with pytest.raises(RefusedError, match="the object is symmetric"):
-        calibrate(table, rig, obj)
+        calibrate(table, rig, obj, SHORT)
 
 
 def test_tolerated_displacements_are_not_named() -> None:

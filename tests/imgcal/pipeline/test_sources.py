@@ -105,6 +105,14 @@ def test_blobs_that_cannot_be_of_this_rig_or_object(seen, job, column, value, re
         job(replace(blobs, **{column: wrong}), rig, obj)
 
 
+@pytest.mark.parametrize("job", [calibrate, score])
+def test_cameras_that_share_no_snapshot_are_said_to(seen, job):
+    rig, obj, _, blobs = seen
+    apart = replace(blobs, snapshot=blobs.camera.copy(), snapshot_names=tuple(f"{c}_0" for c in rig.camera_names))
+    with pytest.raises(InputError, match=r"no snapshot in which two cameras .*\(cam01: cam01_0; cam02: cam02_0\)"):
+        job(apart, rig, obj)
+
+
 @EVERYWHERE
 @pytest.mark.parametrize("column", ["camera", "snapshot", "fiducial", "flags"])
 def test_numbers_that_are_not_whole(seen, job, column):

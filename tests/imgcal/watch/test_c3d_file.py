@@ -3,7 +3,7 @@ import struct
 import numpy as np
 import pytest
 
-from imgcal.watch.c3d_file import MOST_FRAMES, C3DFile
+from imgcal.watch.c3d_file import C3DFile
 
 c3d = pytest.importorskip("c3d", reason="no c3d (extra dev): no independent reader of C3D")
 ezc3d = pytest.importorskip("ezc3d", reason="no ezc3d (extra dev): no independent reader of C3D")
@@ -83,12 +83,26 @@ def test_what_a_killed_process_left_can_be_read(tmp_path):
     file.close()
 
 
-def test_more_frames_than_the_format_counts_are_refused(tmp_path):
-    file = C3DFile(tmp_path / "long.c3d", ["a"], 100.0, 1000.0)
-    file.append(*some(MOST_FRAMES, 1))
-    with pytest.raises(OSError, match="no more than 65,534 frames"):
-        file.append(*some(1, 1))
+@pytest.mark.parametrize("frames", [65_535, 65_541, 140_001])
+def test_frames_beyond_sixteen_bits_are_written_and_counted(tmp_path, frames):
+    path = tmp_path / "long.c3d"
+    points = np.zeros((frames, 1, 3))
+    points[:, 0, 0] = np.arange(frames)
+    file = C3DFile(path, ["a"], 100.0, 1000.0)
+    for first in range(0, frames, 65_000):
+        part = points[first : first + 65_000]
+        file.append(part, np.full(part.shape[:2], 0.1), np.ones(part.shape[:2], dtype=np.int64))
+    file.widen(["a", "b"])
     file.close()
-    assert ezc3d.c3d(str(tmp_path / "long.c3d"))["data"]["points"].shape == (4, 1, MOST_FRAMES)
+    found, there, _ = read(path)
+    with open(path, "rb") as opened:
+        assert c3d.Reader(opened).last_frame == frames
+    assert (there[:frames, 0, 0] == np.arange(frames)).all()
+    assert np.isnan(there[frames:]).all() and len(there) < frames + 512 / 32
+    assert found["parameters"]["POINT"]["LONG_FRAMES"]["value"][0] == frames
+
+
+def test_an_existing_file_is_left(tmp_path):
+    C3DFile(tmp_path / "trial.c3d", ["a"], 100.0, 1000.0).close()
     with pytest.raises(FileExistsError):
-        C3DFile(tmp_path / "long.c3d", ["a"], 100.0, 1000.0)
+        C3DFile(tmp_path / "trial.c3d", ["a"], 100.0, 1000.0)

@@ -148,6 +148,18 @@ def test_snapshots_before_a_restart_are_not_read_again_and_what_is_saved_is_remo
     assert sorted(path.name for path in tmp_path.glob("frames/cam01/*")) == ["8.png", "9.png"]
 
 
+def test_a_camera_s_name_in_its_files_is_not_part_of_the_snapshot_s(tmp_path, rig):
+    for number in (8, 9, 10):
+        for camera in ("cam01", "cam02"):
+            put(tmp_path, camera, f"{camera}_{number}")
+    folder = Folder(tmp_path, rig, remove=True, after="8", until_idle=0.3)
+    assert folder.count_processed() == 1
+    found = [(e.snapshot, e.camera) for e in folder.items() if e is not None]
+    assert found == [("9", "cam01"), ("9", "cam02"), ("10", "cam01"), ("10", "cam02")]
+    folder.delete_read("9")
+    assert sorted(path.name for path in tmp_path.glob("frames/cam01/*")) == ["cam01_10.png", "cam01_8.png"]
+
+
 def test_a_frame_that_cannot_be_deleted_keeps_no_other_and_is_tried_again(tmp_path, rig):
     for name in ("1", "2", "3"):
         put(tmp_path, "cam01", name)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from imgcal.online import RigKeeper
-from imgcal.watch import CameraBlobs, Exposure, Hook, Poses, Progress, SourceReader, TimedSnapshot, Watch
+from imgcal.watch import CameraBlobs, Exposure, Hook, Poses, PoseSink, Progress, SourceReader, TimedSnapshot, Watch
 from imgcal.watch import loop as module
 from imgcal.watch.learning import Outcome
 from tests.imgcal.watch.states import OBJECT, RIG, KeeperOfStates, event
@@ -81,7 +81,7 @@ def test_the_state_is_saved_once_a_second_with_how_far_the_source_is(tmp_path, m
     with Watch(keeper, tmp_path) as loop, SourceReader(Slow(*(k / 10 for k in range(10))), RIG) as intake:
         loop.run(intake, threading.Event())
     assert 3 <= len(keeper.saves) <= 10 and keeper.saves[-1] == 10
-    assert Progress.load(tmp_path) == Progress(0.9, logged=(tmp_path / "events.jsonl").stat().st_size)
+    assert Progress.load(tmp_path) == Progress(0.9, logged=(tmp_path / "events.jsonl").stat().st_size, snapshot=9)
 
 
 def test_the_first_snapshot_is_saved_at_once(tmp_path):
@@ -97,11 +97,11 @@ def test_a_start_goes_on_after_the_last_snapshot_that_the_state_knows(tmp_path):
         for number in range(2):
             loop.process(snapshot(float(number), str(number)))
         loop.save()
-    assert Progress.load(tmp_path) == Progress(1.0, "1", 0) == saved[-1]
+    assert Progress.load(tmp_path) == Progress(1.0, "1", logged=0, snapshot=1) == saved[-1]
     keeper.disk_full = True  # as where the process is killed before the state is written
     with Watch(keeper, tmp_path, saved=saved.append) as loop:
         loop.process(snapshot(2.0, "2"))
-    assert Progress.load(tmp_path) == Progress(1.0, "1", 0) == saved[-1]
+    assert Progress.load(tmp_path) == Progress(1.0, "1", logged=0, snapshot=1) == saved[-1]
     assert json.loads((tmp_path / "state.json").read_text())["number"] == 2
 
 
@@ -186,7 +186,7 @@ def test_time_stamps_of_cameras_are_compared_with_their_snapshots(tmp_path):
 
 
 def test_poses_go_out_and_an_output_that_fails_is_told_once(tmp_path):
-    class Broken:
+    class Broken(PoseSink):
         def send(self, record):
             raise OSError(f"no space for {record.snapshot}")
 

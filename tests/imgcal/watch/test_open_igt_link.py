@@ -1,14 +1,16 @@
 import socket
 import struct
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.watch import OpenIGTLink, listening_address
+from imgcal.watch import OpenIGTLink, Poses, listening_address
 from imgcal.watch import open_igt_link as module
 from imgcal.watch.open_igt_link import HEADER, message, status_message, transform_message
+from tests.imgcal.watch.states import some_state
 from tests.imgcal.watch.test_poses import record
 
 pyigtl = pytest.importorskip("pyigtl", reason="no pyigtl (extra dev): no independent client reads the messages")
@@ -86,6 +88,38 @@ def test_a_client_that_stops_reading_misses_poses_and_is_let_go_the_others_get_t
     for _ in range(20):
         server.send(record(number))
     assert not server._clients
+
+
+def statuses(client, count):
+    """Code and text of the next messages, which must all be STATUS."""
+    data, ends = b"", time.monotonic() + 60
+    while data.count(b"STATUS") < count or not data.endswith(b"\0"):
+        assert time.monotonic() < ends
+        data += client.recv(4096)
+    assert {fields["message_type"] for fields, _ in parsed(data)} == {"STATUS"}
+    return [(struct.unpack(">H", body[:2])[0], body[30:].rstrip(b"\0").decode()) for _, body in parsed(data)]
+
+
+def test_a_status_comes_every_second_also_while_no_snapshot_does(monkeypatch):
+    monkeypatch.setattr(module, "STATUS_EVERY", 0.05)
+    monkeypatch.setattr(module, "SILENT_SECONDS", 0.3)
+    sink = OpenIGTLink(port=0)
+    with Poses("igtl", sink, idle=0.02) as poses, socket.create_connection(("127.0.0.1", sink.port)) as client:
+        client.settimeout(10)
+        assert set(statuses(client, 3)) == {(16, "no snapshot has come yet; no pose")}
+        poses.publish(replace(some_state(), rig_from_object=None, refused="nothing is seen"))
+        found = []
+        while not found or "no snapshot" not in found[-1][1]:
+            found += [one for one in statuses(client, 1) if "yet" not in one[1]]
+        assert found[:2] == [(16, "nothing is seen; no pose")] * 2  # usual for a moment
+        assert found[-1] == (16, "no snapshot has come for 0 s; no pose")
+
+
+def test_a_slow_rig_is_not_silent_between_two_snapshots(server, monkeypatch):
+    seconds = iter((0.0, 10.0, 25.0, 41.0))
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(seconds))
+    server.send(record(0)), server.send(record(1))
+    assert server._record(next(seconds)).status == "ok" and server._record(next(seconds)).status == "no_object"
 
 
 def test_garbage_from_a_client_is_read_over(server):

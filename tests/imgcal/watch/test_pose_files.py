@@ -5,7 +5,7 @@ import os
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.watch import PoseFile
+from imgcal.watch import PoseFile, forget_rows
 from imgcal.watch.poses import COLUMNS
 from tests.imgcal.watch.test_poses import record
 
@@ -33,6 +33,28 @@ def test_poses_are_appended_and_half_a_line_is_cut_off(tmp_path, name):
         rows = [json.loads(line) for line in text.splitlines()]
         assert [None if r["covariance"] is None else r["rig_from_object"][0][3] for r in rows] == [1.0, None, 2.0]
     assert [int(row["snapshot"]) for row in rows] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("name", ["poses.csv", "poses.jsonl"])
+def test_rows_after_a_snapshot_are_removed_but_none_of_an_earlier_run(tmp_path, name):
+    path = tmp_path / name
+    written(path, 7, 8)
+    known = path.stat().st_size
+    written(path, 0, 1, 2, 3)
+    whole = path.read_bytes()
+    forget_rows(path, known, 3)
+    assert path.read_bytes() == whole
+    forget_rows(path, known, 1)
+    kept = path.read_text().splitlines()
+    assert len(kept) == 4 + name.endswith("csv") and whole.startswith("".join(f"{line}\n" for line in kept).encode())
+    forget_rows(path, 10**6, 0)
+    forget_rows(tmp_path / "nowhere.csv", 0, 0)
+    assert len(path.read_text().splitlines()) == len(kept)
+    forget_rows(path, known - 5, 0)  # no row ends there: this is another file
+    assert len(path.read_text().splitlines()) == len(kept)
+    path.write_bytes(whole + b"0.5,nonsense\n")
+    forget_rows(path, len(whole), 10**6)
+    assert path.read_bytes() == whole
 
 
 def test_files_that_are_none_of_ours_are_left_alone(tmp_path):

@@ -7,7 +7,7 @@ import torch
 
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.online import ObjectPose
-from imgcal.watch import PoseRecord, Poses
+from imgcal.watch import PoseRecord, Poses, PoseSink
 from imgcal.watch.poses import COLUMNS, UnwrittenError
 from tests.imgcal.watch.states import some_state
 
@@ -22,7 +22,7 @@ def record(number=0, status="ok", message="all 4 cameras are calibrated"):
     return PoseRecord(1.7e9 + number / 60, number, pose, status, message)
 
 
-class Sink:
+class Sink(PoseSink):
     def __init__(self, fails=(), waits=None):
         self.records, self.closed, self.fails, self.waits = [], False, fails, waits
 

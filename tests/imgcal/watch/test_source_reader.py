@@ -158,6 +158,54 @@ def test_what_an_earlier_run_has_worked_on_is_left_out(known, new, before):
     assert [snapshot.name for snapshot in found] == new and intake.known_before == before
 
 
+def blobs_at(time, uv, name=None):
+    return [Exposure(camera, time, CameraBlobs.of(uv), name) for camera in PAIR.camera_names]
+
+
+def first_of(*items):
+    """Digest of the first snapshot of a recording that shows anything."""
+    with SourceReader(Given(items), PAIR) as intake:
+        taken(intake)
+    return intake.first
+
+
+@pytest.mark.parametrize("begin", [[], blobs_at(0.5, [])])  # a recording may begin before the object comes
+def test_a_recording_is_known_by_what_it_shows_first(begin):
+    items = [*begin, *blobs_at(1.0, [[5.0, 6.0]]), *blobs_at(2.0, [[7.0, 8.0]])]
+    first = first_of(*items)
+    assert first is not None and first == first_of(*items[:-2]) == first_of(*blobs_at(9.0, [[5.0, 6.0]], "elsewhere"))
+    assert first != first_of(*items[-2:]) and first != first_of(items[-4]) and first_of(*blobs_at(1.0, [])) is None
+    with SourceReader(Given(items), PAIR, known=Known(1.0, first=first)) as intake:
+        assert intake.wait_until_open().resumes
+        assert [snapshot.time for snapshot in taken(intake)] == [2.0]
+    with SourceReader(Given(items), PAIR, known=Known(0.75, first=first + 1)) as intake:
+        assert not intake.wait_until_open().resumes
+        assert [snapshot.time for snapshot in taken(intake)] == [1.0, 2.0] and intake.known_before == len(begin) // 2
+    with (
+        pytest.raises(InputError, match="begins at 1 s, expected one after 3 s; --fresh starts over"),
+        SourceReader(Given(items), PAIR, known=Known(3.0, first=first + 1)) as intake,
+    ):
+        intake.wait_until_open()
+
+
+def test_why_the_same_recording_cannot_go_on_is_told_before_anything_is_written():
+    items = blobs_at(1.0, [[5.0, 6.0]])
+    known = Known(0.5, first=first_of(*items), mismatch="another rate")
+    with pytest.raises(InputError, match="another rate"), SourceReader(Given(items), PAIR, known=known) as intake:
+        intake.wait_until_open()
+
+
+def test_a_recording_whose_clocks_are_set_back_is_gone_on_with_where_it_was():
+    times = [100.0, 101.0, 102.0, 50.0, 51.0, 52.0]
+    items = [one for number, time in enumerate(times) for one in blobs_at(time, [[5.0 + number, 6.0]])]
+    with SourceReader(Given(items), PAIR) as intake:
+        found = taken(intake)
+    assert [snapshot.time for snapshot in found] == times
+    for number, last in enumerate(found):
+        with SourceReader(Given(items), PAIR, known=Known(last.time, era=last.era)) as intake:
+            assert [snapshot.time for snapshot in taken(intake)] == times[number + 1 :]
+
+
 def test_another_recording_that_is_not_later_is_refused():
     items = [Exposure(camera, 1.0, NOTHING, "a") for camera in PAIR.camera_names]
     refused = pytest.raises(InputError, match="begins at 1 s, expected one after 5 s; --fresh starts over")
