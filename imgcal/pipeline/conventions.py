@@ -8,16 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from imgcal.association import associate_lights, background_rows, image_error
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
+from imgcal.messages import plural
 from imgcal.pipeline.lines_of_sight import FARTHEST, choose_telling_snapshots, mean_miss
 from imgcal.pipeline.turned_images import UPRIGHT, WAYS, turn, undo
-from imgcal.types import CameraRig, Detections
+from imgcal.types import CameraRig, Detections, RigPrior
 
 MOST_TRIED = 4
 """Snapshots that are calibrated."""
@@ -30,6 +33,11 @@ AS_IN_TABLES = {
     (False, True, False): " (as if u were counted from the right)",
     (True, False, False): " (as if u and v were exchanged)",
 }
+
+MOST_MET, MOST_BLOBS, LEAST_MEETING = 40, 4000, 3
+"""Snapshots in which rays are compared, and blobs in these; minimum number of cameras: two rays meet too easily."""
+LEAST_EVIDENCE, LEAST_LEAD = 50.0, 1.25
+"""Log odds by which the markers of one reading must exceed those of any other, and the factor."""
 
 Fit = Callable[[Detections, CameraRig], float]
 """Calibrate; returns the RMS in pixels. Raises RefusedError."""
@@ -79,6 +87,53 @@ def require_conventions(error: RefusedError, detections: Detections, rig: Camera
     if fitting:
         words, rms = ", or ".join(fitting), max(fitting.values())
         raise RefusedError(f"{words}; read like that, images and rig fit to {rms:.2g} px; so {error.reason}") from error
+
+
+def require_meeting_rays(error: RefusedError, detections: Detections, rig: CameraRig) -> None:
+    """Replace a refusal if blobs meet in space once images or rig are read in another convention, or cameras renamed.
+
+    This needs no object: sticks and lights have no pattern, but what three cameras see of a marker meets in one point.
+
+    Args:
+        error: the refusal.
+        detections: the blobs that were refused.
+        rig: the factory calibration, in float64.
+
+    Raises:
+        RefusedError: names the convention, or the cameras.
+    """
+    if rig.num_cameras < LEAST_MEETING:
+        return
+    count = len(detections.snapshot_names)
+    most = min(count, MOST_MET, max(MOST_BLOBS * count // max(len(detections), 1), 1))
+    detections = detections.choose_snapshots(np.linspace(0, count - 1, most).astype(int))
+    detections = detections.select(~background_rows(detections))
+    gate = image_error(rig, (rig.prior or RigPrior()).std(rig))
+    readings = [Reading("", detections, rig), *other_readings(detections, rig), *other_names(detections, rig)]
+    found = [associate_lights(reading.detections, reading.rig, gate) for reading in readings]
+    evidence = np.array([float(lights.odds.sum()) for lights in found])
+    best = int(evidence.argmax())
+    words = readings[best].words
+    rivals = evidence[[reading.words != words for reading in readings]]  # in a regular rig, several shifts fit alike
+    if best == 0 or evidence[best] < LEAST_EVIDENCE + LEAST_LEAD * rivals.max():
+        return
+    raise RefusedError(
+        f"{words}; read like that, blobs of three cameras or more meet in {plural(len(found[best]), 'place')}"
+        f", otherwise in {len(found[0])}; so {error.reason}"
+    ) from error
+
+
+def other_names(detections: Detections, rig: CameraRig) -> Iterator[Reading]:
+    """Exchange any two cameras, and shift the names of all by any number."""
+    names, count = rig.camera_names, rig.num_cameras
+    for pair in combinations(range(count), 2):
+        words = f"cameras {names[pair[0]]} and {names[pair[1]]} seem to be exchanged"
+        camera = np.arange(count)
+        camera[list(pair)] = pair[::-1]
+        yield Reading(words, replace(detections, camera=camera[detections.camera]), rig)
+    for by in range(1, count):
+        words = "the names of all cameras seem to be shifted against those of the rig: each has another one's name"
+        yield Reading(words, replace(detections, camera=(detections.camera + by) % count), rig)
 
 
 def _fit_some(fit: Fit, detections: Detections, rig: CameraRig, snapshots: NDArray[np.int64]) -> float | None:

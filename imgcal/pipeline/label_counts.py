@@ -99,7 +99,7 @@ def count_labels(
     fitting[used], expected[used] = kept.sum(-1), inside.sum(-1)
     usable = count(detections.usable)
     spare = np.maximum(usable - fitting, 0)
-    whole = (fitting >= LEAST_FOUND) & (fitting >= WHOLE * np.minimum(expected, usable))
+    whole = (fitting >= _least_of_whole(labelled, obj)) & (fitting >= WHOLE * np.minimum(expected, usable))
     looked = np.array([snapshot.found_by != "classical" for snapshot in labelled.snapshots], dtype=bool)
     return LabelCounts(
         blobs=count(np.ones(len(detections), dtype=bool)),
@@ -111,6 +111,12 @@ def count_labels(
         found=looked[:, None] & (fitting >= np.maximum(LEAST_FOUND, LEAST_SHARE * expected)),
         crowd=np.where(looked[:, None], _usual_false_blobs(spare), _usual_extra_blobs(spare, whole)),
     )
+
+
+def _least_of_whole(labelled: Associations, obj: CalibrationObject) -> Counts:
+    """Minimum number of labels for the whole object to be in view (S, 1): all of a stick's; one alone shows nothing."""
+    size = np.array([obj.each[snapshot.part].num_fiducials for snapshot in labelled.snapshots], dtype=np.int64)
+    return np.where(size > 1, np.minimum(size, LEAST_FOUND), LEAST_FOUND)[:, None]
 
 
 def _count_placed(labelled: Associations, poses: RigidTransform, rig: CameraRig, obj: CalibrationObject) -> Counts:

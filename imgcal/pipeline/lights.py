@@ -264,14 +264,22 @@ def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject
             best, best_rig = agreement, trial or rig
     if best is not None:
         _require_upright_images(best, detections, rig, best_rig)
-    wider = "if cameras may have moved farther than the rig's prior says, "
+    fewer, carry = "show fewer markers at once, or one light alone; ", "carry one light around and "
+    if _is_one_light(detections):
+        fewer = carry = ""
+    wider = f"{fewer}if cameras may have moved farther than the rig's prior says, "
     raise _refusal(
         best,
         rig,
-        python=f"show fewer markers at once, or one light alone; {wider}widen it: replace(rig, prior=RigPrior(...))",
-        command=f"show fewer markers at once, or one light alone; {wider}write larger values under `prior` in the rig "
-        "file, or carry one light around and use --cameras",
+        python=f"{wider}widen it: replace(rig, prior=RigPrior(...))",
+        command=f"{wider}write larger values under `prior` in the rig file, or {carry}use --cameras",
     )
+
+
+def _is_one_light(detections: Detections) -> bool:
+    """Tell whether most images that show anything show one blob."""
+    count = np.unique(detections.snapshot * len(detections.camera_names) + detections.camera, return_counts=True)[1]
+    return len(count) > 0 and float(np.median(count)) <= 1
 
 
 def _require_upright_images(agreement: Agreement, detections: Detections, factory: CameraRig, rig: CameraRig) -> None:

@@ -26,7 +26,8 @@ from imgcal.estimation import (
 )
 from imgcal.geometry import RigidTransform
 from imgcal.medians import MEDIAN_SQUARED
-from imgcal.pipeline.label_counts import LabelCounts, count_labels
+from imgcal.pipeline.camera_places import CameraView
+from imgcal.pipeline.label_counts import LEAST_FOUND, LabelCounts, count_labels
 from imgcal.pipeline.labelled_capture import LabelledCapture, arrange_labels
 from imgcal.types import CalibrationObject, CameraRig, Detections, MovedCamera, MovedError
 
@@ -41,6 +42,7 @@ EARLIER = "taken before a camera moved"
 MOST_MOVES = 8  # maximum number of parts of a capture
 
 Bools = NDArray[np.bool_]
+Rows = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -169,7 +171,7 @@ def _moves(
         fit = _fit(arrange_labels(again, rig, obj), rig, obj, options)
     names = tuple(labelled.snapshots[s].name for s in labelled.used)
     found = find_moves(fit.problem, fit.state, rig.camera_names, names, options.estimation)
-    gone = _find_gone(fit, labelled, rig, {move.camera for move in found})
+    gone = _find_gone(fit, labelled, rig, obj, {move.camera for move in found})
     return tuple(sorted((*found, *gone), key=lambda move: names.index(move.snapshot))), fits
 
 
@@ -258,7 +260,9 @@ def _row_of(
     return np.where(fiducial >= 0, table[labelled.moments[row], obj.part_of[fiducial]], row)
 
 
-def _find_gone(fit: _Fit, labelled: Associations, rig: CameraRig, known: set[str]) -> list[MovedCamera]:
+def _find_gone(
+    fit: _Fit, labelled: Associations, rig: CameraRig, obj: CalibrationObject, known: set[str]
+) -> list[MovedCamera]:
     """Find cameras that first saw the object in the right place and later in a wrong one, or vice versa.
 
     The probability that a moment separates the agreeing from the disagreeing snapshots so cleanly follows from random
@@ -289,5 +293,21 @@ def _find_gone(fit: _Fit, labelled: Associations, rig: CameraRig, known: set[str
         shares = before[best] / place[best], (count - before[best]) / (total - place[best])
         parted = min(shares) <= MOST_MIXED and max(shares) >= 1 - MOST_MIXED
         if parted and 2 * len(place) * doubtful * chance[best] < LEAST_CHANCE:
+            if not _shows_object_elsewhere(fit, labelled, rig, obj, rows[~wrong], rows[wrong], camera):
+                continue
             moves.append(MovedCamera(name, labelled.snapshots[rows[place[best]]].name, "unknown"))
     return moves
+
+
+def _shows_object_elsewhere(
+    fit: _Fit, labelled: Associations, rig: CameraRig, obj: CalibrationObject, right: Rows, wrong: Rows, camera: int
+) -> bool:
+    """Check that the blobs of a camera in the `wrong` snapshots are the object, and that only another place shows it.
+
+    Blobs that are few may be reflections beside a hidden object. They do not follow it as its image does.
+    """
+    view = CameraView.of(labelled, pose_at(fit.problem, fit.state)[0], rig, obj, camera)
+    right, wrong = (np.searchsorted(labelled.used, rows) for rows in (right, wrong))
+    many = fit.tally.unexplained[:, camera][labelled.used][wrong] >= LEAST_FOUND
+    is_object = 2 * many.sum() > len(wrong) or view.some_turn_explains(wrong)
+    return is_object and not view.one_place_explains(right, wrong)

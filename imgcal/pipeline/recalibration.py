@@ -20,7 +20,7 @@ from imgcal.detection import DetectionOptions
 from imgcal.errors import InputError, RefusedError
 from imgcal.pipeline.board_turns import settle_turns
 from imgcal.pipeline.calibration import Calibration
-from imgcal.pipeline.conventions import lines_of_sight_miss, require_conventions
+from imgcal.pipeline.conventions import lines_of_sight_miss, require_conventions, require_meeting_rays
 from imgcal.pipeline.fitting import fit_steady
 from imgcal.pipeline.initialization import Initializer
 from imgcal.pipeline.late_cameras import find_late_cameras, require_same_moments
@@ -158,7 +158,11 @@ class _Case:
             with contextlib.suppress(*UNSOLVABLE):  # what cannot be solved explains nothing
                 if self.may_be_misread:
                     self.try_conventions(error)
-                require_units(error, self.detections, self.rig, self.obj)
+                # Labels show more than the sizes of images, which reflections distort.
+                shown = self.detections if labelled is None else labelled.detections
+                require_units(error, shown, self.rig, self.obj)
+                if labelled is None or not is_solid(self.obj):
+                    require_meeting_rays(error, self.detections, self.rig)
                 if labelled is not None:
                     require_matching_images(error, self.detections, labelled, self.rig, self.obj)
                     require_same_moments(error, self.detections, labelled, self.rig, self.obj, self.options)
@@ -211,6 +215,8 @@ def _calibrate_lights(
             fit = fit_steady(lights.labelled, lights.labelled.detections, rig, obj, options)
     except RefusedError as error:
         require_units(error, detections, rig, obj)
+        with contextlib.suppress(*UNSOLVABLE):
+            require_meeting_rays(error, detections, rig)
         raise
     seconds = {
         "detection": detecting,

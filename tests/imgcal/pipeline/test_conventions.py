@@ -11,11 +11,12 @@ import torch
 import imgcal
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
-from imgcal.pipeline.conventions import lines_of_sight_miss, other_readings
+from imgcal.pipeline.conventions import lines_of_sight_miss, other_readings, require_meeting_rays
 from imgcal.pipeline.lines_of_sight import choose_telling_snapshots, mean_miss, sight_angles
 from imgcal.pipeline.turned_images import WAYS, turn, undo
 from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
 from imgcal.types import CameraRig, Detections
+from tests.imgcal.association.stick_scenes import TRIPLE, capture
 from tests.imgcal.pipeline.short_search import SHORT
 
 
@@ -167,3 +168,32 @@ def test_each_way_to_turn_an_image_has_its_name_and_is_undone() -> None:
         np.testing.assert_array_equal(turn(turn(uv, last, way), last, undo(way)), uv)
     (clockwise,) = (way for way, name in WAYS.items() if name == "turned clockwise by 90 degrees")
     np.testing.assert_array_equal(turn(np.zeros((1, 2)), last, clockwise), [[9.0, 0.0]])  # top left to top right
+
+
+SPOT = ((0.0, 0.0, 0.0),)
+
+
+@pytest.mark.parametrize("points", [TRIPLE, SPOT])
+@pytest.mark.parametrize(("mistake", "expected"), [
+    ("v from the bottom", "all images seem to be mirrored top to bottom"),
+    ("OpenGL", "the rig's cameras seem to look along -z"),
+    ("exchanged", "cameras cam02 and cam05 seem to be exchanged"),
+    ("shifted", "the names of all cameras seem to be shifted against those of the rig"),
+])  # fmt: skip
+def test_rays_that_meet_show_conventions_and_names_without_a_pattern(points, mistake: str, expected: str) -> None:
+    rig, obj, blobs, _ = capture(points, 24, false=1)
+    rig = rig.to(torch.float64)
+    if mistake == "exchanged":
+        blobs = replace(blobs, camera=np.array([0, 4, 2, 3, 1, 5, 6, 7, 8, 9])[blobs.camera])
+    elif mistake == "shifted":
+        blobs = replace(blobs, camera=(blobs.camera - 1) % rig.num_cameras)
+    else:
+        rig, blobs = MISTAKES[mistake][0](rig, blobs)
+    with pytest.raises(RefusedError, match=rf"^{expected}.*; read like that, blobs of three .*; so "):
+        imgcal.calibrate(blobs, rig, obj)
+
+
+def test_rays_that_meet_as_they_are_hide_no_refusal() -> None:
+    rig, _, blobs, _ = capture(TRIPLE, 12, false=1)
+    require_meeting_rays(RefusedError("of another kind"), blobs, rig.to(torch.float64))
+    require_meeting_rays(RefusedError("nothing"), blobs.select(np.zeros(0, dtype=int)), rig.to(torch.float64))

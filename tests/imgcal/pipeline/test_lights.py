@@ -119,6 +119,13 @@ def test_a_camera_whose_image_is_turned_is_named(scene: Scene) -> None:
         imgcal.calibrate(turned, scene.factory, LIGHTS)
 
 
+def test_one_light_alone_is_not_advised_where_it_is_one() -> None:
+    rig, obj, blobs, _ = capture(((0.0, 0.0, 0.0),), 24, false=0)
+    with pytest.raises(RefusedError, match=r"^unknown markers: camera cam04: of .*use --cameras|cam04") as refused:
+        imgcal.calibrate(blobs, camera_faults.turned(rig, 3, 15.0), obj)
+    assert "one light" not in refused.value.for_command and "use --cameras" in refused.value.for_command
+
+
 def test_few_snapshots_are_refused(scene: Scene) -> None:
     with pytest.raises(RefusedError, match="found 4 snapshots, expected at least 8"):
         imgcal.calibrate(scene.detections.of_snapshots(0, 4), scene.factory, LIGHTS)

@@ -14,6 +14,8 @@ from imgcal.io import load_object, read_rig
 from imgcal.pipeline import calibrate, score, unit_doubt
 from imgcal.pipeline.units import image_doubt
 from imgcal.synthesis import PhysicalDrift, simulate_truth, simulate_volume, true_detections
+from imgcal.types import MovedError
+from scripts.benchmarks import camera_faults as damage
 from tests.imgcal.pipeline.short_search import SHORT
 
 RIGS = ("O10", "O6", "U7", "T4", "room10")
@@ -199,3 +201,11 @@ def test_a_refusal_of_unknown_markers_or_a_stick_names_the_unit():
     blobs = true_detections(simulate_volume(rig, stick, 20, torch.Generator().manual_seed(0), PhysicalDrift()))
     with pytest.raises(RefusedError, match=r"^the object seems to be in metres, .*; so "):
         calibrate(blobs, rig, object_in_metres(stick))
+
+
+def test_reflections_beside_a_body_make_no_unit_of_a_move():
+    rig, obj, truth = damage.wand_in_a_room(30, 1)
+    moved = damage.changed_from(truth, obj, 3, 15, lambda r: damage.turned(r, 3, 1.0))
+    table = damage.blobs(moved, 1, clutter=2.0, missed=0.4)
+    with pytest.raises(MovedError, match=r"^camera cam04 moved before snapshot"):
+        calibrate(table, rig, obj)
