@@ -331,15 +331,18 @@ def _measure(name: str, method: Method, batch: Sample, first: int) -> dict[str, 
         rows = slice(start, min(start + size, count))
         given = batch.given(rows)
         truth = batch.truth[rows]
+        least = int(given.seen.any(1).sum(-1).min())
+        too_few = InputError(
+            f"missing: found {batch.conditions.corruption.missing:g}, expected a smaller share: it leaves one rig "
+            f"{least} fiducials, and a pose needs {LEAST_FIDUCIALS}"
+        )
+        if least == 0:
+            raise too_few
         try:
             passes = method.passes(given) if method.passes is not None else (method.predict(given),)
         except torch.linalg.LinAlgError as error:
-            least = int(given.seen.any(1).sum(-1).min())
             if least < LEAST_FIDUCIALS:
-                raise InputError(
-                    f"missing: found {batch.conditions.corruption.missing:g}, expected a smaller share: it leaves "
-                    f"one rig {least} fiducials, and a pose needs {LEAST_FIDUCIALS}"
-                ) from error
+                raise too_few from error
             raise RefusedError(
                 f"evaluation: {name}: a system of equations has no solution ({error}), though every rig sees at least "
                 f"{least} different fiducials: the object lies on one line, or this method has a fault"
