@@ -215,15 +215,16 @@ def check_detections(detections: Detections, rig: CameraRig, obj: CalibrationObj
 
 def _require_shared_snapshot(detections: Detections) -> None:
     """Require a snapshot in which two cameras have blobs: without one, nothing relates the cameras to each other."""
-    seen = np.unique(np.stack((detections.snapshot, detections.camera)), axis=1)
-    snapshots, cameras = seen
-    if len(np.unique(snapshots)) < len(snapshots) or len(np.unique(cameras)) < 2:
+    shape = len(detections.snapshot_names), len(detections.camera_names)
+    blobs = np.bincount(detections.snapshot * shape[1] + detections.camera, minlength=shape[0] * shape[1])
+    seen = blobs.reshape(shape) > 0
+    showing = np.flatnonzero(seen.any(axis=0))
+    if len(showing) < 2 or seen.sum(axis=1).max() > 1:
         return
-    first, second = np.unique(cameras)[:2]
     names = [
         f"{detections.camera_names[camera]}: "
-        f"{list_names(detections.snapshot_names[each] for each in snapshots[cameras == camera])}"
-        for camera in (first, second)
+        f"{list_names(detections.snapshot_names[each] for each in np.flatnonzero(seen[:, camera]))}"
+        for camera in showing[:2]
     ]
     raise InputError(
         f"detections: found no snapshot in which two cameras have blobs ({'; '.join(names)}), expected what cameras "
