@@ -332,17 +332,13 @@ def _measure(name: str, method: Method, batch: Sample, first: int) -> dict[str, 
         given = batch.given(rows)
         truth = batch.truth[rows]
         least = int(given.seen.any(1).sum(-1).min())
-        too_few = InputError(
-            f"missing: found {batch.conditions.corruption.missing:g}, expected a smaller share: it leaves one rig "
-            f"{least} fiducials, and a pose needs {LEAST_FIDUCIALS}"
-        )
         if least == 0:
-            raise too_few
+            raise _make_missing_error(batch, least)
         try:
             passes = method.passes(given) if method.passes is not None else (method.predict(given),)
         except torch.linalg.LinAlgError as error:
             if least < LEAST_FIDUCIALS:
-                raise too_few from error
+                raise _make_missing_error(batch, least) from error
             raise RefusedError(
                 f"evaluation: {name}: a system of equations has no solution ({error}), though every rig sees at least "
                 f"{least} different fiducials: the object lies on one line, or this method has a fault"
@@ -356,6 +352,14 @@ def _measure(name: str, method: Method, batch: Sample, first: int) -> dict[str, 
             found["refined"].append(errors(refined.prediction, truth, given.obj).where(refined.found))
     joined = {stage: vars(concatenate(parts)) if parts else None for stage, parts in found.items()}
     return {**joined, "passes": number, "rigs": count}
+
+
+def _make_missing_error(batch: Sample, least: int) -> InputError:
+    """Make the error for a rig that sees only `least` fiducials."""
+    return InputError(
+        f"missing: found {batch.conditions.corruption.missing:g}, expected a smaller share: it leaves one rig {least} "
+        f"fiducials, and a pose needs {LEAST_FIDUCIALS}"
+    )
 
 
 def _row(trials: Sequence[_Collected], bounds: tuple[Errors, ...]) -> Row:

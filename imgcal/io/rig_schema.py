@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from typing import Annotated, Any, Literal, Self
 
 import torch
@@ -210,8 +209,7 @@ class RigFile(StrictModel):
 
 def check_names(names: list[str]) -> None:
     """Raise `ValueError` where two cameras have one name."""
-    twice, times = Counter(names).most_common(1)[0]
-    if times > 1:
+    if (twice := limits.find_repeated(names)) is not None:
         raise ValueError(f"found the camera name {twice} more than once, expected different names")
 
 
