@@ -22,6 +22,7 @@ from imgcal.estimation.linearization import (
     POSE_PARAMETERS,
     Problem,
     State,
+    Step,
     jacobian_at,
     points_at,
     robust_weight,
@@ -180,7 +181,11 @@ def object_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Sh
 
 
 def scale_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ScaleEvidence | None:
-    """Compute the `scale_error` of an exact object in time linear in its fiducials instead of cubic.
+    """Compute the `scale_error` of an exact object without differentiating by its fiducials.
+
+    If object, poses and the cameras' positions about their centre are all scaled alike, no image changes. So scaling the
+    object is as good as scaling all the others the other way, and only the prior of the positions notices that. With v
+    that step of the whitened offsets o, and S their covariance, v^T (v - S v) is the information of the scale.
 
     Args:
         problem: of one rig, with an exact object.
@@ -192,14 +197,32 @@ def scale_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Sca
     """
     if not bool(problem.points.any()):  # one point has no scale
         return ScaleEvidence((0.0, np.inf))
+    offset, prior_std = solution.state.offset, problem.prior_std[..., 3:6]
+    if not bool((prior_std > 0).all()):
+        return _scale_evidence_of_fixed(problem, solution, loss)
+    factorization = solution.factorization
+    if bool(factorization.reduced.failed.any()):
+        return None
+    position = problem.factory.positions + offset[..., 3:6] * prior_std
+    step = torch.zeros_like(offset)
+    step[..., 3:6] = (position - position.mean(1, keepdim=True)) / prior_std
+    pose = torch.zeros_like(solution.equations.pose_gradient)
+    left = float((step * (step - factorization.solve(Step(step, pose, None)).camera)).sum())
+    if left <= UNSURE * float(step.square().sum()):
+        return ScaleEvidence((0.0, np.inf))
+    return ScaleEvidence((-float((step * offset).sum()) / left, left**-0.5))
+
+
+def _scale_evidence_of_fixed(problem: Problem, solution: Solution, loss: NamedLoss) -> ScaleEvidence | None:
+    """Do the work of `scale_evidence` where positions of cameras are fixed, in time linear in the fiducials."""
     found = direction_evidence(problem, solution, loss, problem.points[None])
     if found is None:
         return None
-    left = found.information[0, 0]
+    left = float(found.information[0, 0])
     # As in `ShapeEvidence`, but relative to a fiducial's information before rig and poses are marginalized.
-    if left <= UNSURE * found.alone * problem.points.square().sum():
+    if left <= UNSURE * found.alone * float(problem.points.square().sum()):
         return ScaleEvidence((0.0, np.inf))
-    return ScaleEvidence((float(found.pull[0] / left), float(left) ** -0.5))
+    return ScaleEvidence((float(found.pull[0]) / left, left**-0.5))
 
 
 def shape_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ShapeEvidence | None:
