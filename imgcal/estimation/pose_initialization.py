@@ -122,13 +122,16 @@ def _rays(
 def _quadratic_form(rays: Tensor, origins: Tensor, seen: Tensor, points: Tensor) -> _QuadraticForm:
     """Sum the squared distances of the fiducials from their rays into a quadratic form."""
     eye = torch.eye(3, dtype=rays.dtype, device=rays.device)
-    per_ray = (eye - rays.unsqueeze(-1) * rays.unsqueeze(-2)) * seen[..., None, None]  # projects across the ray
-    across = per_ray.sum(1)  # (P, N, 3, 3)
-    pulled = torch.einsum("pcnij,pcj->pni", per_ray, origins)
-    total = across.sum(1)
-    slope = torch.einsum("pnij,na->pija", across, points).flatten(-2)  # (P, 3, 9)
-    matrix = torch.einsum("pnij,na,nb->piajb", across, points, points).flatten(-2).flatten(1, 2)
-    linear = torch.einsum("pni,na->pia", pulled, points).flatten(-2)
+    shown = rays * seen[..., None]
+    # A ray r projects a point x across it to (1 - r r^T) x.
+    across = seen.sum(1)[..., None, None] * eye - torch.einsum("pcni,pcnj->pnij", shown, rays)  # (P, N, 3, 3)
+    along = (rays * origins[:, :, None]).sum(-1, keepdim=True)
+    pulled = seen.mT @ origins - (shown * along).sum(1)  # (P, N, 3)
+    total, flat = across.sum(1), across.flatten(2).mT  # (P, 3, 3), (P, 9, N)
+    slope = (flat @ points).reshape(-1, 3, 9)
+    squares = (points[:, :, None] * points[:, None]).flatten(1)  # (N, 9)
+    matrix = (flat @ squares).unflatten(-1, (3, 3)).unflatten(1, (3, 3)).transpose(2, 3).flatten(3).flatten(1, 2)
+    linear = (pulled.mT @ points).flatten(1)
     # A single ray leaves the translation along it undetermined, and none leaves all of it; slight regularization keeps
     # the solution finite. The trace is two for each ray.
     total = total + 1e-9 * total.diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(2.0)[:, None, None] * eye

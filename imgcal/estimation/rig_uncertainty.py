@@ -249,7 +249,9 @@ def _pixel_rows(rig: CameraRig, points: Tensor) -> Tensor:
     by_z = -(by_x * x[:, None] + by_y * y[:, None])
     by_point = torch.stack((by_x, by_y, by_z), 1)  # (C, 3, 2, P)
     rows = by_point.new_zeros(len(rotation), rig.num_parameters, *by_point.shape[2:])
-    torch.linalg.cross(in_camera[:, :, None].expand_as(by_point), by_point, dim=1, out=rows[:, 0:3])
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # the cross product, far faster by hand
+        torch.mul(in_camera[:, j, None], by_point[:, k], out=rows[:, i])
+        rows[:, i].addcmul_(in_camera[:, k, None], by_point[:, j], value=-1)
     rows[:, 3:6] = (-rotation.mT @ by_point.flatten(2)).view(by_point.shape)
     rows[:, 6, 0], rows[:, 7, 1] = xd, yd
     rows[:, 8, 0] = rows[:, 9, 1] = 1
