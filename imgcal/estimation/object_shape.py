@@ -183,9 +183,9 @@ def object_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> Sh
 def scale_evidence(problem: Problem, solution: Solution, loss: NamedLoss) -> ScaleEvidence | None:
     """Compute the `scale_error` of an exact object without differentiating by its fiducials.
 
-    If object, poses and the cameras' positions about their centre are all scaled alike, no image changes. So scaling the
-    object is as good as scaling all the others the other way, and only the prior of the positions notices that. With v
-    that step of the whitened offsets o, and S their covariance, v^T (v - S v) is the information of the scale.
+    If object, poses and the cameras' positions about their centre are all scaled alike, no image changes. So a larger
+    object is as good as smaller distances, and only the prior of the positions tells them apart. Where v is the step of
+    the whitened offsets that scales the positions, and S their covariance, the scale's information is v^T (v - S v).
 
     Args:
         problem: of one rig, with an exact object.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -28,6 +29,8 @@ from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.initialization import Initialization, Initializer, prediction_residual
 from imgcal.pipeline.label_counts import count_labels
 from imgcal.pipeline.labelled_capture import LabelledCapture, arrange_labels
+from imgcal.pipeline.light_motion import require_steady_cameras
+from imgcal.pipeline.lights import FoundLights
 from imgcal.pipeline.motion_check import steady_part
 from imgcal.pipeline.object_checks import object_offsets
 from imgcal.pipeline.object_exchange import require_one_size
@@ -44,6 +47,7 @@ from imgcal.types import (
     CalibrationObject,
     CameraRig,
     Detections,
+    MovedError,
     Observations,
     Prediction,
     RigPrior,
@@ -85,6 +89,45 @@ def fit_steady(
     fit = replace(fit, moved=steady.moved)  # before its tally is computed and cached
     require_views(fit.tally, rig)
     return fit
+
+
+def fit_lights(
+    lights: FoundLights,
+    rig: CameraRig,
+    obj: CalibrationObject,
+    options: PipelineOptions,
+    prior_std: Tensor | None = None,
+) -> Calibration:
+    """Do what `fit_steady` does with unknown markers, and check that every camera shows them in place to the end.
+
+    Raises:
+        RefusedError: the data are not sufficient.
+        MovedError: a camera shows the markers elsewhere before or after some moment.
+    """
+    labelled = lights.labelled
+    fit = fit_steady(labelled, labelled.detections, rig, obj, options, prior_std=prior_std)
+    moment, points = fit.labelled.moments[fit.labelled.used], fit.rig_from_object.translation.numpy()
+    moving = lights.detections.select(~lights.background)
+    require_steady_cameras(moving, moment, points, fit.observations.seen[:, :, 0].numpy(), fit.estimate.rig)
+    return replace(fit, lights=lights)
+
+
+def fit_since_last_move(
+    fit: Callable[[Detections], Calibration], detections: Detections, options: PipelineOptions
+) -> Calibration:
+    """Fit unknown markers; if a camera has moved and the options allow it, those after its move.
+
+    Raises:
+        RefusedError: the data are not sufficient, or a camera has moved.
+    """
+    try:
+        return fit(detections)
+    except MovedError as error:
+        if not (options.after_last_move and error.explained):
+            raise
+        first = len(detections.snapshot_names) - error.since
+        found = fit_since_last_move(fit, detections.select(detections.snapshot >= first), options)
+        return replace(found, moved=(*error.moved, *found.moved))
 
 
 def fit_labelled(

@@ -31,6 +31,7 @@ from imgcal.estimation import K3, ColdStart, cold_start, ordinary_lens
 from imgcal.messages import list_names, plural
 from imgcal.pipeline.board_turns import require_one_turn
 from imgcal.pipeline.calibration import Calibration
+from imgcal.pipeline.fitting import fit_since_last_move
 from imgcal.pipeline.late_cameras import find_late_cameras, require_same_moments
 from imgcal.pipeline.lights_from_scratch import calibrate_lights_from_scratch, place_by_stick
 from imgcal.pipeline.partial_labels import name_missing_labels
@@ -112,7 +113,9 @@ def calibrate_from_scratch(
         detections, obj = _marker_alone(detections, obj)
         found = time.perf_counter()
         with require_solvable():
-            fit = calibrate_lights_from_scratch(detections, cameras, obj, options, distance)
+            fit = fit_since_last_move(
+                lambda some: calibrate_lights_from_scratch(some, cameras, obj, options, distance), detections, options
+            )
         seconds = {"detection": found - started, "estimation": time.perf_counter() - found}
         return _complete_rig(replace(fit, repeats=repeats), cameras, seconds)
     require_one_turn(cameras, obj)

@@ -30,6 +30,7 @@ from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate, EstimationOptions, estimate, robust_std
 from imgcal.geometry import RigidTransform
 from imgcal.messages import name_cameras
+from imgcal.pipeline.light_motion import require_steady_cameras
 from imgcal.pipeline.turned_images import compare_turns
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations, RigPrior
 
@@ -248,6 +249,7 @@ def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject
 
     Raises:
         RefusedError: there is none, or another one explains the blobs equally well.
+        MovedError: a camera moved, so that none is right for all moments.
     """
     std = (rig.prior or RigPrior()).std(rig)
     generator = torch.Generator().manual_seed(0)
@@ -264,6 +266,8 @@ def _verified_rig(detections: Detections, rig: CameraRig, obj: CalibrationObject
             best, best_rig = agreement, trial or rig
     if best is not None:
         _require_upright_images(best, detections, rig, best_rig)
+        found = associate_lights(detections, best_rig, even_error(rig))
+        require_steady_cameras(detections, found.moment, found.point, found.row >= 0, best_rig)
     fewer, carry = "show fewer markers at once, or one light alone; ", "carry one light around and "
     if _is_one_light(detections):
         fewer = carry = ""

@@ -23,7 +23,7 @@ from imgcal.estimation import cold_start_from_points, move_to_pair_frame, prior_
 from imgcal.geometry import RigidTransform
 from imgcal.messages import plural
 from imgcal.pipeline.calibration import Calibration
-from imgcal.pipeline.fitting import fit_steady
+from imgcal.pipeline.fitting import fit_lights
 from imgcal.pipeline.lights import (
     AFTER_ALIGNMENT,
     NOTHING,
@@ -125,8 +125,7 @@ def calibrate_lights_from_scratch(
     assert cameras.prior is not None
     placed = replace(first, prior=_prior(first, cameras.prior))
     std = _wide_prior_std(first, pair, cameras.prior)
-    fit = fit_steady(lights.labelled, lights.labelled.detections, placed, obj, options, prior_std=std)
-    fit = replace(fit, lights=lights, distance=known)
+    fit = replace(fit_lights(lights, placed, obj, options, std), distance=known)
     _require_determined(fit, pair[0])
     return fit
 

@@ -276,27 +276,40 @@ def _find_gone(
     for camera, name in enumerate(rig.camera_names):
         rows = np.flatnonzero(agrees[:, camera] | differs[:, camera])
         wrong = differs[rows, camera]
-        total, count = len(rows), int(wrong.sum())
-        if name in known or not LEAST_SNAPSHOTS <= count <= total - LEAST_SNAPSHOTS:
+        if name in known or not LEAST_SNAPSHOTS <= wrong.sum() <= len(rows) - LEAST_SNAPSHOTS:
             continue
         least = max(LEAST_SNAPSHOTS, longest_episode(fit.problem, fit.state, camera, moments) + 1)
-        if total < 2 * least:
-            continue
-        place = np.arange(least, total - least + 1)
-        before = np.cumsum(wrong)[place - 1]
-        from scipy.stats import hypergeom  # slow to import, and rarely needed
-
-        chance = np.minimum(
-            hypergeom.sf(before - 1, total, count, place), hypergeom.sf(count - before - 1, total, count, total - place)
-        )
-        best = int(chance.argmin())
-        shares = before[best] / place[best], (count - before[best]) / (total - place[best])
-        parted = min(shares) <= MOST_MIXED and max(shares) >= 1 - MOST_MIXED
-        if parted and 2 * len(place) * doubtful * chance[best] < LEAST_CHANCE:
-            if not _shows_object_elsewhere(fit, labelled, rig, obj, rows[~wrong], rows[wrong], camera):
-                continue
-            moves.append(MovedCamera(name, labelled.snapshots[rows[place[best]]].name, "unknown"))
+        place = split_cleanly(wrong, least, doubtful)
+        if place is not None and _shows_object_elsewhere(fit, labelled, rig, obj, rows[~wrong], rows[wrong], camera):
+            moves.append(MovedCamera(name, labelled.snapshots[rows[place]].name, "unknown"))
     return moves
+
+
+def split_cleanly(wrong: Bools, least: int, cameras: int) -> int | None:
+    """Find the moment that separates a camera's agreeing snapshots from the others more cleanly than chance would.
+
+    Args:
+        wrong: (T,) the snapshots that disagree, in chronological order.
+        least: smallest number of snapshots on either side.
+        cameras: number of cameras that are tested like this.
+
+    Returns:
+        The first snapshot after it; None = there is no such moment.
+    """
+    total, count = len(wrong), int(wrong.sum())
+    if total < 2 * least or not 0 < count < total:
+        return None
+    place = np.arange(least, total - least + 1)
+    before = np.cumsum(wrong)[place - 1]
+    from scipy.stats import hypergeom  # slow to import, and rarely needed
+
+    chance = np.minimum(
+        hypergeom.sf(before - 1, total, count, place), hypergeom.sf(count - before - 1, total, count, total - place)
+    )
+    best = int(chance.argmin())
+    shares = before[best] / place[best], (count - before[best]) / (total - place[best])
+    parted = min(shares) <= MOST_MIXED and max(shares) >= 1 - MOST_MIXED
+    return int(place[best]) if parted and 2 * len(place) * cameras * chance[best] < LEAST_CHANCE else None
 
 
 def _shows_object_elsewhere(

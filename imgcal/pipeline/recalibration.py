@@ -21,7 +21,7 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.pipeline.board_turns import settle_turns
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.conventions import lines_of_sight_miss, require_conventions, require_meeting_rays
-from imgcal.pipeline.fitting import fit_steady
+from imgcal.pipeline.fitting import fit_lights, fit_since_last_move, fit_steady
 from imgcal.pipeline.initialization import Initializer
 from imgcal.pipeline.late_cameras import find_late_cameras, require_same_moments
 from imgcal.pipeline.learned_measurer import LearnedMeasurer
@@ -207,12 +207,17 @@ def _calibrate_lights(
     detecting: float,
 ) -> Calibration:
     """Calibrate from unknown markers; `detecting`: seconds that detection took."""
-    started = time.perf_counter()
-    try:
+    started, identified = time.perf_counter(), 0.0
+
+    def fit_some(some: Detections) -> Calibration:
+        nonlocal identified
         with require_solvable():
-            lights = find_lights(detections, rig, obj)
+            lights = find_lights(some, rig, obj)
             identified = time.perf_counter()
-            fit = fit_steady(lights.labelled, lights.labelled.detections, rig, obj, options)
+            return fit_lights(lights, rig, obj, options)
+
+    try:
+        fit = fit_since_last_move(fit_some, detections, options)
     except RefusedError as error:
         require_units(error, detections, rig, obj)
         with contextlib.suppress(*UNSOLVABLE):
@@ -223,7 +228,7 @@ def _calibrate_lights(
         "identity": identified - started,
         "estimation": time.perf_counter() - identified,
     }
-    return replace(fit, lights=lights, seconds=seconds, repeats=repeats)
+    return replace(fit, seconds=seconds, repeats=repeats)
 
 
 def label_again(

@@ -67,7 +67,7 @@ class MovedError(RefusedError):
                 disagreement may have another cause.
             labelled: all blobs, with their labels.
         """
-        self.moved, self.since, self.labelled = tuple(moved), since, labelled
+        self.moved, self.since, self.explained, self.labelled = tuple(moved), since, explained, labelled
         shown = "; ".join(map(str, moved[:MOST_TOLD])) + ("; ..." if len(moved) > MOST_TOLD else "")
         if not explained:
             super().__init__(

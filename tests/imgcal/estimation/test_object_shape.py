@@ -111,7 +111,9 @@ def test_one_camera_does_not_know_the_scale(simulate) -> None:
 
 @pytest.mark.parametrize(("snapshots", "cameras", "radius"), [(1, 5, None), (7, 3, None), (4, 4, 6.0)])
 @pytest.mark.parametrize("fixed", [False, True])
-def test_the_scale_by_itself_is_that_of_the_whole_shape(monkeypatch, simulate, snapshots, cameras, radius, fixed) -> None:
+def test_the_scale_by_itself_is_that_of_the_whole_shape(
+    monkeypatch, simulate, snapshots, cameras, radius, fixed
+) -> None:
     monkeypatch.setattr(shape_modes, "POINTS_AT_ONCE", 60)
     case = simulate(2, snapshots=snapshots, cameras=cameras, missing=0.1, radius=radius)
     uv, prior_std = case.observations.uv.clone(), case.prior_std.clone()

@@ -7,10 +7,11 @@ import pytest
 import torch
 
 import imgcal
-from imgcal import InputError, RefusedError
+from imgcal import Detections, InputError, PipelineOptions, RefusedError
 from imgcal.association import associate
 from imgcal.geometry import rotation_from_vector
 from imgcal.pipeline.motion_check import _prepend_earlier
+from imgcal.types import MovedError
 from scripts.benchmarks import camera_faults
 from scripts.benchmarks.lights import LIGHTS, Scene, simulate, triangulation_error
 from tests.imgcal.association.stick_scenes import BODY, capture, several
@@ -189,6 +190,51 @@ def shifted(scene: Scene, camera: int, moments: range) -> imgcal.Detections:
     """Shift the blobs of one camera by half a pixel in some moments."""
     rows = (scene.detections.camera == camera) & np.isin(scene.detections.snapshot, moments)
     return replace(scene.detections, uv=scene.detections.uv + np.where(rows[:, None], (0.4, -0.3), 0.0))
+
+
+def turned_from(scene: Scene, camera: int, first: int, degrees: float) -> Detections:
+    """Turn one camera from a moment on."""
+    blobs, after = scene.detections, camera_faults.turned(scene.rig, camera, degrees)
+    rows = np.flatnonzero((blobs.camera == camera) & (blobs.snapshot >= first) & (scene.fiducial >= 0))
+    points = scene.points[blobs.snapshot[rows], scene.fiducial[rows]]
+    uv = blobs.uv.copy()
+    uv[rows] += (after.project(points).uv[camera] - scene.rig.project(points).uv[camera]).numpy()
+    inside = ((uv >= 0) & (uv <= scene.rig.image_size[0].numpy() - 1)).all(1)
+    return replace(blobs, uv=uv).select(inside)
+
+
+@pytest.mark.parametrize("markers", [1, 5])
+def test_a_camera_that_shows_the_markers_elsewhere_has_moved(markers: int) -> None:
+    scene = simulate(markers=markers, moments=80, drift=0.3, seed=4)
+    blobs = turned_from(scene, 4, 40, 1.0)
+    with pytest.raises(
+        MovedError, match=r"camera cam05 moved before snapshot 000(39|4\d).* from the (3\d|4[01]) since"
+    ):
+        imgcal.calibrate(blobs, scene.factory, LIGHTS)
+    found = imgcal.calibrate(blobs, scene.factory, LIGHTS, PipelineOptions(after_last_move=True))
+    assert [move.camera for move in found.moved] == ["cam05"]
+    used = found.labelled.moments[found.labelled.used]
+    assert used.min() >= 39 and found.labelled.moment_counts[1] == 80
+
+
+def test_reflections_beside_hidden_markers_are_no_motion() -> None:
+    scene = simulate(markers=1, moments=80, drift=0.3, seed=4)
+    blobs, late = scene.detections, np.arange(40, 80)
+    count = len(late)
+    reflection = Detections(
+        uv=np.column_stack((300 + 2.0 * late, 500 + 0.5 * late)),
+        sigma=np.full(count, 0.1),
+        camera=np.full(count, 4),
+        snapshot=late,
+        fiducial=np.full(count, -1),
+        radius=np.full(count, np.nan),
+        flags=np.zeros(count, dtype=np.uint8),
+        camera_names=blobs.camera_names,
+        snapshot_names=blobs.snapshot_names,
+    )
+    seen = blobs.select(~((blobs.camera == 4) & (blobs.snapshot >= 40)))
+    found = imgcal.calibrate(camera_faults.joined(seen, reflection), scene.factory, LIGHTS)
+    assert found.moved == () and triangulation_error(found.rig, scene) < 1
 
 
 def test_an_error_that_ends_is_no_motion() -> None:
