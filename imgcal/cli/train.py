@@ -37,7 +37,9 @@ class Train(arguments.Train):
         if there and not self.resume:
             raise InputError(f"{self.out}: found a training there already, expected a new folder, or --resume")
         if self.resume and not there:
-            raise InputError(f"{self.out}: found no {STATE} there, expected one to --resume from")
+            raise InputError(
+                f"{self.out}: found no {STATE} there, expected one to --resume from; without --resume it begins"
+            )
         if experiment.training.threads is not None:
             torch.set_num_threads(experiment.training.threads)
         if experiment.training.tf32:

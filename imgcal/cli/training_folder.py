@@ -15,6 +15,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from imgcal.errors import InputError, RefusedError
 from imgcal.io import MODEL, holding, read_metrics, write_tensors, write_text
+from imgcal.messages import plural
 from imgcal.training import (
     Callbacks,
     DivergedError,
@@ -135,6 +136,8 @@ class TrainingFolder(Callbacks):
         count = sum(parameter.numel() for parameter in run.plain.parameters())
         where = f"{run.accelerator.num_processes} x {run.accelerator.device.type}"
         again = f", from step {run.step} on" if run.step else ""
+        if run.step and is_finished(run, run.seconds):
+            again = f", complete already after {plural(run.step, 'step')}"
         self._say(f"{run.experiment.name}: {count:,} parameters, {where}{again}")
         if run.task.untrained:
             parts = ", ".join(sorted({name.partition(".")[0] for name in run.task.untrained}))

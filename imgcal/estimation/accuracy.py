@@ -11,7 +11,7 @@ from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.estimation import Estimate, camera_covariance
-from imgcal.estimation.rig_uncertainty import RigUncertainty, detach_double, uncertainty_over
+from imgcal.estimation.rig_uncertainty import RigUncertainty, uncertainty_over
 from imgcal.geometry import rotate, undistort
 from imgcal.types import CameraRig
 
@@ -217,7 +217,7 @@ def predicted_error(
             f"predicted error: found a batch of {tuple(found.rig.batch_shape)} rigs, expected one rig without "
             "batch axes"
         )
-    rig = detach_double(found.rig)
+    rig = found.rig.as_constant()
     volume = working_volume(found) if volume is None else volume
     volume = replace(volume, low=volume.low.to(rig.focal_length), high=volume.high.to(rig.focal_length))
     covariance = joint_covariance(found) if covariance is None else covariance
@@ -257,7 +257,7 @@ def working_volume(calibration: Estimate) -> WorkingVolume:
         distance, the place at that distance counts, too, unless the rig's frame is another than the convention says; a
         single snapshot then gives a useful box.
     """
-    problem, rig = calibration.problem, detach_double(calibration.rig)
+    problem, rig = calibration.problem, calibration.rig.as_constant()
     pose = calibration.rig_from_object.to(torch.float64)
     centres = rotate(pose.rotation.detach(), problem.centroid.detach().to(pose.rotation)) + pose.translation.detach()
     if (usual := _usual_place(rig)) is not None:

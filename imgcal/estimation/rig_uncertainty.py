@@ -8,7 +8,7 @@ covariance, P S P^T with P = I - G (G^T H G)^-1 G^T H; docs/method.md has the eq
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -291,8 +291,3 @@ def inverse_or_zero(information: Tensor) -> Tensor:
     adjugate = torch.stack((df, bf, be, bf, af, ae, be, ae, ad), -1).unflatten(-1, (3, 3))
     good = (a > 0) & (ad > 0) & (determinant > 0)
     return torch.where(good, 1 / determinant, 0.0)[..., None, None] * adjugate
-
-
-def detach_double(rig: CameraRig) -> CameraRig:
-    """Copy a rig in double precision, detached from the graph."""
-    return replace(rig.map_tensors(lambda tensor, _: tensor.detach()), image_size=rig.image_size).to(torch.float64)

@@ -50,7 +50,9 @@ class Parameterization(nn.Module):
     def __init__(self, factory: CameraRig, obj: CalibrationObject, prior_std: Tensor) -> None:
         super().__init__()
         if factory.working_distance is None:
-            raise InputError(f"rig {factory.name}: found no working_distance, expected one (mm) to start from")
+            raise InputError(
+                f"rig {factory.name}: found no working_distance, expected the distance (mm) along the rig's z axis at which networks see the object"
+            )
         self._factory, self._obj = factory, obj  # for their attributes that are not tensors
         self.working_distance = factory.working_distance
         points = obj.points.to(factory.focal_length)

@@ -100,7 +100,7 @@ class KeeperMemory:
         if not obj.unknown_markers:
             obj.require_rigid("for a running rig")
         check_object(obj)
-        rig = rig.to(torch.float64)
+        rig = rig.as_constant()
         calibration, rig = None if horizon is not None else calibration_posterior(rig), replace(rig, posterior=None)
         start = None if calibration is None else (belief_from_posterior(calibration, obj), calibration.snapshots)
         monitor = RigMonitor(RigFilter(rig, obj, drift, options.estimation, start=start, horizon=horizon))

@@ -154,7 +154,7 @@ def fit_labelled(
     Raises:
         RefusedError: a camera saw nothing, the estimate has no minimum, or the residuals do not fit.
     """
-    rig = rig.to(torch.float64)
+    rig = rig.as_constant()
     return _fit(arrange_labels(labelled, rig, obj), rig, obj, options, _Known(initializer, latest, prior_std))
 
 

@@ -273,7 +273,7 @@ def _first_rig(labelled: Detections, cameras: CameraRig, obj: CalibrationObject)
 
 
 def _set_prior(cameras: CameraRig) -> CameraRig:
-    cameras = cameras.to(torch.float64)
+    cameras = cameras.as_constant()
     return cameras if cameras.prior is not None else replace(cameras, prior=RigPrior(0.15, 25.0, 0.1))
 
 

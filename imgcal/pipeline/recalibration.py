@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import NoReturn
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from imgcal.association import Associations, PipelineOptions, Progress, Sight, associate
@@ -87,7 +86,7 @@ def calibrate(
     """
     check_rig(rig)
     obj = as_one(obj)
-    started, rig, options = time.perf_counter(), rig.to(torch.float64), options.of_object(obj)
+    started, rig, options = time.perf_counter(), rig.as_constant(), options.of_object(obj)
     source = source if isinstance(source, Detections) else check_frames(source, rig)
     blobs = find_blobs(source, rig, obj, detection, measurer)
     detections, repeats = drop_repeats(settle_turns(blobs, rig, obj))

@@ -116,7 +116,7 @@ def score(
     """
     check_rig(rig)
     obj = as_one(obj)
-    rig, options = rig.to(torch.float64), options.of_object(obj)
+    rig, options = rig.as_constant(), options.of_object(obj)
     detections = settle_labels(find_blobs(source, rig, obj, detection), rig, obj)
     obj = as_unknown_marker(obj, detections)
     try:

@@ -90,7 +90,7 @@ def cut_labelled(
     Raises:
         RefusedError: no snapshot can be decided, or no pose fits most of them.
     """
-    rig, options = rig.to(torch.float64), options.of_object(obj)
+    rig, options = rig.as_constant(), options.of_object(obj)
     labelled = associate(detections, rig, obj, options, progress, sight)
     used, observations, poses = fit_poses(labelled, rig, obj, options)
     observations, poses = fit_to_light(frames, used, rig, obj, (observations, poses), detection, options.estimation)

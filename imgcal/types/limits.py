@@ -178,8 +178,10 @@ def find_repeated(names: Sequence[str]) -> str | None:
 
 
 def check_object(obj: CalibrationObject) -> None:
-    """Raise `InputError` if an object, or one of several, has implausible values."""
+    """Raise `InputError` if an object, or one of several, has implausible values, or values that require gradients."""
     for part in obj.each:
+        if part.points.requires_grad:
+            raise InputError(f"object {part.name}: found points that require gradients, expected constants: detach()")
         columns = {"coordinate": (part.points, COORDINATE)}
         if part.radius is not None:
             columns["radius"] = part.radius, FIDUCIAL_RADIUS

@@ -410,6 +410,10 @@ class CameraRig:
             ),
         )
 
+    def as_constant(self) -> CameraRig:
+        """Copy in double precision, detached from the graph: for code that computes no gradients."""
+        return self.map_tensors(lambda tensor, _: tensor.detach().to(torch.float64))
+
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> CameraRig:
         """Change the floating-point type, move to a device, or both."""
         moved = self.map_tensors(lambda tensor, _: tensor.to(dtype=dtype, device=device))

@@ -122,6 +122,9 @@ def test_a_second_training_in_a_folder_is_refused_and_harms_nothing(experiment, 
     assert f"{out}: another imgcal is using this folder" in error and error.count("\n") == 1
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
     assert train(experiment, out, "--resume", "--set", "training.steps=40") == 0
+    capsys.readouterr()
+    assert train(experiment, out, "--resume", "--set", "training.steps=40") == 0
+    assert "complete already after 60 steps" in "".join(capsys.readouterr())
 
 
 @pytest.mark.parametrize(

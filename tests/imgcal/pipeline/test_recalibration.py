@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from imgcal.association import Proposal, Sight, proposal_rows
-from imgcal.errors import RefusedError
+from imgcal.errors import InputError, RefusedError
 from imgcal.estimation import relative_covariance
 from imgcal.networks import InfraredNetwork
-from imgcal.pipeline import LearnedProposer, calibrate
+from imgcal.pipeline import LearnedProposer, calibrate, score
 from imgcal.synthesis import PhysicalDrift, Truth, simulate_truth, true_detections
 
 
@@ -33,6 +33,18 @@ def test_an_honest_calibration(o10, asymmetric8):
     assert torch.equal(covariance, relative_covariance(result.estimate, 2))
     focal = covariance.diagonal().unflatten(0, (-1, 15))[:, 6:8].sqrt()
     assert ((result.rig.focal_length - truth.focal_length).abs() < 5 * focal).all()
+
+
+def test_a_rig_with_gradients_is_taken_as_it_is(o10, asymmetric8):
+    truth = simulate_truth(o10, asymmetric8, 3, torch.Generator().manual_seed(1), PhysicalDrift())
+    blobs = true_detections(truth)
+    traced = replace(o10, focal_length=o10.focal_length.clone().requires_grad_())
+    found = calibrate(blobs, traced, asymmetric8)
+    assert not found.rig.focal_length.requires_grad
+    assert torch.equal(found.rig.focal_length, calibrate(blobs, o10, asymmetric8).rig.focal_length)
+    assert float(score(blobs, traced, asymmetric8).distances.mean()) > 5
+    with pytest.raises(InputError, match="points that require gradients"):
+        calibrate(blobs, o10, replace(asymmetric8, points=asymmetric8.points.clone().requires_grad_()))
 
 
 @pytest.mark.parametrize("hidden", [0.15, 0.4])
