@@ -51,7 +51,8 @@ class Parameterization(nn.Module):
         super().__init__()
         if factory.working_distance is None:
             raise InputError(
-                f"rig {factory.name}: found no working_distance, expected the distance (mm) along the rig's z axis at which networks see the object"
+                f"rig {factory.name}: found no working_distance, expected the distance (mm) along the rig's z axis at "
+                "which networks see the object"
             )
         self._factory, self._obj = factory, obj  # for their attributes that are not tensors
         self.working_distance = factory.working_distance
