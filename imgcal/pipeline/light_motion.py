@@ -16,6 +16,10 @@ from imgcal.pipeline.label_counts import MARGIN
 from imgcal.pipeline.motion_check import split_cleanly
 from imgcal.types import CameraRig, Detections, MovedCamera, MovedError
 
+MOST_MIXED = 0.4
+"""Maximum share of moments of the other kind before and after a move: markers are hidden, and beside false blobs they
+look like markers elsewhere."""
+
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
@@ -61,7 +65,7 @@ def _find_lost_cameras(
     for camera in suspects:
         rows = np.flatnonzero(agrees[:, camera] | differs[:, camera])
         wrong = differs[rows, camera]
-        place = split_cleanly(wrong, LEAST_SNAPSHOTS, len(suspects))
+        place = split_cleanly(wrong, LEAST_SNAPSHOTS, len(suspects), MOST_MIXED)
         if place is not None:
             view = CameraView(blobs.select(blobs.camera == camera), *_by_moment(moment, points, shape[0]), rig, camera)
             if view.some_turn_explains(rows[wrong]) and not view.one_place_explains(rows[~wrong], rows[wrong]):

@@ -285,13 +285,14 @@ def _find_gone(
     return moves
 
 
-def split_cleanly(wrong: Bools, least: int, cameras: int) -> int | None:
+def split_cleanly(wrong: Bools, least: int, cameras: int, mixed: float = MOST_MIXED) -> int | None:
     """Find the moment that separates a camera's agreeing snapshots from the others more cleanly than chance would.
 
     Args:
         wrong: (T,) the snapshots that disagree, in chronological order.
         least: smallest number of snapshots on either side.
         cameras: number of cameras that are tested like this.
+        mixed: maximum share of snapshots of the other kind on either side.
 
     Returns:
         The first snapshot after it; None = there is no such moment.
@@ -308,7 +309,7 @@ def split_cleanly(wrong: Bools, least: int, cameras: int) -> int | None:
     )
     best = int(chance.argmin())
     shares = before[best] / place[best], (count - before[best]) / (total - place[best])
-    parted = min(shares) <= MOST_MIXED and max(shares) >= 1 - MOST_MIXED
+    parted = min(shares) <= mixed and max(shares) >= 1 - mixed
     return int(place[best]) if parted and 2 * len(place) * cameras * chance[best] < LEAST_CHANCE else None
 
 

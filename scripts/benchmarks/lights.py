@@ -1,10 +1,11 @@
 """Markers without labels: how many captures are calibrated, refused and wrong, and how good the rigs are.
 
-Run as `python -m scripts.benchmarks.lights campaign|accuracy|bound|stream`; each writes its part of
+Run as `python -m scripts.benchmarks.lights campaign|moves|accuracy|bound|stream`; each writes its part of
 docs/benchmarks/lights.json and resumes where it was stopped (out/work/lights.jsonl). Rig room10; errors of the factory
 values: half a degree, 2 mm, 1 % and 5 px times the drift; blobs with a noise of 0.1 px, a quarter of them hidden, three
 false ones in each image, no labels. `accuracy` compares with an estimate that is given all labels and reaches the
-Cramér-Rao bound, and times 2,000 lights. `bound` says what errors that bound allows. `stream` needs IMGCAL_CAPTURES.
+Cramér-Rao bound, and times 2,000 lights. `moves` turns one camera in the middle of the capture. `bound` says what
+errors that bound allows. `stream` needs IMGCAL_CAPTURES.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from imgcal.estimation import camera_covariance, relative_covariance, relative_d
 from imgcal.geometry import RigidTransform
 from imgcal.messages import list_names
 from imgcal.synthesis import PhysicalDrift, simulate_volume
+from imgcal.types import MovedError
+from scripts.benchmarks.camera_faults import turned
 from scripts.benchmarks.wand_recording import CALIBRATED, calibrated, recording
 from scripts.output import ROOT, WORK, command, commit, make_folder, read_json, surroundings, write_json
 
@@ -44,6 +47,8 @@ DRAWN = 40
 """Rigs drawn from the bound for each capture."""
 STICKS = {"stick of two": (-250.0, 250.0), "stick of three": (-250.0, -80.0, 250.0)}
 """mm, positions of the markers along the stick."""
+MOVING, TURNS = {1: 120, 15: 40}, (0.0, 0.1, 0.3, 1.0, 3.0, 10.0)
+"""Number of snapshots by number of markers, and turns of one camera in the middle, degrees."""
 TARGETS = {"1 marker": (450, 2000), "40 markers": (50,), "stick of two": (150,), "stick of three": (150,)}
 """Numbers of snapshots of the cases whose accuracy is measured."""
 PAIRS, LINES = ((0, 2), (0, 4)), ((0, 1, 2), (1, 3, 4))
@@ -231,6 +236,40 @@ def campaign(seeds: int) -> Iterable[dict[str, Any]]:
                 }
 
 
+def moves(seeds: int) -> Iterable[dict[str, Any]]:
+    """Yield captures in which one camera turns by some angle in the middle; zero = none does."""
+    for seed in range(seeds):
+        for markers, moments in MOVING.items():
+            for degrees in TURNS:
+                case = {"part": "moves", "target": f"{markers} marker", "moments": moments, "drift": 1.0}
+                yield case | {"degrees": degrees, "seed": 200 + seed}
+
+
+def examine_move(scene: Scene, degrees: float, seed: int) -> dict[str, Any]:
+    """Turn one camera in the middle of a capture, calibrate, and see what is reported."""
+    camera, first = seed % scene.rig.num_cameras, scene.uv.shape[0] // 2
+    blobs = turned_from(scene, camera, first, degrees) if degrees else scene.detections
+    try:
+        found = imgcal.calibrate(blobs, scene.factory, scene.obj)
+    except MovedError as error:
+        right = degrees > 0 and [move.camera for move in error.moved] == [scene.rig.camera_names[camera]]
+        return {"status": "named" if right else "false", "moved": [str(move) for move in error.moved]}
+    except RefusedError as error:
+        return {"status": "refused", "reason": str(error)[:160]}
+    return {"status": "calibrated", "error_mm": triangulation_error(found.rig, scene)}
+
+
+def turned_from(scene: Scene, camera: int, first: int, degrees: float) -> Detections:
+    """Turn one camera from a moment on: its blobs are elsewhere, or out of view."""
+    blobs, after = scene.detections, turned(scene.rig, camera, degrees)
+    rows = np.flatnonzero((blobs.camera == camera) & (blobs.snapshot >= first) & (scene.fiducial >= 0))
+    points = scene.points[blobs.snapshot[rows], scene.fiducial[rows]]
+    uv = blobs.uv.copy()
+    uv[rows] += (after.project(points).uv[camera] - scene.rig.project(points).uv[camera]).numpy()
+    inside = ((uv >= 0) & (uv <= scene.rig.image_size[0].numpy() - 1)).all(1)
+    return replace(blobs, uv=uv).select(inside)
+
+
 def accuracy(seeds: int) -> Iterable[dict[str, Any]]:
     """Yield results for the cases that are compared with the estimate from labels."""
     for seed in range(seeds):
@@ -243,6 +282,9 @@ def run(case: dict[str, Any]) -> dict[str, Any]:
     """Simulate and examine one case."""
     stick = STICKS.get(case["target"], ())
     markers = len(stick) or int(case["target"].split()[0])
+    if case["part"] == "moves":
+        scene = simulate(markers, case["moments"], case["drift"], case["seed"])
+        return case | {"commit": commit()} | examine_move(scene, case["degrees"], case["seed"])
     return case | {"commit": commit()} | examine(simulate(markers, case["moments"], case["drift"], case["seed"], stick))
 
 
@@ -328,9 +370,13 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for row in rows:
         key = f"{row['target']} x {row['moments']}, drift {row['drift']:g}"
-        entry = result.setdefault(row["part"], {}).setdefault(
-            key, {"calibrated": 0, "refused": 0, "wrong": 0, "rows": []}
-        )
+        outcomes = ["calibrated", "refused", "wrong"]
+        if row["part"] == "moves":
+            key, outcomes = (
+                f"{row['target']} x {row['moments']}, {row['degrees']:g} deg",
+                ["named", "false", *outcomes[:2]],
+            )
+        entry = result.setdefault(row["part"], {}).setdefault(key, dict.fromkeys(outcomes, 0) | {"rows": []})
         entry[row["status"]] += 1
         entry["rows"].append(row)
     for part in result.values():
@@ -359,7 +405,7 @@ def rms(values: Sequence[float]) -> float:
 class Options:
     """Count captures of unknown markers that are calibrated, refused and wrong."""
 
-    part: tyro.conf.Positional[Literal["campaign", "accuracy", "bound", "stream"]]
+    part: tyro.conf.Positional[Literal["campaign", "moves", "accuracy", "bound", "stream"]]
     seeds: int = SEEDS  #: captures per kind
 
 
@@ -376,7 +422,8 @@ def main() -> None:
         return
     make_folder(DONE.parent)
     done = [json.loads(line) for line in DONE.read_text().splitlines()] if DONE.is_file() else []
-    for case in campaign(options.seeds) if options.part == "campaign" else accuracy(options.seeds):
+    cases = {"campaign": campaign, "moves": moves, "accuracy": accuracy}[options.part]
+    for case in cases(options.seeds):
         if any(case.items() <= row.items() for row in done):
             continue
         row = run(case)

@@ -13,7 +13,7 @@ from imgcal.geometry import rotation_from_vector
 from imgcal.pipeline.motion_check import _prepend_earlier
 from imgcal.types import MovedError
 from scripts.benchmarks import camera_faults
-from scripts.benchmarks.lights import LIGHTS, Scene, simulate, triangulation_error
+from scripts.benchmarks.lights import LIGHTS, Scene, simulate, triangulation_error, turned_from
 from tests.imgcal.association.stick_scenes import BODY, capture, several
 
 
@@ -190,17 +190,6 @@ def shifted(scene: Scene, camera: int, moments: range) -> imgcal.Detections:
     """Shift the blobs of one camera by half a pixel in some moments."""
     rows = (scene.detections.camera == camera) & np.isin(scene.detections.snapshot, moments)
     return replace(scene.detections, uv=scene.detections.uv + np.where(rows[:, None], (0.4, -0.3), 0.0))
-
-
-def turned_from(scene: Scene, camera: int, first: int, degrees: float) -> Detections:
-    """Turn one camera from a moment on."""
-    blobs, after = scene.detections, camera_faults.turned(scene.rig, camera, degrees)
-    rows = np.flatnonzero((blobs.camera == camera) & (blobs.snapshot >= first) & (scene.fiducial >= 0))
-    points = scene.points[blobs.snapshot[rows], scene.fiducial[rows]]
-    uv = blobs.uv.copy()
-    uv[rows] += (after.project(points).uv[camera] - scene.rig.project(points).uv[camera]).numpy()
-    inside = ((uv >= 0) & (uv <= scene.rig.image_size[0].numpy() - 1)).all(1)
-    return replace(blobs, uv=uv).select(inside)
 
 
 @pytest.mark.parametrize("markers", [1, 5])
