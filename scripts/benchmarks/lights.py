@@ -266,8 +266,8 @@ def turned_from(scene: Scene, camera: int, first: int, degrees: float) -> Detect
     points = scene.points[blobs.snapshot[rows], scene.fiducial[rows]]
     uv = blobs.uv.copy()
     uv[rows] += (after.project(points).uv[camera] - scene.rig.project(points).uv[camera]).numpy()
-    inside = ((uv >= 0) & (uv <= scene.rig.image_size[0].numpy() - 1)).all(1)
-    return replace(blobs, uv=uv).select(inside)
+    outside = ((uv < 0) | (uv > scene.rig.image_size[0].numpy() - 1)).any(1)
+    return replace(blobs, uv=uv).select(np.flatnonzero(~outside))
 
 
 def accuracy(seeds: int) -> Iterable[dict[str, Any]]:
