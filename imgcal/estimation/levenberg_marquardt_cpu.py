@@ -7,9 +7,11 @@ whatever the type of the tensors: one type is compiled.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numba
@@ -44,6 +46,10 @@ from renderers.compiling import njit
 from renderers.interpreting import without_machine_code
 
 Part = TypeVar("Part", bound=Problem | State | Solution | NormalEquations | ObjectEquations)
+
+# OpenMP's threads do not survive a fork: with several, PyTorch would wait for them forever in the new process.
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))
 
 LOSS_CODES = {"squared": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
 

@@ -1,3 +1,5 @@
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -45,6 +47,30 @@ def test_a_rig_with_gradients_is_taken_as_it_is(o10, asymmetric8):
     assert float(score(blobs, traced, asymmetric8).distances.mean()) > 5
     with pytest.raises(InputError, match="points that require gradients"):
         calibrate(blobs, o10, replace(asymmetric8, points=asymmetric8.points.clone().requires_grad_()))
+
+
+FORKED = """
+import multiprocessing, sys, torch, imgcal
+from imgcal.synthesis import PhysicalDrift, simulate_truth, true_detections
+torch.set_num_threads(2)
+rig, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+truth = simulate_truth(rig, obj, 200, torch.Generator().manual_seed(1), PhysicalDrift())
+blobs = true_detections(truth)
+def calibrate():
+    return imgcal.calibrate(blobs, rig, obj).rig.focal_length
+def check(expected):
+    sys.exit(0 if torch.allclose(calibrate(), expected, rtol=1e-9, atol=0) else 1)
+process = multiprocessing.get_context("fork").Process(target=check, args=(calibrate(),))
+process.start()
+process.join(60)
+print(process.exitcode)
+process.kill()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows does not fork")
+def test_a_forked_process_calibrates_like_its_parent():
+    assert subprocess.run([sys.executable, "-c", FORKED], capture_output=True, check=True).stdout == b"0\n"
 
 
 @pytest.mark.parametrize("hidden", [0.15, 0.4])
