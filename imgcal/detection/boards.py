@@ -7,8 +7,8 @@ short distance.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any
 
@@ -17,10 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from imgcal.detection.blob_search import find_blobs
 from imgcal.detection.centroids import Blobs
 from imgcal.detection.checks import Frame
+from imgcal.detection.circle_grids import find_lattices, name_grid, number_circles
+from imgcal.detection.options import DetectionOptions
 from imgcal.errors import InputError
-from imgcal.messages import list_names
+from imgcal.messages import list_names, with_article
 from imgcal.types import BlobFlag, Board
 
 Floats = NDArray[np.float64]
@@ -55,6 +58,7 @@ REACH = 0.5
 """The same, in units of the black border's or the white gap's width."""
 ROUNDS = 4
 """Rounds in which the corners of tags are refined."""
+LARGEST_CIRCLE = 150.0  # px, radius
 CONTRAST = 0.25
 """Contrast relative to that inside the board, from which the pattern continues beyond the grid's edge."""
 ALTERNATING = 0.8
@@ -196,8 +200,7 @@ def _parameters(board: Board) -> Any:
 @lru_cache(maxsize=8)
 def _make_charuco(board: Board) -> Any:
     """Describe a ChArUco board to OpenCV."""
-    count = board.columns * board.rows // 2 if not board.legacy else (board.columns * board.rows + 1) // 2
-    count = max(count, board.columns * board.rows // 2)
+    count = board.columns * board.rows // 2
     dictionary = _dictionary(board.dictionary)
     if board.first_id + count > len(dictionary.bytesList):
         raise InputError(
@@ -337,13 +340,54 @@ def _checkerboard(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
 
 
 def _circles(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
-    across, down = board.shape
-    flags = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
-    found, centres = cv2.findCirclesGrid(grey, (across, down), flags=flags, blobDetector=_blob_detector())
-    if not found:
+    for blobs in _find_circles(grey):
+        grids = _number_grids(blobs, board)
+        if grids:
+            break
+    # Which of several is meant, no image says.
+    if len(grids) != 1 or (blobs.flags[grids[0]] & BlobFlag.BORDER).any():
         return None
-    grid = np.asarray(centres, dtype=np.float64).reshape(down, across, 2)
-    return _Seen((grid if board.asymmetric else _flip_mirrored(grid)).reshape(-1, 2), np.arange(across * down))
+    return _Seen(blobs.uv[grids[0]], np.arange(len(grids[0])))
+
+
+def _number_grids(blobs: Blobs, board: Board) -> list[Ints]:
+    """Find grids that have the layout of a board: the blob (N,) of each circle."""
+    lattices = find_lattices(blobs.uv, blobs.radius)
+    return [rows for lattice in lattices if (rows := number_circles(lattice, board, blobs.uv)) is not None]
+
+
+def _find_circles(grey: NDArray[np.uint8]) -> Iterator[Blobs]:
+    """Find dark circles: those of usual sizes, then more of them, each time with those found before.
+
+    Our own blobs are the more accurate ones, but where circles are dense, their neighbours hide the background.
+    OpenCV's thresholds do not need it; they lose others.
+    """
+    blobs = find_blobs(grey, DetectionOptions(polarity="dark"), 255)
+    yield blobs
+    blobs = _join(blobs, _find_by_thresholds(grey))
+    yield blobs
+    yield _join(blobs, find_blobs(grey, DetectionOptions(polarity="dark", max_radius=LARGEST_CIRCLE), 255))
+
+
+def _find_by_thresholds(grey: NDArray[np.uint8]) -> Blobs:
+    """Find dark circles with OpenCV."""
+    found = _blob_detector().detect(grey)
+    uv = np.array([point.pt for point in found], dtype=np.float64).reshape(-1, 2)
+    radius = np.array([point.size / 2 for point in found])
+    room = np.minimum(uv, np.array(grey.shape[::-1]) - 1 - uv).min(1) - radius
+    flags = np.where(room < 1, int(BlobFlag.BORDER), int(BlobFlag.NONE)).astype(np.uint8)
+    count = len(uv)
+    return Blobs(
+        uv, np.full(count, UNKNOWN_SIGMA), radius, flags, np.zeros(count, np.int64), np.ones(count),
+        np.full(count, -1, np.int64),
+    )  # fmt: skip
+
+
+def _join(blobs: Blobs, others: Blobs) -> Blobs:
+    """Add those others that are not within a radius of blobs."""
+    apart = np.linalg.norm(others.uv[:, None] - blobs.uv[None], axis=-1)
+    new = others.select((apart > np.maximum(others.radius[:, None], blobs.radius)).all(1))
+    return Blobs(*(np.concatenate((getattr(blobs, f.name), getattr(new, f.name))) for f in fields(Blobs)))
 
 
 @lru_cache(maxsize=1)
@@ -462,17 +506,30 @@ def _explain_other_dictionary(looked: list[NDArray[np.uint8]], board: Board) -> 
 
 
 def _explain_other_grid(looked: list[NDArray[np.uint8]], board: Board) -> str:
-    part = "squares" if board.kind == "checkerboard" else "circles"
-    least = 3 if board.kind == "checkerboard" else 2
+    if board.kind == "circles":
+        return _explain_other_circles(looked, board)
     steps = range(-OTHER_SIZES, OTHER_SIZES + 1)
     sizes = [(board.columns + i, board.rows + j) for i in steps for j in steps] + [(board.rows, board.columns)]
-    sizes = [size for size in dict.fromkeys(sizes) if min(size) >= least and size != (board.columns, board.rows)]
+    sizes = [size for size in dict.fromkeys(sizes) if min(size) >= 3 and size != (board.columns, board.rows)]
     sizes.sort(key=lambda size: -size[0] * size[1])
     for grey in looked[: MOST_LOOKED // 2]:
         for columns, rows in sizes:
-            other = Board(board.kind, columns, rows, board.pitch, asymmetric=board.asymmetric)
-            if _FINDERS[board.kind](grey, other) is not None:
-                return f"a board of {columns}x{rows} {part} is visible, expected {board.columns}x{board.rows}"
+            if _checkerboard(grey, Board(board.kind, columns, rows, board.pitch)) is not None:
+                return f"a board of {columns}x{rows} squares is visible, expected {board.columns}x{board.rows}"
+    return ""
+
+
+def _explain_other_circles(looked: list[NDArray[np.uint8]], board: Board) -> str:
+    for grey in looked:
+        *_, blobs = _find_circles(grey)
+        lattices = find_lattices(blobs.uv, blobs.radius)
+        names = [name for lattice in lattices if (name := name_grid(lattice, board, blobs.uv))]
+        if str(board) in names:
+            if names.count(str(board)) > 1:
+                return f"{names.count(str(board))} of them are visible at once, expected one"
+            return "it is cut off by the edge of the image"
+        if names:
+            return f"{with_article(names[0])} is visible, expected {with_article(str(board))}"
     return ""
 
 
