@@ -6,7 +6,10 @@ import pytest
 from imgcal.detection.circle_grids import find_lattices, name_grid, number_circles
 from imgcal.types import Board
 
-LAYOUTS = [(4, 11, True), (4, 10, True), (4, 8, True), (3, 6, True), (3, 4, True), (7, 6, False), (5, 5, False), (2, 5, False), (2, 2, False)]  # fmt: skip
+LAYOUTS = [
+    *((4, 11, True), (4, 10, True), (4, 8, True), (3, 6, True), (3, 4, True)),
+    *((7, 6, False), (5, 5, False), (2, 5, False), (2, 2, False)),
+]
 
 
 def grid(columns, rows, asymmetric):
@@ -80,7 +83,7 @@ def test_a_hidden_circle_leaves_no_grid():
 def test_two_grids_are_both_found_beside_a_third_of_other_circles():
     board = grid(5, 4, False)
     uv = image_of(board.points[:, :2], 1, 0.3)
-    both = np.concatenate((uv, uv + [2.4 * np.ptp(uv[:, 0]), 7]))
+    both = np.concatenate((uv, uv + np.array([2.4 * np.ptp(uv[:, 0]), 7])))
     assert [sorted(rows) for rows in numbered(board, both)] == [list(range(20)), list(range(20, 40))]
     between = uv + (uv[6] - uv[0]) / 2
     all_of_them, radius = np.concatenate((both, between)), np.repeat([4.0, 1.0], [40, 20])
