@@ -7,7 +7,7 @@ short distance.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any
@@ -65,6 +65,10 @@ ALTERNATING = 0.8
 """Correlation of grey values with the colours of squares, from which the pattern continues beyond the grid's edge."""
 MOST_LOOKED = 8
 """Most frames that are examined to explain why a board was not found."""
+LOOKED_TWICE = 4
+"""Frames of a capture that are searched for a second checkerboard."""
+REPEATED = 2
+"""Markers seen twice in one frame, from which it shows two boards; a single one may be a false detection."""
 OTHER_SIZES = 2
 """Columns and rows more or fewer that are tried for this explanation."""
 
@@ -90,15 +94,43 @@ def find_board(frame: Frame, board: Board) -> Blobs:
     return Blobs(seen.uv, sigma, radius, flags, camera, np.ones(count), seen.fiducial)
 
 
-def require_board(blobs: Sequence[Blobs], frames: Iterable[Frame], board: Board) -> None:
-    """Explain why no frame shows the board, if none does.
+def require_board(blobs: Sequence[Blobs], snapshots: Iterable[Mapping[str, Frame | None]], board: Board) -> None:
+    """Explain why no frame shows the board, if none does, or that frames show two of them.
+
+    Args:
+        blobs: what was found in each snapshot.
+        snapshots: the same snapshots, camera -> frame (H, W); only as many are taken as the explanation needs.
+        board: the board.
 
     Raises:
-        InputError: no frame shows it.
+        InputError: no frame shows it, or two checkerboards are visible at once: which is which, no image says.
     """
     if not any(len(shot.uv) for shot in blobs):
-        why = explain_missing(frames, board)
+        why = explain_missing((frame for shot in snapshots for frame in shot.values() if frame is not None), board)
         raise InputError(f"frames: found no {board}" + (f": {why}" if why else ""))
+    if board.kind != "checkerboard":
+        return
+    looked = 0
+    for found, shot in zip(blobs, snapshots, strict=False):
+        for camera, (name, frame) in enumerate(shot.items()):
+            uv = found.uv[found.camera == camera]
+            if frame is None or len(uv) < len(board.points):
+                continue
+            if _shows_second(_eight_bits(frame, board), uv, board):
+                raise InputError(f"camera {name}: found two boards at once, each a {board}, expected one")
+            looked += 1
+        if looked >= LOOKED_TWICE:
+            return
+
+
+def _shows_second(grey: NDArray[np.uint8], uv: Floats, board: Board) -> bool:
+    """Look for another checkerboard beside that with the inner corners (N, 2)."""
+    low, high = board.points[:, :2].min(0) - board.pitch, board.points[:, :2].max(0) + board.pitch
+    sheet = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
+    matrix, _ = cv2.findHomography(board.points[:, :2], uv)
+    outline = cv2.perspectiveTransform(sheet[:, None], matrix)
+    covered = cv2.fillConvexPoly(grey.copy(), np.rint(outline).astype(np.int32), float(np.percentile(grey, 99)))
+    return bool(cv2.findChessboardCornersSB(covered, board.shape, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)[0])
 
 
 def corner_sigma(xy: Floats, uv: Floats) -> Floats:
@@ -217,7 +249,7 @@ def _charuco(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
     made = _make_charuco(board)
     detector = cv2.aruco.CharucoDetector(made, cv2.aruco.CharucoParameters(), _parameters(board))
     corners, ids, marker_corners, marker_ids = detector.detectBoard(grey)
-    if ids is None or marker_ids is None:
+    if ids is None or marker_ids is None or _count_repeated(np.ravel(marker_ids)) >= REPEATED:
         return None
     layout = {int(k): np.asarray(p)[:, :2] for k, p in zip(made.getIds().ravel(), made.getObjPoints(), strict=True)}
     if not _matches_layout(marker_corners, marker_ids, layout, board.marker):
@@ -259,8 +291,8 @@ def _matches_layout(corners: Any, ids: Any, layout: dict[int, Any], size: float)
 
 
 def _april_grid(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
-    corners, ids = _markers(grey, board)
-    if len(ids) == 0:
+    corners, ids, repeated = _markers(grey, board)
+    if len(ids) == 0 or repeated >= REPEATED:
         return None
     number = ids - board.first_id
     inside = (number >= 0) & (number < board.columns * board.rows)
@@ -306,14 +338,19 @@ def _intersect_sides(grey: NDArray[np.uint8], corners: Floats, board: Board) -> 
     return corners
 
 
-def _markers(grey: NDArray[np.uint8], board: Board) -> tuple[Floats, Ints]:
-    """Detect all markers of the board's dictionary: corners (K, 4, 2), ids (K,)."""
+def _markers(grey: NDArray[np.uint8], board: Board) -> tuple[Floats, Ints, int]:
+    """Detect all markers of the board's dictionary: corners (K, 4, 2), ids (K,), and how many are seen repeatedly."""
     corners, ids, _ = cv2.aruco.ArucoDetector(_dictionary(board.dictionary), _parameters(board)).detectMarkers(grey)
     if ids is None or not len(corners):
-        return np.zeros((0, 4, 2)), np.zeros(0, dtype=np.int64)
+        return np.zeros((0, 4, 2)), np.zeros(0, dtype=np.int64), 0
     number = np.asarray(ids, dtype=np.int64).ravel()
     _, first = np.unique(number, return_index=True)
-    return np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2)[first], number[first]
+    return np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2)[first], number[first], _count_repeated(number)
+
+
+def _count_repeated(ids: NDArray[Any]) -> int:
+    """Count the different ids of (K,) that occur more than once."""
+    return int((np.unique(ids, return_counts=True)[1] > 1).sum())
 
 
 # Grids
@@ -473,7 +510,9 @@ def explain_missing(frames: Iterable[Frame], board: Board) -> str:
     if not board.is_coded:
         return _explain_other_grid(looked, board) or _explain_inverted(negative, board)
     found = [_markers(grey, board) for grey in looked]
-    ids = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(number for _, number in found)]))
+    ids = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(number for _, number, _ in found)]))
+    if max((repeated for *_, repeated in found), default=0) >= REPEATED:
+        return "the same markers are visible twice: show one board at a time"
     if len(ids) >= 2:
         count = board.columns * board.rows // (2 if board.kind == "charuco" else 1)
         last = board.first_id + count - 1

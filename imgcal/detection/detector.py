@@ -68,7 +68,7 @@ def detect(
             for snapshot in snapshots
         ]
     if board is not None:
-        require_board(blobs, (frame for shot in snapshots for frame in shot.values() if frame is not None), board)
+        require_board(blobs, snapshots, board)
     digits = len(str(max(len(blobs) - 1, 0)))
     numbers = tuple(f"{index:0{digits}d}" for index in range(len(blobs)))
     return to_detections(drop_dim(blobs, options), names, numbers)

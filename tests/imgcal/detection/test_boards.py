@@ -12,6 +12,7 @@ from imgcal.detection import DetectionOptions, detect_snapshot
 from imgcal.detection.boards import UNKNOWN_SIGMA, corner_sigma, find_board
 from imgcal.errors import InputError
 from imgcal.synthesis import render_board, simulate_board
+from imgcal.synthesis.boards import is_white
 from imgcal.types import Board, CalibrationObject
 
 FINER = 4  # places of a pixel, across and down
@@ -167,6 +168,30 @@ def test_circles_have_the_numbers_of_the_layout_however_the_grid_is_turned(colum
         found = find_board(frame, board)
         assert any(np.abs(found.uv - uv[order]).max() < 0.1 for _, order in board.turns)
         assert found.sigma.max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("checkerboard", "camera camera: found two boards at once"),
+        ("charuco", "visible twice"),
+        ("aprilgrid", "visible twice"),
+    ],
+)
+def test_two_boards_of_one_kind_at_once_are_named(kind, words):
+    obj = imgcal.load_object(kind)
+    size = np.array([obj.board.columns, obj.board.rows]) + 1.4
+    place = np.stack(np.meshgrid(*(np.arange(0.5, 40 * length) / 40 - 0.7 for length in size)), -1)
+    white = is_white(obj.board, place.reshape(-1, 2) * obj.board.pitch).reshape(place.shape[:2])
+    board = cv2.GaussianBlur(np.where(white, 205.0, 35.0), (0, 0), 0.7)
+    frame = np.full((board.shape[0] + 80, 2 * board.shape[1] + 160), 70.0)
+    for left in (40, board.shape[1] + 120):
+        frame[40 : 40 + board.shape[0], left : left + board.shape[1]] = board
+        seen = frame.astype(np.uint8)
+        if left == 40:
+            assert len(imgcal.detect({"camera": seen}, board=obj.board).uv) == obj.num_fiducials
+    with pytest.raises(InputError, match=words):
+        imgcal.detect({"camera": seen}, board=obj.board)
 
 
 def test_circles_that_the_image_cuts_off_leave_no_grid():
