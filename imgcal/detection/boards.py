@@ -1,4 +1,4 @@
-"""Corners and circles of printed boards in one frame: OpenCV finds and identifies them.
+"""Corners and circles of printed boards in one frame: OpenCV finds corners, `circle_grids` numbers circles.
 
 Detections are kept only where they agree with the board's layout. Their accuracy is estimated from the image: corners
 are compared with homographies of their neighbourhoods, which lens distortion or a bent print hardly affects over such a

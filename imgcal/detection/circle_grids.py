@@ -6,6 +6,7 @@ cells of the layout; the lattice is what says which circle is which, and that th
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 
@@ -25,8 +26,8 @@ LEAST_SINE = 0.5
 """Of the angle between the sides of a cell: the shortest sides of a lattice are 60 to 90 degrees apart."""
 OFF_CELL = 0.2
 """Largest distance from the place where a circle is expected, in units of the distance to its nearest neighbour."""
-LIKE = 2.0
-"""Largest ratio of the measured radii of neighbours: where circles are dense, they are measured too small."""
+LIKE = 3.0
+"""Largest ratio of the radii of neighbours: some prints mark the origin by a larger circle."""
 LEAST_CELLS = 6
 """Cells of a lattice that is worth naming; four blobs often form a parallelogram by chance."""
 SIDES: tuple[Cell, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))
@@ -154,26 +155,29 @@ def _grow(first: int, near: Ints, uv: Floats, radius: Floats, tree: cKDTree) -> 
     second = across[0]
     sides = (0, second) if turned[second] > 0 else (second, 0)
     cells = {(0, 0): first, (1, 0): int(near[sides[0]]), (0, 1): int(near[sides[1]])}
-    used, waiting = set(cells.values()), list(cells)
+    used, waiting, tried = set(cells.values()), dict.fromkeys(cells), set()
     while waiting:
-        cell = waiting.pop()
+        cell, _ = waiting.popitem()
         for step in STEPS:
-            target = (cell[0] + step[0], cell[1] + step[1])
-            if target in cells or (expected := _expect(cell, step, cells, uv)) is None:
+            target, behind = (cell[0] + step[0], cell[1] + step[1]), (cell[0] - step[0], cell[1] - step[1])
+            attempt = cell, step, behind in cells  # what is expected depends on the latter
+            if target in cells or attempt in tried or (expected := _expect(cell, step, cells, uv)) is None:
                 continue
-            here = cells[cell]
-            gap = min(
-                float(np.linalg.norm(uv[cells[other]] - uv[here]))
-                for side in STEPS
-                if (other := (cell[0] + side[0], cell[1] + side[1])) in cells
-            )
-            distance, blob = tree.query(expected, distance_upper_bound=OFF_CELL * gap)
-            if np.isfinite(distance) and blob not in used and _alike(radius[here], radius[blob]):
+            tried.add(attempt)
+            around = [uv[cells[other]] for other in _around(cell) if other in cells and other != cell]
+            gap = np.linalg.norm(np.array(around) - uv[cells[cell]], axis=1).min() if around else np.inf
+            reach = OFF_CELL * min(gap, float(np.linalg.norm(expected - uv[cells[cell]])))
+            distance, blob = tree.query(expected, distance_upper_bound=reach)
+            if np.isfinite(distance) and blob not in used and _alike(radius[cells[cell]], radius[blob]):
                 cells[target] = int(blob)
                 used.add(int(blob))
-                around = product(range(target[0] - 1, target[0] + 2), range(target[1] - 1, target[1] + 2))
-                waiting += [other for other in around if other in cells]
+                waiting |= dict.fromkeys(other for other in _around(target) if other in cells)
     return cells
+
+
+def _around(cell: Cell) -> Iterator[Cell]:
+    """The cells around one, and itself."""
+    return product(range(cell[0] - 1, cell[0] + 2), range(cell[1] - 1, cell[1] + 2))
 
 
 def _expect(cell: Cell, step: Cell, cells: dict[Cell, int], uv: Floats) -> Floats | None:
