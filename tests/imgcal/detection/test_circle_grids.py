@@ -8,7 +8,7 @@ from imgcal.types import Board
 
 LAYOUTS = [
     *((4, 11, True), (4, 10, True), (4, 8, True), (3, 6, True), (3, 4, True)),
-    *((7, 6, False), (5, 5, False), (2, 5, False), (3, 3, False)),
+    *((7, 6, False), (5, 5, False), (2, 5, False), (6, 4, False)),
 ]
 
 
