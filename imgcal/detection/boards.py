@@ -1,4 +1,4 @@
-"""Corners and circles of printed boards in one frame: OpenCV finds and identifies them.
+"""Corners and circles of printed boards in one frame: OpenCV finds corners, `circle_grids` numbers circles.
 
 Detections are kept only where they agree with the board's layout. Their accuracy is estimated from the image: corners
 are compared with homographies of their neighbourhoods, which lens distortion or a bent print hardly affects over such a
@@ -7,8 +7,8 @@ short distance.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any
 
@@ -17,10 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from imgcal.detection.blob_search import find_blobs
 from imgcal.detection.centroids import Blobs
 from imgcal.detection.checks import Frame
+from imgcal.detection.circle_grids import find_lattices, name_grid, number_circles
+from imgcal.detection.options import DetectionOptions
 from imgcal.errors import InputError
-from imgcal.messages import list_names
+from imgcal.messages import list_names, with_article
 from imgcal.types import BlobFlag, Board
 
 Floats = NDArray[np.float64]
@@ -55,12 +58,17 @@ REACH = 0.5
 """The same, in units of the black border's or the white gap's width."""
 ROUNDS = 4
 """Rounds in which the corners of tags are refined."""
+LARGEST_CIRCLE = 150.0  # px, radius
 CONTRAST = 0.25
 """Contrast relative to that inside the board, from which the pattern continues beyond the grid's edge."""
 ALTERNATING = 0.8
 """Correlation of grey values with the colours of squares, from which the pattern continues beyond the grid's edge."""
 MOST_LOOKED = 8
 """Most frames that are examined to explain why a board was not found."""
+LOOKED_TWICE = 4
+"""Frames of a capture that are searched for a second checkerboard."""
+REPEATED = 2
+"""Markers seen twice in one frame, from which it shows two boards; a single one may be a false detection."""
 OTHER_SIZES = 2
 """Columns and rows more or fewer that are tried for this explanation."""
 
@@ -86,15 +94,43 @@ def find_board(frame: Frame, board: Board) -> Blobs:
     return Blobs(seen.uv, sigma, radius, flags, camera, np.ones(count), seen.fiducial)
 
 
-def require_board(blobs: Sequence[Blobs], frames: Iterable[Frame], board: Board) -> None:
-    """Explain why no frame shows the board, if none does.
+def require_board(blobs: Sequence[Blobs], snapshots: Iterable[Mapping[str, Frame | None]], board: Board) -> None:
+    """Explain why no frame shows the board, if none does, or that frames show two of them.
+
+    Args:
+        blobs: what was found in each snapshot.
+        snapshots: the same snapshots, camera -> frame (H, W); only as many are taken as the explanation needs.
+        board: the board.
 
     Raises:
-        InputError: no frame shows it.
+        InputError: no frame shows it, or two checkerboards are visible at once: which is which, no image says.
     """
     if not any(len(shot.uv) for shot in blobs):
-        why = explain_missing(frames, board)
+        why = explain_missing((frame for shot in snapshots for frame in shot.values() if frame is not None), board)
         raise InputError(f"frames: found no {board}" + (f": {why}" if why else ""))
+    if board.kind != "checkerboard":
+        return
+    looked = 0
+    for found, shot in zip(blobs, snapshots, strict=False):
+        for camera, (name, frame) in enumerate(shot.items()):
+            uv = found.uv[found.camera == camera]
+            if frame is None or len(uv) < len(board.points):
+                continue
+            if _shows_second(_eight_bits(frame, board), uv, board):
+                raise InputError(f"camera {name}: found two boards at once, each a {board}, expected one")
+            looked += 1
+        if looked >= LOOKED_TWICE:
+            return
+
+
+def _shows_second(grey: NDArray[np.uint8], uv: Floats, board: Board) -> bool:
+    """Look for another checkerboard beside that with the inner corners (N, 2)."""
+    low, high = board.points[:, :2].min(0) - board.pitch, board.points[:, :2].max(0) + board.pitch
+    sheet = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
+    matrix, _ = cv2.findHomography(board.points[:, :2], uv)
+    outline = cv2.perspectiveTransform(sheet[:, None], matrix)
+    covered = cv2.fillConvexPoly(grey.copy(), np.rint(outline).astype(np.int32), float(np.percentile(grey, 99)))
+    return bool(cv2.findChessboardCornersSB(covered, board.shape, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)[0])
 
 
 def corner_sigma(xy: Floats, uv: Floats) -> Floats:
@@ -196,8 +232,7 @@ def _parameters(board: Board) -> Any:
 @lru_cache(maxsize=8)
 def _make_charuco(board: Board) -> Any:
     """Describe a ChArUco board to OpenCV."""
-    count = board.columns * board.rows // 2 if not board.legacy else (board.columns * board.rows + 1) // 2
-    count = max(count, board.columns * board.rows // 2)
+    count = board.columns * board.rows // 2
     dictionary = _dictionary(board.dictionary)
     if board.first_id + count > len(dictionary.bytesList):
         raise InputError(
@@ -214,7 +249,7 @@ def _charuco(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
     made = _make_charuco(board)
     detector = cv2.aruco.CharucoDetector(made, cv2.aruco.CharucoParameters(), _parameters(board))
     corners, ids, marker_corners, marker_ids = detector.detectBoard(grey)
-    if ids is None or marker_ids is None:
+    if ids is None or marker_ids is None or _count_repeated(np.ravel(marker_ids)) >= REPEATED:
         return None
     layout = {int(k): np.asarray(p)[:, :2] for k, p in zip(made.getIds().ravel(), made.getObjPoints(), strict=True)}
     if not _matches_layout(marker_corners, marker_ids, layout, board.marker):
@@ -256,8 +291,8 @@ def _matches_layout(corners: Any, ids: Any, layout: dict[int, Any], size: float)
 
 
 def _april_grid(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
-    corners, ids = _markers(grey, board)
-    if len(ids) == 0:
+    corners, ids, repeated = _markers(grey, board)
+    if len(ids) == 0 or repeated >= REPEATED:
         return None
     number = ids - board.first_id
     inside = (number >= 0) & (number < board.columns * board.rows)
@@ -303,14 +338,19 @@ def _intersect_sides(grey: NDArray[np.uint8], corners: Floats, board: Board) -> 
     return corners
 
 
-def _markers(grey: NDArray[np.uint8], board: Board) -> tuple[Floats, Ints]:
-    """Detect all markers of the board's dictionary: corners (K, 4, 2), ids (K,)."""
+def _markers(grey: NDArray[np.uint8], board: Board) -> tuple[Floats, Ints, int]:
+    """Detect all markers of the board's dictionary: corners (K, 4, 2), ids (K,), and how many are seen repeatedly."""
     corners, ids, _ = cv2.aruco.ArucoDetector(_dictionary(board.dictionary), _parameters(board)).detectMarkers(grey)
     if ids is None or not len(corners):
-        return np.zeros((0, 4, 2)), np.zeros(0, dtype=np.int64)
+        return np.zeros((0, 4, 2)), np.zeros(0, dtype=np.int64), 0
     number = np.asarray(ids, dtype=np.int64).ravel()
     _, first = np.unique(number, return_index=True)
-    return np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2)[first], number[first]
+    return np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2)[first], number[first], _count_repeated(number)
+
+
+def _count_repeated(ids: NDArray[Any]) -> int:
+    """Count the different ids of (K,) that occur more than once."""
+    return int((np.unique(ids, return_counts=True)[1] > 1).sum())
 
 
 # Grids
@@ -337,13 +377,54 @@ def _checkerboard(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
 
 
 def _circles(grey: NDArray[np.uint8], board: Board) -> _Seen | None:
-    across, down = board.shape
-    flags = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
-    found, centres = cv2.findCirclesGrid(grey, (across, down), flags=flags, blobDetector=_blob_detector())
-    if not found:
+    for blobs in _find_circles(grey):
+        grids = _number_grids(blobs, board)
+        if grids:
+            break
+    # Which of several is meant, no image says.
+    if len(grids) != 1 or (blobs.flags[grids[0]] & BlobFlag.BORDER).any():
         return None
-    grid = np.asarray(centres, dtype=np.float64).reshape(down, across, 2)
-    return _Seen((grid if board.asymmetric else _flip_mirrored(grid)).reshape(-1, 2), np.arange(across * down))
+    return _Seen(blobs.uv[grids[0]], np.arange(len(grids[0])))
+
+
+def _number_grids(blobs: Blobs, board: Board) -> list[Ints]:
+    """Find grids that have the layout of a board: the blob (N,) of each circle."""
+    lattices = find_lattices(blobs.uv, blobs.radius)
+    return [rows for lattice in lattices if (rows := number_circles(lattice, board, blobs.uv)) is not None]
+
+
+def _find_circles(grey: NDArray[np.uint8]) -> Iterator[Blobs]:
+    """Find dark circles: those of usual sizes, then more of them, each time with those found before.
+
+    Our own blobs are the more accurate ones, but where circles are dense, their neighbours hide the background.
+    OpenCV's thresholds do not need it; they lose others.
+    """
+    blobs = find_blobs(grey, DetectionOptions(polarity="dark"), 255)
+    yield blobs
+    blobs = _join(blobs, _find_by_thresholds(grey))
+    yield blobs
+    yield _join(blobs, find_blobs(grey, DetectionOptions(polarity="dark", max_radius=LARGEST_CIRCLE), 255))
+
+
+def _find_by_thresholds(grey: NDArray[np.uint8]) -> Blobs:
+    """Find dark circles with OpenCV."""
+    found = _blob_detector().detect(grey)
+    uv = np.array([point.pt for point in found], dtype=np.float64).reshape(-1, 2)
+    radius = np.array([point.size / 2 for point in found])
+    room = np.minimum(uv, np.array(grey.shape[::-1]) - 1 - uv).min(1) - radius
+    flags = np.where(room < 1, int(BlobFlag.BORDER), int(BlobFlag.NONE)).astype(np.uint8)
+    count = len(uv)
+    return Blobs(
+        uv, np.full(count, UNKNOWN_SIGMA), radius, flags, np.zeros(count, np.int64), np.ones(count),
+        np.full(count, -1, np.int64),
+    )  # fmt: skip
+
+
+def _join(blobs: Blobs, others: Blobs) -> Blobs:
+    """Add those others that are not within a radius of blobs."""
+    apart = np.linalg.norm(others.uv[:, None] - blobs.uv[None], axis=-1)
+    new = others.select((apart > np.maximum(others.radius[:, None], blobs.radius)).all(1))
+    return Blobs(*(np.concatenate((getattr(blobs, f.name), getattr(new, f.name))) for f in fields(Blobs)))
 
 
 @lru_cache(maxsize=1)
@@ -429,7 +510,9 @@ def explain_missing(frames: Iterable[Frame], board: Board) -> str:
     if not board.is_coded:
         return _explain_other_grid(looked, board) or _explain_inverted(negative, board)
     found = [_markers(grey, board) for grey in looked]
-    ids = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(number for _, number in found)]))
+    ids = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(number for _, number, _ in found)]))
+    if max((repeated for *_, repeated in found), default=0) >= REPEATED:
+        return "the same markers are visible twice: show one board at a time"
     if len(ids) >= 2:
         count = board.columns * board.rows // (2 if board.kind == "charuco" else 1)
         last = board.first_id + count - 1
@@ -462,17 +545,30 @@ def _explain_other_dictionary(looked: list[NDArray[np.uint8]], board: Board) -> 
 
 
 def _explain_other_grid(looked: list[NDArray[np.uint8]], board: Board) -> str:
-    part = "squares" if board.kind == "checkerboard" else "circles"
-    least = 3 if board.kind == "checkerboard" else 2
+    if board.kind == "circles":
+        return _explain_other_circles(looked, board)
     steps = range(-OTHER_SIZES, OTHER_SIZES + 1)
     sizes = [(board.columns + i, board.rows + j) for i in steps for j in steps] + [(board.rows, board.columns)]
-    sizes = [size for size in dict.fromkeys(sizes) if min(size) >= least and size != (board.columns, board.rows)]
+    sizes = [size for size in dict.fromkeys(sizes) if min(size) >= 3 and size != (board.columns, board.rows)]
     sizes.sort(key=lambda size: -size[0] * size[1])
     for grey in looked[: MOST_LOOKED // 2]:
         for columns, rows in sizes:
-            other = Board(board.kind, columns, rows, board.pitch, asymmetric=board.asymmetric)
-            if _FINDERS[board.kind](grey, other) is not None:
-                return f"a board of {columns}x{rows} {part} is visible, expected {board.columns}x{board.rows}"
+            if _checkerboard(grey, Board(board.kind, columns, rows, board.pitch)) is not None:
+                return f"a board of {columns}x{rows} squares is visible, expected {board.columns}x{board.rows}"
+    return ""
+
+
+def _explain_other_circles(looked: list[NDArray[np.uint8]], board: Board) -> str:
+    for grey in looked:
+        *_, blobs = _find_circles(grey)
+        lattices = find_lattices(blobs.uv, blobs.radius)
+        names = [name for lattice in lattices if (name := name_grid(lattice, board, blobs.uv))]
+        if str(board) in names:
+            if names.count(str(board)) > 1:
+                return f"{names.count(str(board))} of them are visible at once, expected one"
+            return "it is cut off by the edge of the image"
+        if names:
+            return f"{with_article(names[0])} is visible, expected {with_article(str(board))}"
     return ""
 
 

@@ -5,24 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imgcal.detection.blob_search import find_blobs
 from imgcal.detection.boards import find_board, require_board
-from imgcal.detection.candidates import block_means, outline, screen
-from imgcal.detection.centroids import Blobs, measure, to_detections
+from imgcal.detection.centroids import Blobs, to_detections
 from imgcal.detection.checks import Frame, check_frame, check_mask, full_scale
 from imgcal.detection.options import DetectionOptions
-from imgcal.detection.populations import DIMMER, drop_dim, select_usable, usual_size
+from imgcal.detection.populations import drop_dim
 from imgcal.errors import InputError
-from imgcal.medians import median
 from imgcal.types import BlobFlag, Board, Detections
-
-LARGER = 32.0  # px, largest radius that a search with the usual limit still finds
-LARGEST = 48.0  # px, largest radius that fits the windows
-FEW = 4  # usable blobs of a frame below which the search for much larger ones is finer
 
 ANGLES = np.linspace(0, 2 * np.pi, 16, endpoint=False)
 OUTLINE = np.concatenate(([[0.0, 0.0]], np.stack((np.cos(ANGLES), np.sin(ANGLES)), axis=1)))
@@ -74,7 +68,7 @@ def detect(
             for snapshot in snapshots
         ]
     if board is not None:
-        require_board(blobs, (frame for shot in snapshots for frame in shot.values() if frame is not None), board)
+        require_board(blobs, snapshots, board)
     digits = len(str(max(len(blobs) - 1, 0)))
     numbers = tuple(f"{index:0{digits}d}" for index in range(len(blobs)))
     return to_detections(drop_dim(blobs, options), names, numbers)
@@ -138,41 +132,12 @@ def _detect_one(
     if board is not None:
         points = find_board(frame, board)
         return points if mask is None else points.select(~_is_in_mask(mask, points.uv))
-    scale = full_scale(frame, options.bit_depth, name)
-    contiguous = frame if frame.flags.c_contiguous else frame.copy()
-    if options.max_radius is None:
-        blobs = _find_all_sizes(contiguous, options, scale)
-    else:
-        blobs = _find(contiguous, block_means(contiguous, options, scale), options, scale)
+    blobs = find_blobs(frame, options, full_scale(frame, options.bit_depth, name))
     if mask is not None:
         reach = blobs.uv[:, None] + blobs.radius[:, None, None] * OUTLINE
         touching = _is_in_mask(mask, reach.reshape(-1, 2)).reshape(-1, len(OUTLINE)).any(axis=1)
         blobs.flags[touching] |= np.uint8(BlobFlag.MASKED)
     return blobs
-
-
-def _find_all_sizes(frame: Frame, options: DetectionOptions, scale: int) -> Blobs:
-    """Find blobs of the usual sizes, and larger ones where there are several of one size.
-
-    The first search also finds most of the larger ones. A frame is searched again if it has no blob, or something large
-    that is as bright as its blobs; with hardly any blob, the check for the latter is finer.
-    """
-    limit, means = options.radius_limit, block_means(frame, options, scale)
-    screening = screen(means, options, scale)
-    blobs = measure(frame, outline(frame, screening, options, scale), replace(options, max_radius=LARGER), scale)
-    kept = usual_size(blobs, limit)
-    blobs = blobs if kept.all() else blobs.select(kept)
-    if len(blobs.uv):
-        least, step = (LARGER, 4) if np.count_nonzero(select_usable(blobs)) >= FEW else (limit, 1)
-        if not screening.holds(DIMMER * scale * median(blobs.contrast), least, 2 * LARGEST, step):
-            return blobs
-    wide = _find(frame, means, replace(options, max_radius=LARGEST), scale)
-    wide = wide.select(usual_size(wide, limit))
-    return wide if (wide.radius > limit).any() else blobs
-
-
-def _find(frame: Frame, means: Frame, options: DetectionOptions, scale: int) -> Blobs:
-    return measure(frame, outline(frame, screen(means, options, scale), options, scale), options, scale)
 
 
 def _is_in_mask(mask: NDArray[np.bool_], uv: NDArray[np.float64]) -> NDArray[np.bool_]:

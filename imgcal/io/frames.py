@@ -88,6 +88,9 @@ def count_frames(path: Path) -> int:
 def read_frame(path: str | Path, page: int = 0, size: Size | None = None) -> Frame:
     """Read a grey image of 8 or 16 bit.
 
+    Pixels are those of the file, in its order: how it would be turned for display (Orientation in TIFF and Exif) is
+    no matter of the camera.
+
     Args:
         path: image file.
         page: of a TIFF with several.
@@ -106,10 +109,10 @@ def read_frame(path: str | Path, page: int = 0, size: Size | None = None) -> Fra
         if path.suffix.lower() in TIFF_SUFFIXES:
             pages = tiff_pages(path)
             if page < len(pages):
-                _require_size(path, pages[page], size)
+                _require_size(path, pages[page].size, size)
             with silence_stderr():
                 found, images = cv2.imreadmulti(str(path), start=page, count=1, flags=cv2.IMREAD_UNCHANGED)
-            image = images[0] if found and images else None
+            image = _as_stored(images[0], pages[page].orientation) if found and images else None
         else:
             content = _content(path)
             _require_size(path, image_size(path.suffix.lower(), content), size)
@@ -122,6 +125,14 @@ def read_frame(path: str | Path, page: int = 0, size: Size | None = None) -> Fra
     if image is None:
         raise InputError(f"{path}: found a damaged or truncated file, expected a {path.suffix[1:].upper()} image")
     return _grey(image, path)
+
+
+def _as_stored(image: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Undo the turn (TIFF 6.0, Orientation) by which OpenCV makes the first pixel of a TIFF the one at the top left."""
+    rows = slice(None, None, -1 if orientation in (3, 4, 7, 8) else 1)
+    columns = slice(None, None, -1 if orientation in (2, 3, 6, 7) else 1)
+    turned = image[rows, columns]
+    return np.ascontiguousarray(turned.swapaxes(0, 1) if orientation >= 5 else turned)
 
 
 def write_frame(path: str | Path, frame: Frame) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import re
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -33,7 +34,8 @@ MOVIE_ATOMS = frozenset({b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b
 
 PGM_HEADER = re.compile(rb"P[25](?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s")
 JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start-of-frame markers
-TIFF_WIDTH, TIFF_HEIGHT, TIFF_SAMPLES = 256, 257, 277
+TIFF_WIDTH, TIFF_HEIGHT, TIFF_BITS, TIFF_PHOTOMETRIC, TIFF_ORIENTATION, TIFF_SAMPLES = 256, 257, 258, 262, 274, 277
+WHITE_IS_ZERO, BLACK_IS_ZERO = 0, 1
 
 
 def has_kind(suffix: str, start: bytes) -> bool:
@@ -69,14 +71,20 @@ def check_pixels(path: Path, size: Size, samples: int = 1) -> None:
         raise InputError(f"{path}: found {found}, expected at most {MOST_PIXELS:,}")
 
 
-def tiff_pages(path: Path) -> tuple[Size, ...]:
+@dataclass(frozen=True)
+class TiffPage:
+    """One image of a TIFF, as it is stored."""
+
+    size: Size  # (0, 0) where the page has none
+    orientation: int  # 1 to 8, of its first row and column for display; 1 = top left
+
+
+def tiff_pages(path: Path) -> tuple[TiffPage, ...]:
     """Walk the directories of a TIFF or BigTIFF: OpenCV silently counts only the pages before a truncation.
 
-    Returns:
-        Size of every page, (0, 0) where a page has none.
-
     Raises:
-        InputError: another kind of file, truncated, or with a page larger than any camera's image.
+        InputError: another kind of file, truncated, with a page larger than any camera's image, or of more than 8 bit
+            with zero for white: OpenCV inverts 8 bit only.
 
     Source: TIFF 6.0, section 2; BigTIFF has 8-byte offsets and 20-byte entries.
     """
@@ -86,7 +94,7 @@ def tiff_pages(path: Path) -> tuple[Size, ...]:
 
 
 @functools.lru_cache(maxsize=64)  # every page of a file is read by its own call
-def _tiff_pages(path: Path, size: int, changed: int) -> tuple[Size, ...]:
+def _tiff_pages(path: Path, size: int, changed: int) -> tuple[TiffPage, ...]:
     with open(path, "rb") as file:
         magic = file.read(4)
         order = {b"II": "<", b"MM": ">"}.get(magic[:2], "")
@@ -97,7 +105,7 @@ def _tiff_pages(path: Path, size: int, changed: int) -> tuple[Size, ...]:
         if big:
             file.read(4)
         offset_format, count_format = (order + "Q", order + "Q") if big else (order + "I", order + "H")
-        offset, pages = _unpack(file, offset_format, path), dict[int, Size]()
+        offset, pages = _unpack(file, offset_format, path), dict[int, TiffPage]()
         while offset and offset not in pages:
             if offset > size:
                 raise _truncated_error(path)
@@ -105,17 +113,18 @@ def _tiff_pages(path: Path, size: int, changed: int) -> tuple[Size, ...]:
             entries = _unpack(file, count_format, path)
             if entries * 12 > size or len(pages) == MOST_PAGES:
                 raise _truncated_error(path)
-            pages[offset] = _page_size(path, file, entries, order, big)
+            pages[offset] = _read_page(path, file, entries, order, big)
             offset = _unpack(file, offset_format, path)
     return tuple(pages.values())
 
 
-def _page_size(path: Path, file: BinaryIO, entries: int, order: str, big: bool) -> Size:
+def _read_page(path: Path, file: BinaryIO, entries: int, order: str, big: bool) -> TiffPage:
     entry = 20 if big else 12
     content = file.read(entries * entry)
     if len(content) < entries * entry:
         raise _truncated_error(path)
-    values = {TIFF_WIDTH: 0, TIFF_HEIGHT: 0, TIFF_SAMPLES: 1}
+    values = {TIFF_WIDTH: 0, TIFF_HEIGHT: 0, TIFF_SAMPLES: 1, TIFF_BITS: 1, TIFF_ORIENTATION: 1}
+    values[TIFF_PHOTOMETRIC] = BLACK_IS_ZERO
     for start in range(0, len(content), entry):
         tag, kind = struct.unpack_from(order + "HH", content, start)
         if tag in values and kind in (3, 4, 16):  # short, long, long8; the value stands in the entry
@@ -124,7 +133,9 @@ def _page_size(path: Path, file: BinaryIO, entries: int, order: str, big: bool) 
                 values[tag] = struct.unpack_from(order + letter, content, start + (12 if big else 8))[0]
     size = values[TIFF_WIDTH], values[TIFF_HEIGHT]
     check_pixels(path, size, max(values[TIFF_SAMPLES], 1))
-    return size
+    if values[TIFF_PHOTOMETRIC] == WHITE_IS_ZERO and values[TIFF_BITS] > 8:
+        raise InputError(f"{path}: found inverted grey values (WhiteIsZero), expected zero for black (BlackIsZero)")
+    return TiffPage(size, values[TIFF_ORIENTATION])
 
 
 def _unpack(file: BinaryIO, number_format: str, path: Path) -> int:

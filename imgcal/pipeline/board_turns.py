@@ -27,6 +27,7 @@ from imgcal.estimation import (
     single_camera_poses,
 )
 from imgcal.medians import MEDIAN_SQUARED
+from imgcal.messages import with_article
 from imgcal.pipeline.labelled_capture import LabelledCapture
 from imgcal.types import Board, CalibrationObject, CameraRig, Detections, Observations
 
@@ -215,6 +216,7 @@ def require_one_turn(cameras: CameraRig, obj: CalibrationObject) -> None:
     """Raise `RefusedError` if the board's orientation in several cameras cannot be made consistent."""
     if obj.board is not None and len(obj.board.turns) > 1 and cameras.num_cameras > 1:
         raise RefusedError(
-            f"object: a {obj.board} looks the same when turned, so without a factory calibration its points cannot be "
-            "matched between cameras: use a ChArUco board, or one with an even and an odd number of squares"
+            f"object: {with_article(str(obj.board))} looks the same when turned, so without a factory calibration its "
+            "points cannot be matched between cameras: use a ChArUco board, a checkerboard with an even and an odd "
+            "number of squares, or an asymmetric grid with an odd number of rows"
         )

@@ -57,8 +57,7 @@ def detect_capture(
     if board is not None:
         if measurer is not None:
             raise InputError(f"measurer {measurer.name}: found a printed board, expected an object with markers")
-        again = capture.snapshots(first, last)
-        require_board(found, (frame for _, shot in again for frame in shot.values() if frame is not None), board)
+        require_board(found, (frames for _, frames in capture.snapshots(first, last)), board)
         return to_detections(found, capture.camera_names, names), shown
     return to_detections(drop_dim(found, options), capture.camera_names, names), shown
 

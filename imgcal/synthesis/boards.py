@@ -210,13 +210,8 @@ def is_white(board: Board, xy: Floats) -> NDArray[np.bool_]:
         return np.square(xy - nearest).sum(1) > (DOT * apart) ** 2
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     if board.kind == "charuco":
-        count = (board.columns * board.rows + 1) // 2
-        ids = np.arange(
-            board.first_id, board.first_id + count - (0 if board.legacy else board.columns * board.rows % 2)
-        )
-        made = cv2.aruco.CharucoBoard(
-            (board.columns, board.rows), board.pitch, board.marker, dictionary, ids.astype(np.int32)
-        )
+        ids = np.arange(board.first_id, board.first_id + board.columns * board.rows // 2, dtype=np.int32)
+        made = cv2.aruco.CharucoBoard((board.columns, board.rows), board.pitch, board.marker, dictionary, ids)
         made.setLegacyPattern(board.legacy)
         picture = made.generateImage((board.columns * TEXELS, board.rows * TEXELS), marginSize=0)
         column, row = np.clip(np.floor(xy / board.pitch * TEXELS).astype(np.int64), 0, size * TEXELS - 1).T

@@ -71,7 +71,8 @@ class Board:
 
     def __str__(self) -> str:
         """Describe it: `ChArUco board of 5x7 squares (DICT_4X4_50)`."""
-        names = {"charuco": "ChArUco board", "aprilgrid": "AprilGrid", "circles": "grid"}
+        grid = "asymmetric grid" if self.asymmetric else "grid"
+        names = {"charuco": "ChArUco board", "aprilgrid": "AprilGrid", "circles": grid}
         parts = {"aprilgrid": "tags", "circles": "circles"}
         code = f" ({self.dictionary})" if self.is_coded else ""
         what = f"{self.columns}x{self.rows} {parts.get(self.kind, 'squares')}{code}"

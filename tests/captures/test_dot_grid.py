@@ -3,12 +3,15 @@
 import shutil
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import imgcal
+from imgcal.detection.boards import find_board
 from imgcal.estimation import camera_std
 from imgcal.io import read_frame, write_text
-from tests.captures.sets import nominal
+from imgcal.types import Board
+from tests.captures.sets import dot_grid, nominal
 
 HELD_OUT_LIMIT = 0.25  # px RMS, from the captures' README
 
@@ -59,3 +62,12 @@ def test_the_halves_differ_by_as_much_as_they_say(grid):
     assert (difference.square() / variance).mean() < 4
     alone = sum(camera_std(replace(half.estimate, inflation=None))[0, 6:10].square() for half in halves)
     assert (difference.square() / alone).mean() > 20
+
+
+def test_the_grid_is_found_as_a_board(captures):
+    """A larger dot marks the origin; in one view it merges with the dark edge of the image."""
+    frames, _ = dot_grid(captures)
+    found = [find_board(frame, Board("circles", 10, 10, 25.4)) for frame in frames]
+    assert [len(points.uv) for points in found].count(100) >= 14
+    assert max(np.median(points.sigma) for points in found if len(points.uv)) < 0.1
+    assert not any(len(find_board(frame, Board("circles", 9, 10, 25.4)).uv) for frame in frames[:3])

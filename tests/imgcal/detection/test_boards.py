@@ -2,17 +2,20 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 import imgcal
 from imgcal.detection import DetectionOptions, detect_snapshot
-from imgcal.detection.boards import UNKNOWN_SIGMA, corner_sigma
+from imgcal.detection.boards import UNKNOWN_SIGMA, corner_sigma, find_board
 from imgcal.errors import InputError
 from imgcal.synthesis import render_board, simulate_board
-from imgcal.types import CalibrationObject
+from imgcal.synthesis.boards import is_white
+from imgcal.types import Board, CalibrationObject
 
+FINER = 4  # places of a pixel, across and down
 KINDS = ("charuco", "aprilgrid", "checkerboard", "circles")
 
 
@@ -126,6 +129,13 @@ def test_a_long_line_of_corners_beside_a_grid_does_not_change_its_sigma():
         ("charuco", {"inverted": True}, "expected inverted: false"),
         ("aprilgrid", {"columns": 3, "rows": 3}, "expected 0 to 8"),
         ("checkerboard", {"columns": 7, "rows": 6}, "a board of (8x7|7x8) squares is visible, expected 7x6"),
+        (
+            "circles",
+            {"columns": 3},
+            "grid of 4x11 circles is visible, expected an asymmetric grid of 3x11",
+        ),
+        ("circles", {"asymmetric": False}, "an asymmetric grid of 4x11 circles is visible, expected a grid of 4x11"),
+        ("circles", {"inverted": True}, "expected inverted: false"),
     ],
 )
 def test_says_why_a_board_is_not_found(kind, change, words):
@@ -134,6 +144,73 @@ def test_says_why_a_board_is_not_found(kind, change, words):
     _, frames = seen(printed, rig)
     with pytest.raises(InputError, match=words):
         imgcal.detect(frames, board=replace(printed.board, **change))
+
+
+def turned_grid(board, turn, ends=(0, 0), size=(480, 640)):
+    """Draw circles of a board that is turned about its normal, in front of a camera: frame, and pixels (N, 2)."""
+    xy = board.points[:, :2] - (board.points[:, :2].max(0) + board.points[:, :2].min(0)) / 2
+    matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    uv = (xy @ matrix.T) + np.array(size[::-1]) / 2 + ends
+    frame = np.full((FINER * size[0], FINER * size[1]), 205.0)
+    fine = np.rint((FINER * (uv + 0.5) - 0.5) * 256).astype(int)
+    for place in fine:
+        cv2.circle(frame, place.tolist(), round(0.3 * board.pitch * FINER * 256), 35.0, -1, shift=8)
+    frame = frame.reshape(size[0], FINER, size[1], FINER).mean((1, 3))
+    noise = np.random.default_rng(0).normal(0, 2, size)
+    return np.clip(frame + noise, 0, 255).astype(np.uint8), uv
+
+
+@pytest.mark.parametrize(("columns", "rows", "asymmetric"), [(4, 10, True), (4, 8, True), (4, 11, True), (7, 6, False)])
+def test_circles_have_the_numbers_of_the_layout_however_the_grid_is_turned(columns, rows, asymmetric):
+    board = Board("circles", columns, rows, 20.0 if asymmetric else 40.0, asymmetric=asymmetric)
+    for turn in np.radians(range(0, 360, 30)):
+        frame, uv = turned_grid(board, turn)
+        found = find_board(frame, board)
+        assert any(np.abs(found.uv - uv[order]).max() < 0.1 for _, order in board.turns)
+        assert found.sigma.max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("checkerboard", "camera camera: found two boards at once"),
+        ("charuco", "visible twice"),
+        ("aprilgrid", "visible twice"),
+    ],
+)
+def test_two_boards_of_one_kind_at_once_are_named(kind, words):
+    obj = imgcal.load_object(kind)
+    size = np.array([obj.board.columns, obj.board.rows]) + 1.4
+    place = np.stack(np.meshgrid(*(np.arange(0.5, 40 * length) / 40 - 0.7 for length in size)), -1)
+    white = is_white(obj.board, place.reshape(-1, 2) * obj.board.pitch).reshape(place.shape[:2])
+    board = cv2.GaussianBlur(np.where(white, 205.0, 35.0), (0, 0), 0.7)
+    frame = np.full((board.shape[0] + 80, 2 * board.shape[1] + 160), 70.0)
+    for left in (40, board.shape[1] + 120):
+        frame[40 : 40 + board.shape[0], left : left + board.shape[1]] = board
+        seen = frame.astype(np.uint8)
+        if left == 40:
+            assert len(imgcal.detect({"camera": seen}, board=obj.board).uv) == obj.num_fiducials
+    with pytest.raises(InputError, match=words):
+        imgcal.detect({"camera": seen}, board=obj.board)
+
+
+def test_circles_that_the_image_cuts_off_leave_no_grid():
+    board = Board("circles", 7, 6, 40.0)
+    frame, uv = turned_grid(board, 0.0, ends=(200 - 6, 0))
+    assert 628 < uv[:, 0].max() < 640
+    assert not len(find_board(frame, board).uv)
+    with pytest.raises(InputError, match="cut off by the edge of the image"):
+        imgcal.detect({"camera": frame}, board=board)
+
+
+def test_two_boards_at_once_are_named():
+    board = Board("circles", 5, 4, 40.0)
+    left, _ = turned_grid(board, 0.2, ends=(-150, 0))
+    right, _ = turned_grid(board, 1.0, ends=(150, 0))
+    frame = np.minimum(left, right)
+    assert not len(find_board(frame, board).uv)
+    with pytest.raises(InputError, match="2 of them are visible at once, expected one"):
+        imgcal.detect({"camera": frame}, board=board)
 
 
 @pytest.mark.parametrize(("dark", "light"), [(60, 160), (0, 255)])

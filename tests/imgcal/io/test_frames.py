@@ -178,3 +178,45 @@ def test_junk_video(tmp_path: Path) -> None:
     (tmp_path / "v.avi").write_bytes(b"junk" * 100)
     with pytest.raises(InputError, match=r"v\.avi: found a damaged or empty file"):
         count_frames(tmp_path / "v.avi")
+
+
+def tiff_of(frame: Any, orientation: int = 1, white_is_zero: bool = False) -> bytes:
+    """Write one uncompressed grey page by hand."""
+    (rows, columns), bits = frame.shape, 8 * frame.itemsize
+    tags = {256: columns, 257: rows, 258: bits, 259: 1, 262: 0 if white_is_zero else 1, 273: 0, 274: orientation}
+    tags |= {277: 1, 278: rows, 279: frame.nbytes}
+    tags[273] = start = 8 + 2 + 12 * len(tags) + 4
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
+    head = b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4)
+    assert len(head) == start
+    return head + frame.astype(frame.dtype.newbyteorder("<")).tobytes()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("frame", [GREY8, GREY16], ids=["8 bit", "16 bit"])
+def test_pixels_are_those_of_the_file_however_it_is_turned_for_display(
+    frame: Any, orientation: int, tmp_path: Path
+) -> None:
+    path = tmp_path / "f.tif"
+    path.write_bytes(tiff_of(frame, orientation))
+    np.testing.assert_array_equal(read_frame(path, size=(64, 48)), frame, strict=True)
+    if orientation > 1:  # wart: OpenCV turns TIFF, whatever its flags
+        assert not np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), frame)
+    if frame.dtype == np.uint8:
+        plain = cv2.imencode(".jpg", frame)[1].tobytes()
+        exif = b"Exif\0\0II*\0" + struct.pack("<IHHHIII", 8, 1, 274, 3, 1, orientation, 0)
+        (tmp_path / "plain.jpg").write_bytes(plain)
+        turned = tmp_path / "turned.jpg"
+        turned.write_bytes(plain[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + plain[2:])
+        np.testing.assert_array_equal(read_frame(turned), read_frame(tmp_path / "plain.jpg"), strict=True)
+
+
+def test_inverted_grey_values_are_read_or_refused(tmp_path: Path) -> None:
+    path = tmp_path / "f.tif"
+    path.write_bytes(tiff_of(255 - GREY8, white_is_zero=True))
+    np.testing.assert_array_equal(read_frame(path), GREY8, strict=True)
+    path = tmp_path / "g.tif"
+    path.write_bytes(tiff_of(65535 - GREY16, white_is_zero=True))
+    with pytest.raises(InputError, match="inverted grey values"):
+        read_frame(path)
+    assert cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[0, 0] == 65535 - GREY16[0, 0]  # wart: OpenCV inverts 8 bit only
