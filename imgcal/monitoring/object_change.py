@@ -37,7 +37,7 @@ MISFIT_LEAD = 30.0
 """Log odds against the next best explanation at which a change of the object is believed without a suspected camera:
 a bad fit has many causes."""
 LEAST_CAMERAS = 2
-"""Number of cameras that must see the object in most snapshots: to one camera, a wrong label is a fiducial elsewhere."""
+"""Number of cameras that must see the object in most snapshots: to one, a wrong label is a fiducial elsewhere."""
 LEAST_GAIN = MISFIT_LEAD / 2
 """Least gain of log likelihood, with all fiducials free, for which the parts of the object are weighed: half of the
 lead, because fits are not exact."""
