@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -83,18 +84,14 @@ def event_message(event: Event) -> dict[str, Any]:
     }
 
 
-def rig_message(state: RigState) -> dict[str, Any]:
-    """The rig and its reference, pickled, to be read when needed."""
-    return {"time": float(state.time), "pickled": pickle.dumps((state.rig, state.factory))}
-
-
 def belief_message(state: RigState) -> dict[str, Any]:
-    """The input of the deviations and the predicted error, pickled, to be read when needed."""
+    """The rig, its uncertainty and its reference, pickled, to be read when needed."""
     pose, blobs = state.rig_from_object, state.detections
     labelled = blobs.fiducial >= 0
     turn = torch.eye(3, dtype=torch.float64) if pose is None else pose.rotation.detach().double().reshape(-1, 3, 3)[-1]
     sigma = float(np.median(blobs.sigma[labelled])) if labelled.any() else None
-    return {"pickled": pickle.dumps((state.belief, state.factory, turn)), "sigma": sigma}
+    belief = replace(state.belief)  # without what follows from its values
+    return {"time": float(state.time), "pickled": pickle.dumps((belief, state.factory, turn)), "sigma": sigma}
 
 
 def picture_message(state: RigState, camera: int, frames: Mapping[str, Frame | None]) -> dict[str, Any]:

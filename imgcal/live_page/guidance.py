@@ -26,15 +26,21 @@ PLACES = {True: 4, False: 3}
 MOST_POINTS = 8  # fiducials that a try takes
 
 
-def compare(content: dict[str, Any]) -> tuple[CameraRig, NDArray[np.float64]]:
-    """Read a rig (`contents.rig_message`): the rig, and its change (C, 15) against the factory, as most see it."""
-    rig, factory = pickle.loads(content["pickled"])
-    return rig, Gauge.from_majority(rig, factory).difference(rig, factory).numpy()
+def compare(content: dict[str, Any]) -> tuple[CameraRig, NDArray[np.float64], Tensor]:
+    """Read a rig (`contents.belief_message`).
+
+    Returns:
+        The rig; its change (C, K) against the factory, as most see it; and one standard deviation of each, (C, K).
+    """
+    belief, factory, _ = pickle.loads(content["pickled"])
+    rig = belief.rig
+    gauge = Gauge.from_majority(rig, factory)
+    return rig, gauge.difference(rig, factory).numpy(), gauge.spread(rig, belief.covariance())
 
 
 def compute_guidance(
     content: dict[str, Any], points_object: NDArray[np.float64], volume: WorkingVolume
-) -> tuple[dict[str, Any], CameraRig, Tensor]:
+) -> dict[str, Any]:
     """Compute what the page shows about the volume.
 
     Args:
@@ -43,16 +49,14 @@ def compute_guidance(
         volume: where the object is seen.
 
     Returns:
-        Plain values for the page; the rig of this belief, and one standard deviation of each camera's change against
-        the factory (C, K).
+        Plain values for the page.
 
     Raises:
         RefusedError: the information is singular.
         torch.linalg.LinAlgError: the matrix of a determinant is singular.
     """
-    belief, factory, turn = pickle.loads(content["pickled"])
+    belief, _, turn = pickle.loads(content["pickled"])
     rig, covariance = belief.rig, belief.covariance()
-    std = Gauge.from_majority(rig, factory).spread(rig, covariance)
     few = rig.num_cameras <= FEW_CAMERAS
     grid = volume.grid(FINE if few else COARSE)
     points = grid.flatten(0, -2)
@@ -66,7 +70,8 @@ def compute_guidance(
     gain = information_gain(belief, covariance, places, shape, sigma)
     known = mm[mm.isfinite()]
     best = int(gain.argmax())
-    advice = {
+    return {
+        "time": content["time"],
         "low": round_values(volume.low.numpy()),
         "high": round_values(volume.high.numpy()),
         "mm": round_values(mm.view(grid.shape[:-1]).numpy(), 3),
@@ -77,7 +82,6 @@ def compute_guidance(
         "gain": round_values(gain.numpy(), 3),
         "best": best if float(gain[best]) > 0 else None,
     }
-    return advice, rig, std
 
 
 def information_gain(belief: RigBelief, covariance: Tensor, places: Tensor, shape: Tensor, sigma: float) -> Tensor:

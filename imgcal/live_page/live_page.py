@@ -37,7 +37,6 @@ from imgcal.live_page.contents import (
     event_message,
     greeting,
     picture_message,
-    rig_message,
     state_message,
 )
 from imgcal.live_page.rig_drawing import viewing_volume
@@ -51,8 +50,7 @@ Message = tuple[str, Callable[[], dict[str, Any]]]  # kind, and what makes the c
 
 STATES_A_SECOND = 10.0
 PICTURES_A_SECOND = 2.0  # of each camera
-RIG_SECONDS = 0.5
-BELIEF_SECONDS = 1.0  # for ten cameras; longer for more, squared
+BELIEF_SECONDS, USUAL_CAMERAS = 0.5, 30  # up to so many cameras; longer for more, squared
 MOST_EVENTS = 1000  # that wait to be passed on
 MOST_COMMANDS = 64  # that wait to be fetched
 RESTART_SECONDS = 2.0  # between two starts of the server
@@ -340,8 +338,8 @@ class _Courier:
         self._obj, self._cameras = obj, rig.num_cameras
         self._shown = np.full(rig.num_cameras, -1)  # snapshot of each camera's latest picture ...
         self._shown_at = np.zeros(rig.num_cameras)  # ... and when it was passed on, s
-        self._rig_at = self._belief_at = 0.0  # s
-        self._belief_seconds = BELIEF_SECONDS * max(rig.num_cameras / 10, 1.0) ** 2
+        self._belief_at = 0.0  # s
+        self._belief_seconds = BELIEF_SECONDS * max(rig.num_cameras / USUAL_CAMERAS, 1.0) ** 2
 
     def messages(self, state: RigState | None, events: Sequence[dict[str, Any]]) -> Iterator[Message]:
         """Events, a new state, and the parts of it that are due."""
@@ -351,10 +349,7 @@ class _Courier:
         if state is None:
             return
         yield "state", partial(state_message, state, self._obj)
-        if now - self._rig_at >= RIG_SECONDS or events:
-            self._rig_at = now
-            yield "rig", partial(rig_message, state)
-        if now - self._belief_at >= self._belief_seconds:
+        if now - self._belief_at >= self._belief_seconds or events:
             self._belief_at = now
             yield "belief", partial(belief_message, state)
 

@@ -95,7 +95,6 @@ class PageState:
         self.state: dict[str, Any] | None = None
         self._actions = {action.name: action for action in greeting["actions"]}
         self.advice: dict[str, Any] | None = None
-        self._std: Array | None = None
         self._timelines = Timelines()
         self._visited: deque[list[float]] = deque(maxlen=MOST_VISITED)
         self._visited_at = self._layout_at = -math.inf
@@ -117,21 +116,22 @@ class PageState:
         return {}
 
     def update_change(
-        self, time: float, layout: dict[str, Any], change: Array, focal_length: Array
+        self, time: float, layout: dict[str, Any], change: Array, std: Array, focal_length: Array
     ) -> dict[str, bytes]:
-        """Take the rig of a moment: how it is drawn, its change against the factory (C, 15), focal lengths (C, 2)."""
+        """Take the rig of a moment: how it is drawn, its change against the factory and one standard deviation of that
+        (C, 15) each, and focal lengths (C, 2).
+        """
         self._value[:, :3] = camera_changes(change, focal_length)
-        if self._std is not None:
-            self._sigma = camera_sigmas(self._std, focal_length)
+        self._sigma = camera_sigmas(std, focal_length)
         self._timelines.add(time, self._value.copy(), self._sigma)
         if abs(time - self._layout_at) < LAYOUT_SECONDS:
             return {}
         self._layout_at, self._layout = time, layout
         return {"layout": stream_event("layout", layout), "volume": stream_event("volume", self._volume())}
 
-    def update_advice(self, advice: dict[str, Any], std: Array) -> dict[str, bytes]:
-        """Take what has been computed of a belief: predicted error and guidance, and deviations (C, 15)."""
-        self._std, self.advice = std, advice
+    def update_advice(self, advice: dict[str, Any]) -> dict[str, bytes]:
+        """Take what has been computed of a belief: predicted error and guidance."""
+        self.advice = advice
         return {"volume": stream_event("volume", self._volume())}
 
     def apply_command(self, command: Command) -> dict[str, bytes]:

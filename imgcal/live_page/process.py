@@ -147,8 +147,8 @@ async def _serve(listening: socket.socket, pipe: socket.socket) -> None:
         while True:
             kind, content = await read_message(reader)
             try:
-                if kind in ("rig", "belief"):
-                    guide.learn(kind, content, application)
+                if kind == "belief":
+                    guide.learn(content, application)
                 elif kind == "answer":
                     application.accept_answer(**content)
                 else:
@@ -171,15 +171,14 @@ class Guide:
         self._pool = ThreadPoolExecutor(2, initializer=_use_one_thread)
         self._waiting: dict[str, dict[str, Any]] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
-        self._rig: Any = None  # the latest
-        self._known: Any = None  # the latest whose deviations are known, with these: of one moment
+        self._known: Any = None  # the latest rig and its deviations
 
-    def learn(self, kind: str, content: dict[str, Any], application: Application) -> None:
-        """Take a rig or a belief, and send the results to the viewers."""
-        self._waiting[kind] = content
-        if kind not in self._tasks or self._tasks[kind].done():
-            work = self._compare if kind == "rig" else self._look
-            self._tasks[kind] = asyncio.get_running_loop().create_task(work(application))
+    def learn(self, content: dict[str, Any], application: Application) -> None:
+        """Take a belief, and send the results to the viewers."""
+        for kind, work in (("rig", self._compare), ("volume", self._look)):
+            self._waiting[kind] = content
+            if kind not in self._tasks or self._tasks[kind].done():
+                self._tasks[kind] = asyncio.get_running_loop().create_task(work(application))
 
     async def _compare(self, application: Application) -> None:
         while "rig" in self._waiting:
@@ -189,11 +188,11 @@ class Guide:
 
     async def _look(self, application: Application) -> None:
         loop = asyncio.get_running_loop()
-        while "belief" in self._waiting:
+        while "volume" in self._waiting:
             begun = loop.time()
-            found = await self._compute("belief", self._compute_guidance)
+            found = await self._compute("volume", self._compute_guidance)
             if found is not None:
-                application.spread(application.board.update_advice(*found))
+                application.spread(application.board.update_advice(found))
             await asyncio.sleep(max(GUIDANCE_SECONDS, 2 * (loop.time() - begun)))
 
     async def _compute(self, kind: str, work: Callable[[dict[str, Any]], Any]) -> Any:
@@ -208,9 +207,9 @@ class Guide:
         from imgcal.live_page.guidance import compare
         from imgcal.live_page.rig_drawing import arrangement
 
-        self._rig, change = compare(content)
-        layout = arrangement(self._rig, self._volume())
-        return content["time"], layout, change, self._rig.focal_length.numpy()
+        rig, change, std = compare(content)
+        self._known = rig, std
+        return content["time"], arrangement(rig, self._volume()), change, std.numpy(), rig.focal_length.numpy()
 
     def _compute_guidance(self, content: dict[str, Any]) -> Any:
         from torch.linalg import LinAlgError
@@ -219,11 +218,9 @@ class Guide:
         from imgcal.live_page.guidance import compute_guidance
 
         try:
-            advice, rig, std = compute_guidance(content, self._greeting["points"], self._volume())
+            return compute_guidance(content, self._greeting["points"], self._volume())
         except (RefusedError, LinAlgError):  # nothing can be said yet
             return None
-        self._known = rig, std
-        return advice, std.numpy()
 
     def _volume(self) -> Any:
         import torch
@@ -233,13 +230,13 @@ class Guide:
         return WorkingVolume(*(torch.as_tensor(corner) for corner in self._greeting["volume"]))
 
     def rig_yaml(self) -> str | None:
-        """The rig file of the latest moment with known deviations; None before any snapshot."""
-        rig, std = (self._rig, None) if self._known is None else self._known
-        if rig is None:
+        """The file of the latest rig with its deviations; None before any snapshot."""
+        if self._known is None:
             return None
         from imgcal.io import RigCovariance, rig_text
 
-        return rig_text(rig, covariance=None if std is None else RigCovariance(std))
+        rig, std = self._known
+        return rig_text(rig, covariance=RigCovariance(std))
 
 
 def _use_one_thread() -> None:

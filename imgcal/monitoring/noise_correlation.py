@@ -18,6 +18,7 @@ import math
 from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
+from itertools import islice
 
 import numpy as np
 import torch
@@ -35,6 +36,9 @@ MEMORY_SNAPSHOTS = 1024
 """Number of latest snapshots used to measure correlation times ..."""
 FIRST_MEASUREMENTS, MEASUREMENT_INTERVAL = (48, 64, 96), 128
 """... counts of snapshots at which they are first measured, and the interval after that."""
+WITHHELD_SECONDS, MOST_WITHHELD = 2.0, 0.25
+"""Seconds of latest snapshots that are left out, but at most this share of all: until a change of a camera has been
+found, the shift of its image would pass for a persistent error that hides it."""
 USUAL, USUAL_SECONDS, USUAL_SNAPSHOTS = 0.4, 0.1, 256
 """Autocorrelation of the errors of infrared cameras at short intervals, its decay time (s, to 1/e), and the number of
 snapshots until which a calibrated rig is assumed to have no less: fewer snapshots cannot tell."""
@@ -146,6 +150,11 @@ class NoiseCorrelation:
         return math.ceil(seconds / (self.interval or FASTEST))
 
     @property
+    def _withheld(self) -> int:
+        """Number of latest snapshots that may show a change that has not been found yet."""
+        return min(self._count(WITHHELD_SECONDS), int(MOST_WITHHELD * len(self.shifts)))
+
+    @property
     def least_shifts(self) -> list[float]:
         """Minimum image shift (px) of each camera that counts as a change: less may be a persistent error."""
         return torch.where(self.time > 1, LEAST_SHIFT * self.model_error, 0.0).tolist()
@@ -171,7 +180,9 @@ class NoiseCorrelation:
         return torch.where(self.time > 1, weight.clamp_min(LEAST_WEIGHT), 1.0)
 
     def settle(self, cameras: Collection[int]) -> None:
-        """Ignore the next snapshots of cameras that have changed."""
+        """Ignore the latest and the next snapshots of cameras that have changed."""
+        for shift in islice(reversed(self.shifts), self._withheld):
+            shift[list(cameras)] = np.nan
         self.settled_at |= dict.fromkeys(cameras, self.taken + SETTLING_SNAPSHOTS)
 
     def add(self, observations: Observations, residual: Tensor) -> None:
@@ -193,7 +204,7 @@ class NoiseCorrelation:
 
     def _measure(self) -> None:
         """Measure each camera alone and all together: cameras with few snapshots are assumed to be like the others."""
-        series = np.stack(self.shifts)
+        series = np.stack(self.shifts)[: len(self.shifts) - self._withheld]
         seen = np.isfinite(series[..., 0])
         variance = np.nansum(np.square(series), axis=(0, 2)) / (2 * np.maximum(seen.sum(0), 1))
         whitened = series / np.sqrt(np.maximum(variance, 1e-12))[:, None]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import object_prior_std
-from imgcal.monitoring.case import SHAPE, Case, Explanation, Finding, ObjectChange, Variant
+from imgcal.monitoring.case import SHAPE, Case, Explained, Explanation, Finding, ObjectChange, Variant
 from imgcal.monitoring.cusum import Cusum, RunningMedian
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.pending_change import free_cameras
@@ -36,6 +36,8 @@ LEAST_SIGMAS = 3.0
 MISFIT_LEAD = 30.0
 """Log odds against the next best explanation at which a change of the object is believed without a suspected camera:
 a bad fit has many causes."""
+LEAST_CAMERAS = 2
+"""Number of cameras that must see the object in most snapshots: to one, a wrong label is a fiducial elsewhere."""
 LEAST_GAIN = MISFIT_LEAD / 2
 """Least gain of log likelihood, with all fiducials free, for which the parts of the object are weighed: half of the
 lead, because fits are not exact."""
@@ -115,6 +117,11 @@ class ObjectChanged(Explanation):
             return [partial(_free_part, case, *known)]
         parts = [known, (SHAPE, ALL_MM), (SHAPE, ONE_MM), *((n, ONE_MM) for n in _suspected_fiducials(case))]
         return [partial(_free_part, case, *part) for part in parts]
+
+    def premature(self, case: Case, found: Explained) -> str | None:
+        """Wait while single cameras see the object."""
+        cameras = torch.cat([one.seen.any(-1).sum(-1) for one, _ in case.latest])
+        return None if 2 * int((cameras >= LEAST_CAMERAS).sum()) > len(cameras) else "a single camera sees the object"
 
 
 def _free_part(case: Case, fiducial: int | None, by: float) -> Variant:

@@ -585,8 +585,8 @@ class RigMonitor:
             if not may_have_changed(case) and weigh(case, (Steady(), Warmed())).best.name == Steady.name:
                 return None
             verdict = weigh(case)
-            sure = Steady.name in verdict.explained and verdict.lead >= MISFIT_LEAD
-            if sure and verdict.best.name in (ObjectChanged.name, Warmed.name):
+            best, sure = verdict.best, Steady.name in verdict.explained and verdict.lead >= MISFIT_LEAD
+            if sure and best.name in (ObjectChanged.name, Warmed.name) and not best.explanation.premature(case, best):
                 return self._adopt(case, verdict, new)
         return None
 

@@ -16,12 +16,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from imgcal.association import PipelineOptions, find_merged, to_observations
-from imgcal.estimation import EstimationOptions, fit_pose
-from imgcal.geometry import RigidTransform, kernels
+from imgcal.estimation import EstimationOptions, fit_pose, pixel_jacobian
+from imgcal.geometry import RigidTransform, cross_matrix, kernels
 from imgcal.medians import median
+from imgcal.monitoring import RigBelief
 from imgcal.online.light_points import FoundLights
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 from renderers.compiling import njit
@@ -97,6 +99,42 @@ def check_labels(
     fiducial[rows] = np.where(lost, -1, fiducial[rows])
     blobs = replace(named, fiducial=fiducial)
     return Checked(blobs, named, fit.rig_from_object, off, usual, int((fiducial >= 0).sum()))
+
+
+def predict_usual(checked: Checked, belief: RigBelief, least: float) -> float:
+    """Predict `Checked.usual` (px) from the uncertainty of the rig: large where cameras see the object together that
+    never have before.
+
+    Args:
+        checked: a snapshot.
+        belief: about the rig.
+        least: px, usual error of a well-known camera's image; the pose follows the best-known cameras.
+    """
+    given = checked.given
+    seen = np.zeros((belief.rig.num_cameras, belief.obj.num_fiducials), np.bool_)
+    rows = given.fiducial >= 0
+    seen[given.camera[rows], given.fiducial[rows]] = True
+    seen[seen.sum(1) < LEAST_LABELS] = False
+    if not seen.any():
+        return 0.0
+    points = belief.points_at(checked.rig_from_object)[0]
+    camera, fiducial = torch.from_numpy(seen).nonzero(as_tuple=True)
+    own = pixel_jacobian(belief.rig, points)[camera, fiducial]  # (M, 2, K)
+    covariance = belief.covariance().unflatten(0, (belief.rig.num_cameras, -1)).unflatten(2, (-1, own.shape[2]))
+    # Covariance (M, 2, M, 2) of the images before the pose is fitted, and a weight for each of them.
+    images = torch.einsum("aik,akbl,bjl->aibj", own, covariance[camera][:, :, camera], own)
+    variance = images.flatten(2).flatten(0, 1).diagonal().view(-1, 2).mean(1)
+    count = torch.bincount(camera, minlength=len(seen)).clamp_min(1)
+    mean = variance.new_zeros(len(seen)).index_add(0, camera, variance) / count
+    weight = (least**2 + mean).rsqrt()[camera].repeat_interleave(2)[:, None]
+    arms = points - points.mean(0)
+    motion = torch.cat((-cross_matrix(arms), torch.eye(3, dtype=points.dtype).expand(len(points), 3, 3)), -1)
+    by_pose = (-own[..., 3:6] @ motion[fiducial]).flatten(0, 1)  # (2 M, 6)
+    basis = torch.linalg.qr(weight * by_pose).Q
+    left = torch.eye(len(basis), dtype=points.dtype) - basis @ basis.mT
+    spread = (left @ (weight * images.flatten(2).flatten(0, 1) * weight.mT) @ left).diagonal() / weight[:, 0].square()
+    squared = mean.new_zeros(len(seen)).index_add(0, camera, spread.view(-1, 2).sum(1)) / count
+    return median(squared.clamp_min(0).sqrt().numpy()[seen.any(1)])
 
 
 @njit(cache=True, fastmath=kernels.FAST)

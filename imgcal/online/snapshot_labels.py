@@ -12,8 +12,8 @@ from imgcal.detection import Frame
 from imgcal.errors import RefusedError
 from imgcal.estimation import initial_pose
 from imgcal.geometry import RigidTransform
-from imgcal.online.keeper_memory import KeeperMemory
-from imgcal.online.label_consistency import Checked, check_labels
+from imgcal.online.keeper_memory import UNUSUAL, KeeperMemory
+from imgcal.online.label_consistency import Checked, check_labels, predict_usual
 from imgcal.online.labelling import LEAST_FOLLOWED, Labelling
 from imgcal.online.light_labels import label_lights
 from imgcal.online.object_checks import object_event
@@ -73,13 +73,16 @@ def label_snapshot(
         obj = memory.obj_now
         pose = initial_pose(to_observations(blobs, memory.prior, obj), memory.belief.rig, obj)[0]
     checked = _check(memory, blobs, pose.reshape(1), correct)
-    if checked.usual > memory.most_usual and memory.doubts.due and test_clocks(memory):
+    misfit = _fits_nowhere(memory, checked)
+    if misfit and memory.doubts.due and test_clocks(memory):
         checked = _check(memory, blobs, pose.reshape(1), correct)
-    changed = checked.usual > memory.most_usual and memory.doubts.due and test_object(memory, learnt=False)
-    if changed and (change := changed.object_change) is not None:
+        misfit = _fits_nowhere(memory, checked)
+    changed = test_object(memory, learnt=False) if misfit and memory.doubts.due else None
+    if changed is not None and (change := changed.object_change) is not None:
         memory.pending.append(object_event(change, memory.change_time(change.since), memory.time, memory.count - 1))
         checked = _check(memory, blobs, pose.reshape(1), correct)
-    if checked.usual > memory.most_usual:
+        misfit = _fits_nowhere(memory, checked)
+    if misfit:
         memory.doubts.observe_refused(checked, memory.time if memory.learnt is None else memory.learnt, memory.time)
         memory.in_vain += 1
         if memory.in_vain >= MOST_VAIN:
@@ -105,7 +108,15 @@ def _follow(memory: KeeperMemory, labelling: Labelling, usable: Detections, corr
     except RefusedError:
         return None
     few = found.checked.labels < LEAST_FOLLOWED * memory.labels
-    return None if few or found.astray - sought or found.checked.usual > memory.most_usual else found
+    return None if few or found.astray - sought or _fits_nowhere(memory, found.checked) else found
+
+
+def _fits_nowhere(memory: KeeperMemory, checked: Checked) -> bool:
+    """Tell whether most cameras are off by more than usual, and by more than is not yet known about the rig."""
+    if checked.usual <= memory.most_usual:
+        return False
+    unknown = predict_usual(checked, memory.belief, memory.options.identity_error)
+    return checked.usual > memory.most_usual + UNUSUAL * unknown
 
 
 def _extrapolate(memory: KeeperMemory) -> RigidTransform:

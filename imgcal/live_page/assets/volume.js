@@ -2,6 +2,7 @@
 
 const CLASSES = 6;
 const MUCH = 1.3; // times what a snapshot teaches where the object is now: worth a move
+const AGED = 5; // s after which it is said of which moment the accuracy is
 
 function target() { // where the object teaches the most, if that is worth a move
   const advice = page.volume && page.volume.advice;
@@ -19,7 +20,8 @@ function ratioOf(advice, here) {
 function guidance() {
   const advice = page.volume && page.volume.advice;
   if (!advice) return page.state && page.state.object ? "Computing how accurate the rig is …" : "Show the object to the cameras.";
-  const known = advice.median === null ? "No two cameras see the same part of the volume." : `Typical error of a triangulated point: ${digits(advice.median)} mm; in 95 % of the volume below ${digits(advice.p95)} mm.`;
+  const old = page.state && page.state.time - advice.time > AGED ? `At ${clock(advice.time)}: ` : "";
+  const known = old + (advice.median === null ? "No two cameras see the same part of the volume." : `Typical error of a triangulated point: ${digits(advice.median)} mm; in 95 % of the volume below ${digits(advice.p95)} mm.`);
   const next = target();
   if (!next) return `${known} The object is in a good place: snapshots elsewhere would not improve the rig much more.`;
   const here = page.state && page.state.object ? mean(page.state.object) : null;

@@ -10,7 +10,6 @@ from imgcal.live_page.contents import (
     belief_message,
     event_message,
     picture_message,
-    rig_message,
     small_jpeg,
     state_message,
 )
@@ -76,6 +75,9 @@ def test_an_object_is_in_view_while_a_camera_sees_enough_blobs(o10, asymmetric8)
 
 
 def test_rigs_and_events_go_through(o10, asymmetric8):
-    rig, factory = pickle.loads(rig_message(made_state(o10, asymmetric8))["pickled"])
-    assert rig.camera_names == factory.camera_names
+    state = made_state(o10, asymmetric8)
+    belief, factory, _ = pickle.loads(belief_message(state)["pickled"])
+    assert belief.rig.camera_names == factory.camera_names
+    few = len(belief_message(state)["pickled"])
+    assert state.belief.information.shape and len(belief_message(state)["pickled"]) == few  # not what follows from it
     assert event_message(alarm("cam07"))["message"] == "cam07 turned 0.3 degrees"

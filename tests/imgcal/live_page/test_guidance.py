@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from imgcal.live_page.contents import belief_message, rig_message
+from imgcal.live_page.contents import belief_message
 from imgcal.live_page.guidance import compare, compute_guidance, information_gain
 from imgcal.live_page.rig_drawing import viewing_volume
 from imgcal.monitoring import RigBelief, absorb
@@ -48,11 +48,10 @@ def test_nothing_is_learnt_where_nothing_is_seen_and_less_where_one_has_been(o10
 
 def test_the_page_is_told_how_well_the_volume_is_known(o10, asymmetric8):
     state = made_state(o10, asymmetric8)
-    advice, rig, std = compute_guidance(belief_message(state), asymmetric8.points.numpy(), viewing_volume(o10))
+    advice = compute_guidance(belief_message(state), asymmetric8.points.numpy(), viewing_volume(o10))
+    assert advice["time"] == state.time
     assert np.shape(advice["mm"]) == np.shape(advice["count"]) == (9, 9, 9)
     assert 0 < advice["median"] < advice["p95"] and advice["best"] == int(np.argmax(advice["gain"]))
-    assert rig.camera_names == o10.camera_names
-    assert std.numpy() == pytest.approx(state.std.numpy(), rel=1e-12)
 
 
 def test_the_page_says_the_deviations_of_the_state_where_the_rig_has_moved_too(o10, asymmetric8):
@@ -60,7 +59,7 @@ def test_the_page_says_the_deviations_of_the_state_where_the_rig_has_moved_too(o
     step = torch.zeros(10, 15).double()
     step[6, 1], step[2, 3] = 0.1, 30.0
     state = replace(state, belief=replace(state.belief, rig=state.belief.rig.retract(step)))
-    _, rig, std = compute_guidance(belief_message(state), asymmetric8.points.numpy(), viewing_volume(o10))
+    rig, _, std = compare(belief_message(state))
     assert torch.equal(rig.focal_length, state.rig.focal_length) and torch.equal(rig.positions, state.rig.positions)
     assert std.numpy() == pytest.approx(state.std.numpy(), rel=1e-12)
 
@@ -70,6 +69,6 @@ def test_a_camera_that_turned_has_turned_and_no_other(o10, asymmetric8):
     step = torch.zeros(10, 15).double()
     step[6, 1] = 0.005
     state = replace(state, belief=replace(state.belief, rig=state.belief.rig.retract(step)))
-    _, change = compare(rig_message(state))
+    _, change, _ = compare(belief_message(state))
     turned = np.linalg.norm(change[:, :3], axis=1)
     assert turned[6] == pytest.approx(0.005, rel=1e-3) and np.delete(turned, 6).max() < 1e-4

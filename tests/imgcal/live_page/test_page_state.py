@@ -47,11 +47,10 @@ def test_a_state_says_who_sees_and_what_is_off(board, o10, asymmetric8):
     assert np.shape(told["object"]) == (8, 3) and told["value"][0] == [None, None, None, 0.07]
     change = np.zeros((10, 15))
     change[4, 0] = np.deg2rad(0.3)
-    board.update_change(time.time(), board.greeting["arrangement"], change, o10.focal_length.numpy())
+    std = np.full((10, 15), 0.001)
+    board.update_change(time.time(), board.greeting["arrangement"], change, std, o10.focal_length.numpy())
     told = content(board.update("state", state_message(state, asymmetric8)))
-    assert told["value"][4][0] == pytest.approx(0.3) and told["sigma"][4][0] is None
-    board.update_advice({"median": 1.0}, np.full((10, 15), 0.001))
-    board.update_change(time.time(), board.greeting["arrangement"], change, o10.focal_length.numpy())
+    assert told["value"][4][0] == pytest.approx(0.3)
     assert board.contents()["history"]["fine"]["value"][4][0] == pytest.approx([0.3])
     assert content(board.update("state", state_message(state, asymmetric8)))["sigma"][4][1] == pytest.approx(0.001)
 

@@ -94,6 +94,20 @@ def test_a_calibrated_rig_expects_what_is_usual_until_it_knows_better() -> None:
     assert float(noise.time.max()) < 3
 
 
+@pytest.mark.parametrize("late", [6, 60, 120])
+def test_a_shift_that_has_begun_lately_is_no_persistent_error_yet(late: int) -> None:
+    noise = follow([0.9, 0.9], count=1024 - late)
+    before = noise.least_shifts[0]
+    shifted = torch.tensor([[1.0, 0.0]]).double().expand(1, 2, 5, 2)
+    for number in range(late):
+        noise.add(observations(), shifted + SIGMA * torch.randn(1, 2, 5, 2, generator=torch.manual_seed(number)))
+    assert noise.taken == 1024 and noise.least_shifts[0] < 1.3 * before
+    noise.settle((0, 1))  # the change has been found
+    for number in range(512):
+        noise.add(observations(), SIGMA * torch.randn(1, 2, 5, 2, generator=torch.manual_seed(number)))
+    assert noise.least_shifts[0] < 1.3 * before
+
+
 def test_a_camera_that_sees_nothing_for_long_has_the_noise_of_the_others() -> None:
     noise, rng, shift = NoiseCorrelation(3), np.random.default_rng(3), np.zeros((3, 2))
     seen = observations(3)

@@ -52,6 +52,26 @@ def test_a_change_of_the_object_is_told_and_learnt(fiducial: int | None, toleran
     assert float((off - off.mean(0)).norm(dim=-1).max()) < 0.1
 
 
+def test_a_single_camera_does_not_tell_a_change_of_the_object_from_a_wrong_label() -> None:
+    factory, obj, generator = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), torch.Generator().manual_seed(3)
+    truth = simulate_truth(factory, obj, 70, generator, PhysicalDrift())
+    monitor, points, told, found = RigMonitor(RigFilter(factory, obj)), obj.points.clone(), [], []
+    for s in range(70):
+        if s == 45:
+            points[2] += torch.tensor([3.0, -2.5, 3.0])
+        image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(points))
+        uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
+        seen = image.visible.clone()
+        if 45 <= s < 55:
+            seen[:, 1:] = False
+        there = Observations(uv, torch.full(uv.shape[:-1], NOISE, dtype=torch.float64), seen)
+        update = monitor.update(there, truth.rig_from_object[s : s + 1], 1 / 60)
+        told += update.changes
+        found += [] if update.object_change is None else [(s, update.object_change.fiducial)]
+    assert told == []
+    assert [fiducial for _, fiducial in found] == [2] and found[0][0] >= 55
+
+
 @pytest.mark.parametrize(("seed", "spread"), [(1, 1.0), (2, 1.0), (3, 4.0)])
 def test_another_object_of_the_same_design_is_told_as_that_and_no_camera_is_blamed(seed: int, spread: float) -> None:
     factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")

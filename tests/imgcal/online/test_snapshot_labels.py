@@ -10,6 +10,7 @@ import imgcal
 from imgcal.errors import RefusedError
 from imgcal.online import RigKeeper
 from imgcal.online.snapshot_labels import MOST_VAIN
+from imgcal.online.snapshot_update import learn_snapshot
 from imgcal.synthesis import simulate_board, true_detections
 from imgcal.types import Board, CalibrationObject
 from scripts.benchmarks.rig_streams import Conditions
@@ -94,3 +95,22 @@ def test_images_that_do_not_say_the_turn_of_a_board_are_learnt_from(board: Board
         assert keeper.update(turned.of_snapshots(s, s + 1), time=float(s)).refused is None
     assert keeper.noise < 0.05
     assert float((keeper.belief.rig.positions - rig.positions).norm(dim=-1).max()) < 0.5
+
+
+@pytest.mark.parametrize("first", [[0], [0, 1]])
+def test_cameras_that_see_the_object_for_the_first_time_may_be_as_far_off_as_the_factory_says(first: list[int]) -> None:
+    made = Remembered(conditions=Conditions(labelled=True, clutter=0.0, hidden=0.0))
+    usual = []
+    for _ in range(12):
+        blobs = made.blobs()
+        some = made.labelled(blobs.select(np.flatnonzero(np.isin(blobs.camera, first))))
+        learn_snapshot(made.memory, some.checked)
+    for _ in range(4):
+        every = made.labelled(made.blobs())
+        usual.append(every.checked.usual)
+        learn_snapshot(made.memory, every.checked)
+    assert usual[0] > made.memory.most_usual > usual[-1]
+    wrong = replace(made.blobs())
+    wrong.fiducial[:] = np.roll(np.arange(8), 3)[wrong.fiducial]
+    with pytest.raises(RefusedError, match="off in most cameras"):
+        made.labelled(wrong)
