@@ -31,6 +31,7 @@ CHANGES: Mapping[str, slice] = {kind: part for kind, part in PARAMETER_KINDS.ite
 FORMS = {**CHANGES, "tilt": slice(0, 2)}
 """The same, and a rotation about an axis in the image plane, as by the joints of a mount."""
 FORMS_OF = {kind: (kind, "tilt") if kind == "rotation" else (kind,) for kind in CHANGES}
+MOTION_KINDS, MOTION = ("rotation", "position"), slice(0, 6)
 JUMPS = (0.6, 6.0, 60.0, 600.0)
 """Pixels: prior standard deviations of a change, all equally probable. They are image shifts, whatever the kind of
 change, so that no kind is preferred."""
@@ -38,6 +39,9 @@ LARGE = 60.0
 """Pixels: the same for a camera that has moved, judged by the labels that it still has ..."""
 LENS = 60.0
 """... and the upper limit for focal length, principal point and distortion: no push changes them by more."""
+JOINT = 150.0
+"""Millimetres, one standard deviation per axis: distance between a camera's projection centre and the joint of its
+mount, about which it turns."""
 DISTORTED = 2e-4
 """Standard deviation of the distortion for each such pixel if the kind of change is unknown."""
 LEAST_LEARNT = 1e-6
@@ -78,6 +82,33 @@ def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = 
         std[camera, part] = jump * pixels[camera, part]
     std[:, 6:] *= min(1.0, LENS / jump)
     return std
+
+
+def possible_changes(camera: int, kind: str, pixels: Tensor) -> list[Tensor]:
+    """Describe what may have changed together with a kind of change, all equally probable.
+
+    A camera turns about a joint of its mount, which shifts it, or it turns and shifts in any way, or everything
+    changes; a lens changes alone, or with the camera's motion, or everything changes.
+
+    Args:
+        camera: that changed.
+        kind: of `CHANGES`.
+        pixels: (C, K) see `pixel_changes`.
+
+    Returns:
+        Prior standard deviations (C, K) for each possibility.
+    """
+    rotation, position, found = CHANGES["rotation"], CHANGES["position"], []
+    for jump in JUMPS:
+        alone = change_std({camera: kind}, pixels, jump)
+        everything = change_std({camera: None}, pixels, jump)
+        motion = torch.zeros_like(pixels)
+        motion[camera, MOTION] = everything[camera, MOTION]
+        about_joint = motion.clone()
+        about_joint[camera, position] = JOINT * motion[camera, rotation][0]
+        moved = (about_joint, motion) if kind in MOTION_KINDS else (alone, torch.maximum(alone, motion))
+        found += [*moved, everything]
+    return found
 
 
 def camera_change_errors(rig: CameraRig, unit: Tensor) -> Tensor:
@@ -188,13 +219,13 @@ class ChangeTest:
         """Log odds of the given changes (None = of any kind) against no change."""
         found = []
         for jump in JUMPS:
-            _, factor, pull = self._free(changes, jump)
-            found.append(0.5 * pull.square().sum() - factor.diagonal().log().sum() - math.log(len(JUMPS)))
+            _, factor, pull = self._free(change_std(changes, self.pixels, jump))
+            found.append(_log_odds(factor, pull) - math.log(len(JUMPS)))
         return float(torch.logsumexp(torch.stack(found), 0))
 
     def condition_on(self, changes: Mapping[int, str | None]) -> ChangeTest:
         """Test the other cameras, given that these may have changed."""
-        scaled, factor, pull = self._free(changes, LARGE)
+        scaled, factor, pull = self._free(change_std(changes, self.pixels))
         taken = torch.linalg.solve_triangular(factor, scaled, upper=False)
         return ChangeTest(self.pull - taken.mT @ pull, self.learnt - taken.mT @ taken, self.pixels, self.lasting)
 
@@ -205,20 +236,47 @@ class ChangeTest:
         covariance = torch.linalg.pinv(self.learnt[part, part], hermitian=True)
         return covariance @ self.pull[part], covariance
 
-    def _free(self, changes: Mapping[int, str | None], jump: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Describe the effect of R parameters that may have changed, in units of their standard deviations.
+    def estimate(self, camera: int, kind: str) -> tuple[Tensor, Tensor]:
+        """Estimate all changes of a camera by the mean over what may have changed with a kind, if no other changed.
+
+        Returns:
+            The changes (K,) and their covariance (K, K).
+        """
+        own = slice(camera * self.pixels.shape[1], (camera + 1) * self.pixels.shape[1])
+        odds, means, covariances = [], [], []
+        for std in possible_changes(camera, kind, self.pixels):
+            _, factor, pull = self._free(std)
+            rows = std.flatten().nonzero()[:, 0]
+            half = torch.zeros(len(factor), self.pixels.numel(), dtype=std.dtype)
+            half[:, rows] = torch.linalg.solve_triangular(factor, torch.diag(std.flatten()[rows]), upper=False)
+            odds.append(_log_odds(factor, pull))
+            means.append(half[:, own].mT @ pull)
+            covariances.append(half[:, own].mT @ half[:, own])
+        share, mean = torch.stack(odds).softmax(0), torch.stack(means)
+        estimate = share @ mean
+        between = mean - estimate
+        covariance = torch.einsum("m,mij->ij", share, torch.stack(covariances)) + (between.mT * share) @ between
+        return estimate, covariance
+
+    def _free(self, std: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Describe the effect of R parameters that may have changed, in units of their standard deviations (C, K).
 
         Returns:
             Covariance with all gradients (R, K C), Cholesky factor (R, R) of the covariance of their own, jump
             included, and the whitened gradient (R,).
         """
-        std = change_std(changes, self.pixels, jump).flatten()
+        std = std.flatten()
         rows = std.nonzero()[:, 0]
         scaled = std[rows, None] * self.learnt[rows]
         own = scaled[:, rows] * std[rows]
         factor = torch.linalg.cholesky(own + torch.eye(len(rows), dtype=std.dtype))
         pull = torch.linalg.solve_triangular(factor, (std * self.pull)[rows, None], upper=False)[:, 0]
         return scaled, factor, pull
+
+
+def _log_odds(factor: Tensor, pull: Tensor) -> Tensor:
+    """Log odds of changes against none, from what `ChangeTest._free` returns."""
+    return 0.5 * pull.square().sum() - factor.diagonal().log().sum()
 
 
 def _own_blocks(matrix: Tensor, cameras: int) -> Tensor:

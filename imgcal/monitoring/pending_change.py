@@ -162,8 +162,9 @@ class PendingChange:
         return tuple(decided), kinds
 
     def size(self, test: ChangeTest, camera: int, kind: str) -> tuple[float, float]:
-        """Size of a camera's change, assuming this kind alone, and its standard deviation."""
-        change, covariance = test.condition_on(self.others(camera)).jump(camera, kind)
+        """Size of a camera's change in a kind, whatever else has changed, and its standard deviation."""
+        every, joint = test.condition_on(self.others(camera)).estimate(camera, kind)
+        change, covariance = every[CHANGES[kind]], joint[CHANGES[kind], CHANGES[kind]]
         size = float(change.norm())
         along = change / max(size, 1e-30)
         return size, float((along @ covariance @ along).clamp_min(0).sqrt())
