@@ -31,6 +31,7 @@ CHANGES: Mapping[str, slice] = {kind: part for kind, part in PARAMETER_KINDS.ite
 FORMS = {**CHANGES, "tilt": slice(0, 2)}
 """The same, and a rotation about an axis in the image plane, as by the joints of a mount."""
 FORMS_OF = {kind: (kind, "tilt") if kind == "rotation" else (kind,) for kind in CHANGES}
+TURNS = ("rotation", "tilt")
 MOTION_KINDS, MOTION = ("rotation", "position"), slice(0, 6)
 JUMPS = (0.6, 6.0, 60.0, 600.0)
 """Pixels: prior standard deviations of a change, all equally probable. They are image shifts, whatever the kind of
@@ -71,6 +72,8 @@ def pixel_changes(rig: CameraRig) -> Tensor:
 def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = LARGE) -> Tensor:
     """Standard deviations (C, K) of changes, by camera and form (None = any); zero where nothing changes.
 
+    A camera that turns about a joint of its mount is also shifted, by the distance to the joint times the angle.
+
     Args:
         changes: form of the change, one of `FORMS`, of each camera that changed.
         pixels: (C, K) see `pixel_changes`.
@@ -80,6 +83,8 @@ def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = 
     for camera, kind in changes.items():
         part = slice(None) if kind is None else FORMS[kind]
         std[camera, part] = jump * pixels[camera, part]
+        if kind in TURNS:
+            std[camera, CHANGES["position"]] = JOINT * std[camera, 0]
     std[:, 6:] *= min(1.0, LENS / jump)
     return std
 
@@ -98,16 +103,13 @@ def possible_changes(camera: int, kind: str, pixels: Tensor) -> list[Tensor]:
     Returns:
         Prior standard deviations (C, K) for each possibility.
     """
-    rotation, position, found = CHANGES["rotation"], CHANGES["position"], []
+    found = []
     for jump in JUMPS:
-        alone = change_std({camera: kind}, pixels, jump)
+        simple = change_std({camera: "rotation" if kind in MOTION_KINDS else kind}, pixels, jump)
         everything = change_std({camera: None}, pixels, jump)
-        motion = torch.zeros_like(pixels)
-        motion[camera, MOTION] = everything[camera, MOTION]
-        about_joint = motion.clone()
-        about_joint[camera, position] = JOINT * motion[camera, rotation][0]
-        moved = (about_joint, motion) if kind in MOTION_KINDS else (alone, torch.maximum(alone, motion))
-        found += [*moved, everything]
+        with_motion = simple.clone()
+        with_motion[camera, MOTION] = everything[camera, MOTION]
+        found += [simple, with_motion, everything]
     return found
 
 

@@ -14,7 +14,9 @@ from imgcal.monitoring.case import mean_evidence
 from imgcal.monitoring.change_test import (
     CHANGES,
     FORMS_OF,
+    JOINT,
     LARGE,
+    TURNS,
     ChangeTest,
     Comparison,
     camera_change_errors,
@@ -177,11 +179,13 @@ class PendingChange:
         Returns:
             The belief before, the belief now, and its information (D, D), both without drift since.
         """
-        step = torch.zeros_like(self.before.unit)
+        step, std = torch.zeros_like(self.before.unit), change_std(self.kinds, pixel_changes(self.before.rig))
         for camera, kind in self.kinds.items():
             if kind is not None:
                 step[camera, CHANGES[kind]] = test.condition_on(self.others(camera)).jump(camera, kind)[0]
-        first = free_cameras(replace(self.before, rig=self.before.rig.retract(step)), self.kinds)
+            if kind in TURNS:
+                std[camera, CHANGES["position"]] = JOINT * step[camera, CHANGES[kind]].norm()
+        first = widen(replace(self.before, rig=self.before.rig.retract(step)), std.square())
         information = first.information + self.brought
         factor = torch.linalg.cholesky(information)
         pull = first.information @ self.distance(first) + self.weighted
