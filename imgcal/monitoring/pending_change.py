@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -16,6 +16,7 @@ from imgcal.monitoring.change_test import (
     FORMS_OF,
     JOINT,
     LARGE,
+    MOTION_KINDS,
     TURNS,
     ChangeTest,
     Comparison,
@@ -39,6 +40,8 @@ LENS_KINDS, LENS_LOG_PRIOR = ("focal_length", "principal_point"), -3.0
 """Changes of the lens alone, and their prior log odds against a rotation or a shift: bumps hit the camera."""
 LENS_REST = 2.0
 """A change of the lens alone is the main kind only if it leaves this many times less unexplained than other kinds."""
+CERTAIN_SIGMAS = 5.0
+"""Least size, in standard deviations, of another kind of motion that is reported beside the main kind."""
 DECIDE_AFTER = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """Numbers of snapshots since a change at which its kind is decided if possible."""
 
@@ -54,6 +57,8 @@ class Change:
     sigma: float  # one standard deviation of the size
     decided: bool = False  # this report is final
     evidence: float = math.nan  # chi-squared for "it stood still"; nan = not tested
+    also: tuple[tuple[str, float, float], ...] = field(default=(), metadata={"saved": False})
+    """Other kinds of motion that are certain, with size and standard deviation; only where the kind is decided."""
 
 
 @dataclass
@@ -153,23 +158,30 @@ class PendingChange:
         """
         decided, kinds = [], dict[int, str | None]()
         for camera, change in changes.items():
-            found = self.decide(test, camera, last)
-            if found is None:
+            decision = self.decide(test, camera, last)
+            if decision is None:
                 continue
-            kinds[camera], kind = found
-            size = (math.nan, math.nan) if kind is None else self.size(test, camera, kind)
+            kinds[camera], kind = decision
+            sizes = {} if kind is None else self.sizes(test, camera, kind)
+            size = sizes.pop(kind, (math.nan, math.nan))
             scores = test.condition_on(self.others(camera)).each.scores()
             evidence = max(float(scores[name][camera]) for name in ([kind] if kind else CHANGES))
-            decided.append(Change(camera, change.since, kind or "unknown", *size, decided=True, evidence=evidence))
+            motion = {one: sizes[one] for one in MOTION_KINDS if one in sizes}
+            also = tuple((one, *of) for one, of in motion.items() if of[0] >= CERTAIN_SIGMAS * of[1])
+            found = Change(camera, change.since, kind or "unknown", *size, decided=True, evidence=evidence, also=also)
+            decided.append(found)
         return tuple(decided), kinds
 
-    def size(self, test: ChangeTest, camera: int, kind: str) -> tuple[float, float]:
-        """Size of a camera's change in a kind, whatever else has changed, and its standard deviation."""
+    def sizes(self, test: ChangeTest, camera: int, kind: str) -> dict[str, tuple[float, float]]:
+        """Sizes of a camera's changes of all kinds, whatever changed beside this one, and their standard deviations."""
         every, joint = test.condition_on(self.others(camera)).estimate(camera, kind)
-        change, covariance = every[CHANGES[kind]], joint[CHANGES[kind], CHANGES[kind]]
-        size = float(change.norm())
-        along = change / max(size, 1e-30)
-        return size, float((along @ covariance @ along).clamp_min(0).sqrt())
+        found = {}
+        for name, part in CHANGES.items():
+            change, covariance = every[part], joint[part, part]
+            size = float(change.norm())
+            along = change / max(size, 1e-30)
+            found[name] = size, float((along @ covariance @ along).clamp_min(0).sqrt())
+        return found
 
     def adopt_kinds(self, test: ChangeTest) -> tuple[RigBelief, RigBelief, Tensor]:
         """Restrict the changes of cameras to the `kinds`.

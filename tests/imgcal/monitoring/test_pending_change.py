@@ -42,7 +42,7 @@ def test_the_kind_the_size_and_what_is_believed_then() -> None:
     assert (since.count, since.due, since.overdue) == (8, True, False)
     test = since.test(still)
     assert since.decide(test, 1, last=False) == ("focal_length", "focal_length")
-    size, sigma = since.size(test, 1, "focal_length")
+    size, sigma = since.sizes(test, 1, "focal_length")["focal_length"]
     assert abs(size - ZOOM) < 4 * sigma < ZOOM
     since.kinds[1] = "focal_length"
     first, belief, information = since.adopt_kinds(test)
