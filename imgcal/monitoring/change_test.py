@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.estimation import error_by_step
+from imgcal.estimation import MOUNT_JOINT, error_by_step
 from imgcal.types import PARAMETER_KINDS, CameraRig
 
 CHANGES: Mapping[str, slice] = {kind: part for kind, part in PARAMETER_KINDS.items() if kind != "distortion"}
@@ -40,9 +40,6 @@ LARGE = 60.0
 """Pixels: the same for a camera that has moved, judged by the labels that it still has ..."""
 LENS = 60.0
 """... and the upper limit for focal length, principal point and distortion: no push changes them by more."""
-JOINT = 150.0
-"""Millimetres, one standard deviation per axis: distance between a camera's projection centre and the joint of its
-mount, about which it turns."""
 DISTORTED = 2e-4
 """Standard deviation of the distortion for each such pixel if the kind of change is unknown."""
 LEAST_LEARNT = 1e-6
@@ -84,7 +81,7 @@ def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = 
         part = slice(None) if kind is None else FORMS[kind]
         std[camera, part] = jump * pixels[camera, part]
         if kind in TURNS:
-            std[camera, CHANGES["position"]] = JOINT * std[camera, 0]
+            std[camera, CHANGES["position"]] = MOUNT_JOINT * std[camera, 0]
     std[:, 6:] *= min(1.0, LENS / jump)
     return std
 

@@ -9,12 +9,11 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from imgcal.estimation import displace, error_between
+from imgcal.estimation import MOUNT_JOINT, displace, error_between
 from imgcal.monitoring.case import mean_evidence
 from imgcal.monitoring.change_test import (
     CHANGES,
     FORMS_OF,
-    JOINT,
     LARGE,
     MOTION_KINDS,
     TURNS,
@@ -196,7 +195,7 @@ class PendingChange:
             if kind is not None:
                 step[camera, CHANGES[kind]] = test.condition_on(self.others(camera)).jump(camera, kind)[0]
             if kind in TURNS:
-                std[camera, CHANGES["position"]] = JOINT * step[camera, CHANGES[kind]].norm()
+                std[camera, CHANGES["position"]] = MOUNT_JOINT * step[camera, CHANGES[kind]].norm()
         first = widen(replace(self.before, rig=self.before.rig.retract(step)), std.square())
         information = first.information + self.brought
         factor = torch.linalg.cholesky(information)
