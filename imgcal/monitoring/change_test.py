@@ -33,6 +33,8 @@ FORMS = {**CHANGES, "tilt": slice(0, 2)}
 FORMS_OF = {kind: (kind, "tilt") if kind == "rotation" else (kind,) for kind in CHANGES}
 TURNS = ("rotation", "tilt")
 MOTION_KINDS, MOTION = ("rotation", "position"), slice(0, 6)
+UNUSUAL_LOG_PRIOR = -5.0
+"""Prior log odds of a motion that is no turn about a joint, or a change of everything, against such a turn."""
 JUMPS = (0.6, 6.0, 60.0, 600.0)
 """Pixels: prior standard deviations of a change, all equally probable. They are image shifts, whatever the kind of
 change, so that no kind is preferred."""
@@ -86,27 +88,30 @@ def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = 
     return std
 
 
-def possible_changes(camera: int, kind: str, pixels: Tensor) -> list[Tensor]:
-    """Describe what may have changed together with a kind of change, all equally probable.
+def possible_changes(camera: int, kind: str, pixels: Tensor, angle: float) -> list[tuple[Tensor, float]]:
+    """Describe what may have changed together with a kind of change.
 
-    A camera turns about a joint of its mount, which shifts it, or it turns and shifts in any way, or everything
-    changes; a lens changes alone, or with the camera's motion, or everything changes.
+    A camera turns about a joint of its mount, which shifts it; a lens changes alone. Less probably, the camera turned
+    and was shifted in any way, or everything changed.
 
     Args:
         camera: that changed.
         kind: of `CHANGES`.
         pixels: (C, K) see `pixel_changes`.
+        angle: rad, by which it has turned roughly.
 
     Returns:
-        Prior standard deviations (C, K) for each possibility.
+        Prior standard deviations (C, K) for each possibility, and its log prior odds.
     """
     found = []
     for jump in JUMPS:
-        simple = change_std({camera: "rotation" if kind in MOTION_KINDS else kind}, pixels, jump)
+        usual = change_std({camera: "rotation" if kind in MOTION_KINDS else kind}, pixels, jump)
         everything = change_std({camera: None}, pixels, jump)
-        with_motion = simple.clone()
-        with_motion[camera, MOTION] = everything[camera, MOTION]
-        found += [simple, with_motion, everything]
+        any_motion = usual.clone()
+        any_motion[camera, MOTION] = everything[camera, MOTION]
+        if kind in MOTION_KINDS:
+            usual[camera, CHANGES["position"]] = MOUNT_JOINT * angle
+        found += [(usual, 0.0), (any_motion, UNUSUAL_LOG_PRIOR), (everything, UNUSUAL_LOG_PRIOR)]
     return found
 
 
@@ -243,12 +248,13 @@ class ChangeTest:
         """
         own = slice(camera * self.pixels.shape[1], (camera + 1) * self.pixels.shape[1])
         odds, means, covariances = [], [], []
-        for std in possible_changes(camera, kind, self.pixels):
+        angle = float(self.jump(camera, "rotation")[0].norm())
+        for std, prior in possible_changes(camera, kind, self.pixels, angle):
             _, factor, pull = self._free(std)
             rows = std.flatten().nonzero()[:, 0]
             half = torch.zeros(len(factor), self.pixels.numel(), dtype=std.dtype)
             half[:, rows] = torch.linalg.solve_triangular(factor, torch.diag(std.flatten()[rows]), upper=False)
-            odds.append(_log_odds(factor, pull))
+            odds.append(_log_odds(factor, pull) + prior)
             means.append(half[:, own].mT @ pull)
             covariances.append(half[:, own].mT @ half[:, own])
         share, mean = torch.stack(odds).softmax(0), torch.stack(means)
