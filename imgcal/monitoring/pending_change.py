@@ -162,7 +162,7 @@ class PendingChange:
                 continue
             kinds[camera], kind = decision
             sizes = {} if kind is None else self.sizes(test, camera, kind)
-            size = sizes.pop(kind, (math.nan, math.nan))
+            size = (math.nan, math.nan) if kind is None else sizes.pop(kind)
             scores = test.condition_on(self.others(camera)).each.scores()
             evidence = max(float(scores[name][camera]) for name in ([kind] if kind else CHANGES))
             motion = {one: sizes[one] for one in MOTION_KINDS if one in sizes}
