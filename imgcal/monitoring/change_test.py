@@ -32,7 +32,9 @@ FORMS = {**CHANGES, "tilt": slice(0, 2)}
 """The same, and a rotation about an axis in the image plane, as by the joints of a mount."""
 FORMS_OF = {kind: (kind, "tilt") if kind == "rotation" else (kind,) for kind in CHANGES}
 TURNS = ("rotation", "tilt")
+"""Forms in which a camera turns about a joint of its mount."""
 MOTION_KINDS, MOTION = ("rotation", "position"), slice(0, 6)
+"""Kinds of change that move the camera, and the parameters that they cover."""
 UNUSUAL_LOG_PRIOR = -5.0
 """Prior log odds of a motion that is no turn about a joint, or a change of everything, against such a turn."""
 JUMPS = (0.6, 6.0, 60.0, 600.0)
