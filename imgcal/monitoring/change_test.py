@@ -16,7 +16,7 @@ Systems", 1976; Hausman, "Specification Tests in Econometrics", 1978.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -35,8 +35,10 @@ TURNS = ("rotation", "tilt")
 """Forms in which a camera turns about a joint of its mount."""
 MOTION_KINDS, MOTION = ("rotation", "position"), slice(0, 6)
 """Kinds of change that move the camera, and the parameters that they cover."""
-UNUSUAL_LOG_PRIOR = -5.0
-"""Prior log odds of a motion that is no turn about a joint, or a change of everything, against such a turn."""
+UNUSUAL_LOG_PRIOR, UNUSUAL_SHARE = -30.0, 0.05
+"""Prior log odds of a motion that is no turn about a joint, or a change of everything, against such a turn; and share of
+the evidence that it must explain in addition: errors of lenses and labels explain as much where the object was seen
+briefly."""
 JUMPS = (0.6, 6.0, 60.0, 600.0)
 """Pixels: prior standard deviations of a change, all equally probable. They are image shifts, whatever the kind of
 change, so that no kind is preferred."""
@@ -90,7 +92,7 @@ def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = 
     return std
 
 
-def possible_changes(camera: int, kind: str, pixels: Tensor, angle: float) -> list[tuple[Tensor, float]]:
+def possible_changes(camera: int, kind: str, pixels: Tensor, angle: float) -> list[tuple[Tensor, bool]]:
     """Describe what may have changed together with a kind of change.
 
     A camera turns about a joint of its mount, which shifts it; a lens changes alone. Less probably, the camera turned
@@ -103,7 +105,7 @@ def possible_changes(camera: int, kind: str, pixels: Tensor, angle: float) -> li
         angle: rad, by which it has turned roughly.
 
     Returns:
-        Prior standard deviations (C, K) for each possibility, and its log prior odds.
+        Prior standard deviations (C, K) for each possibility, and whether it is unusual.
     """
     found = []
     for jump in JUMPS:
@@ -113,7 +115,9 @@ def possible_changes(camera: int, kind: str, pixels: Tensor, angle: float) -> li
         any_motion[camera, MOTION] = everything[camera, MOTION]
         if kind in MOTION_KINDS:
             usual[camera, CHANGES["position"]] = MOUNT_JOINT * angle
-        found += [(usual, 0.0), (any_motion, UNUSUAL_LOG_PRIOR), (everything, UNUSUAL_LOG_PRIOR)]
+        found += [(usual, False), (any_motion, True), (everything, True)]
+        if kind == "position":
+            found.append((change_std({camera: kind}, pixels, jump), False))
     return found
 
 
@@ -248,22 +252,36 @@ class ChangeTest:
         Returns:
             The changes (K,) and their covariance (K, K).
         """
+        turns = [change_std({camera: "rotation"}, self.pixels, jump) for jump in JUMPS]
+        for std in turns:
+            std[camera, CHANGES["position"]] = 0.0
+        turn, _ = self._average(camera, [(std, False) for std in turns])
+        return self._average(camera, possible_changes(camera, kind, self.pixels, float(turn[:3].norm())))
+
+    def _average(self, camera: int, possibilities: Sequence[tuple[Tensor, bool]]) -> tuple[Tensor, Tensor]:
+        """Average a camera's changes (K,) over possible ones, with their covariance (K, K); see `possible_changes`.
+
+        What all other possibilities would explain beyond these is an error of the model, and makes them less certain.
+        """
         own = slice(camera * self.pixels.shape[1], (camera + 1) * self.pixels.shape[1])
-        odds, means, covariances = [], [], []
-        angle = float(self.jump(camera, "rotation")[0].norm())
-        for std, prior in possible_changes(camera, kind, self.pixels, angle):
+        evidence, means, covariances = [], [], []
+        for std, _ in possibilities:
             _, factor, pull = self._free(std)
             rows = std.flatten().nonzero()[:, 0]
             half = torch.zeros(len(factor), self.pixels.numel(), dtype=std.dtype)
             half[:, rows] = torch.linalg.solve_triangular(factor, torch.diag(std.flatten()[rows]), upper=False)
-            odds.append(_log_odds(factor, pull) + prior)
+            evidence.append(_log_odds(factor, pull))
             means.append(half[:, own].mT @ pull)
             covariances.append(half[:, own].mT @ half[:, own])
-        share, mean = torch.stack(odds).softmax(0), torch.stack(means)
+        odds, unusual = torch.stack(evidence), torch.tensor([unusual for _, unusual in possibilities])
+        penalty = UNUSUAL_SHARE * odds[~unusual].max().clamp_min(0) - UNUSUAL_LOG_PRIOR
+        share, mean = (odds - penalty * unusual).softmax(0), torch.stack(means)
+        unexplained = odds.max() - share @ odds + UNUSUAL_LOG_PRIOR
+        inflation = (2 * unexplained / self.pixels.shape[1]).clamp_min(1.0)
         estimate = share @ mean
         between = mean - estimate
-        covariance = torch.einsum("m,mij->ij", share, torch.stack(covariances)) + (between.mT * share) @ between
-        return estimate, covariance
+        within = inflation * torch.einsum("m,mij->ij", share, torch.stack(covariances))
+        return estimate, within + (between.mT * share) @ between
 
     def _free(self, std: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Describe the effect of R parameters that may have changed, in units of their standard deviations (C, K).
