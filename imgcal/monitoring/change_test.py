@@ -36,9 +36,9 @@ TURNS = ("rotation", "tilt")
 MOTION_KINDS, MOTION = ("rotation", "position"), slice(0, 6)
 """Kinds of change that move the camera, and the parameters that they cover."""
 UNUSUAL_LOG_PRIOR, UNUSUAL_SHARE = -30.0, 0.05
-"""Prior log odds of a motion that is no turn about a joint, or a change of everything, against such a turn; and share of
-the evidence that it must explain in addition: errors of lenses and labels explain as much where the object was seen
-briefly."""
+"""Prior log odds of a motion that is no turn about a joint, or a change of everything, against such a turn; and the
+share of the evidence that it must explain in addition: where the object was seen briefly, errors of lenses and labels
+explain as much."""
 JUMPS = (0.6, 6.0, 60.0, 600.0)
 """Pixels: prior standard deviations of a change, all equally probable. They are image shifts, whatever the kind of
 change, so that no kind is preferred."""
