@@ -43,7 +43,7 @@ from .map_estimate import (
     object_prior_std,
 )
 from .map_operator import encode_options, map_state, prepend_lenses, split_lenses
-from .moves import find_moves, longest_episode
+from .moves import MOUNT_JOINT, find_moves, longest_episode
 from .object_shape import SNAPSHOTS_TO_BEND, FiducialOffset, ScaleEvidence, ShapeEvidence, offsets
 from .pose_initialization import initial_pose
 from .pose_support import UNPOSED, UndeterminedPosesError, has_poses, require_poses
@@ -65,6 +65,7 @@ __all__ = [
     "LEAST_SNAPSHOTS",
     "MAP_DEPTHS",
     "MAP_SIZE",
+    "MOUNT_JOINT",
     "POSE_PARAMETERS",
     "SNAPSHOTS_TO_BEND",
     "UNPOSED",

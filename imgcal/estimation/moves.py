@@ -78,6 +78,11 @@ KINDS: dict[Kind, tuple[slice, float]] = {
 """Values of a camera by kind, and the factor from their norm to the reported size: degrees, mm, px along one axis."""
 
 MOTION = slice(0, 6)  # rotation and position
+MOUNT_JOINT = 150.0
+"""Millimetres, one standard deviation per axis: distance between a camera's projection centre and the joint of its
+mount, about which it turns."""
+FAR_JOINT = 3.0
+"""Standard deviations beyond which a camera was shifted by more than its turn about a joint explains."""
 
 Array = NDArray[np.float64]
 
@@ -242,19 +247,49 @@ class Change:
 
     @property
     def is_certain(self) -> bool:
-        """Check that its size is significant, unlike that of the small steps that lens errors cause."""
-        _, size, sigma = self.size()
+        """Check that its main kind alone is significant, unlike that of the small steps that lens errors cause."""
+        size, sigma = self._measure(self._main_kind, KINDS[self._main_kind][0])
         return size >= LEAST_SIGMAS * sigma
 
     def size(self) -> tuple[Kind, float, float]:
-        """Kind, size and standard deviation, for the one kind of values that explains the difference best."""
-        kind = max(KINDS, key=lambda name: self.gain(KINDS[name][0]))
+        """Kind, size and standard deviation, for the one kind of values that explains the difference best.
+
+        A camera that turns about a joint of its mount is shifted with it, and one that is shifted may turn.
+        """
+        kind = self._main_kind
+        if kind not in ("rotation", "position"):
+            return kind, *self._measure(kind, KINDS[kind][0])
+        precision = np.zeros(MOTION.stop)
+        if kind == "rotation":
+            angle = math.radians(self._measure(kind, KINDS[kind][0])[0])
+            position = KINDS["position"][0]
+            precision[position] = (self.prior_std[position] / (MOUNT_JOINT * angle)) ** 2
+            change = np.linalg.solve(self.information[MOTION, MOTION] + np.diag(precision), self.pull[MOTION])
+            if change @ (precision * change) > FAR_JOINT**2:
+                precision[:] = 0
+        return kind, *self._measure(kind, MOTION, precision)
+
+    @property
+    def _main_kind(self) -> Kind:
+        return max(KINDS, key=lambda name: self.gain(KINDS[name][0]))
+
+    def _measure(self, kind: Kind, free: slice, precision: Array | float = 0.0) -> tuple[float, float]:
+        """Size of a kind of change, and its standard deviation, if some values may differ.
+
+        Args:
+            kind: of `KINDS`.
+            free: the values that may differ, those of the kind included.
+            precision: inverse prior variances of their whitened differences.
+        """
         part, unit = KINDS[kind]
-        alone, scale = np.linalg.inv(self.information[part, part]), unit * self.prior_std[part]
-        change = alone @ self.pull[part] * scale
+        own, scale = slice(part.start - free.start, part.stop - free.start), unit * self.prior_std[part]
+        covariance = np.linalg.inv(
+            self.information[free, free] + np.diag(np.broadcast_to(precision, free.stop - free.start))
+        )
+        change = (covariance @ self.pull[free])[own] * scale
         length = float(np.linalg.norm(change))
         direction = change / max(length, 1e-30)
-        return kind, length, float(direction @ (alone * scale * scale[:, None]) @ direction) ** 0.5
+        return length, float(direction @ (covariance[own, own] * scale * scale[:, None]) @ direction) ** 0.5
 
 
 def longest_episode(problem: Problem, state: State, camera: int, moment: NDArray[np.int64]) -> int:

@@ -16,14 +16,14 @@ Systems", 1976; Hausman, "Specification Tests in Econometrics", 1978.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from imgcal.errors import RefusedError
-from imgcal.estimation import error_by_step
+from imgcal.estimation import MOUNT_JOINT, error_by_step
 from imgcal.types import PARAMETER_KINDS, CameraRig
 
 CHANGES: Mapping[str, slice] = {kind: part for kind, part in PARAMETER_KINDS.items() if kind != "distortion"}
@@ -31,6 +31,14 @@ CHANGES: Mapping[str, slice] = {kind: part for kind, part in PARAMETER_KINDS.ite
 FORMS = {**CHANGES, "tilt": slice(0, 2)}
 """The same, and a rotation about an axis in the image plane, as by the joints of a mount."""
 FORMS_OF = {kind: (kind, "tilt") if kind == "rotation" else (kind,) for kind in CHANGES}
+TURNS = ("rotation", "tilt")
+"""Forms in which a camera turns about a joint of its mount."""
+MOTION_KINDS, MOTION = ("rotation", "position"), slice(0, 6)
+"""Kinds of change that move the camera, and the parameters that they cover."""
+UNUSUAL_LOG_PRIOR, UNUSUAL_SHARE = -30.0, 0.05
+"""Prior log odds of a motion that is no turn about a joint, or a change of everything, against such a turn; and the
+share of the evidence that it must explain in addition: where the object was seen briefly, errors of lenses and labels
+explain as much."""
 JUMPS = (0.6, 6.0, 60.0, 600.0)
 """Pixels: prior standard deviations of a change, all equally probable. They are image shifts, whatever the kind of
 change, so that no kind is preferred."""
@@ -67,6 +75,8 @@ def pixel_changes(rig: CameraRig) -> Tensor:
 def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = LARGE) -> Tensor:
     """Standard deviations (C, K) of changes, by camera and form (None = any); zero where nothing changes.
 
+    A camera that turns about a joint of its mount is also shifted, by the distance to the joint times the angle.
+
     Args:
         changes: form of the change, one of `FORMS`, of each camera that changed.
         pixels: (C, K) see `pixel_changes`.
@@ -76,8 +86,39 @@ def change_std(changes: Mapping[int, str | None], pixels: Tensor, jump: float = 
     for camera, kind in changes.items():
         part = slice(None) if kind is None else FORMS[kind]
         std[camera, part] = jump * pixels[camera, part]
+        if kind in TURNS:
+            std[camera, CHANGES["position"]] = MOUNT_JOINT * std[camera, 0]
     std[:, 6:] *= min(1.0, LENS / jump)
     return std
+
+
+def possible_changes(camera: int, kind: str, pixels: Tensor, angle: float) -> list[tuple[Tensor, bool]]:
+    """Describe what may have changed together with a kind of change.
+
+    A camera turns about a joint of its mount, which shifts it; a lens changes alone. Less probably, the camera turned
+    and was shifted in any way, or everything changed.
+
+    Args:
+        camera: that changed.
+        kind: of `CHANGES`.
+        pixels: (C, K) see `pixel_changes`.
+        angle: rad, by which it has turned roughly.
+
+    Returns:
+        Prior standard deviations (C, K) for each possibility, and whether it is unusual.
+    """
+    found = []
+    for jump in JUMPS:
+        usual = change_std({camera: "rotation" if kind in MOTION_KINDS else kind}, pixels, jump)
+        everything = change_std({camera: None}, pixels, jump)
+        any_motion = usual.clone()
+        any_motion[camera, MOTION] = everything[camera, MOTION]
+        if kind in MOTION_KINDS:
+            usual[camera, CHANGES["position"]] = MOUNT_JOINT * angle
+        found += [(usual, False), (any_motion, True), (everything, True)]
+        if kind == "position":
+            found.append((change_std({camera: kind}, pixels, jump), False))
+    return found
 
 
 def camera_change_errors(rig: CameraRig, unit: Tensor) -> Tensor:
@@ -188,13 +229,13 @@ class ChangeTest:
         """Log odds of the given changes (None = of any kind) against no change."""
         found = []
         for jump in JUMPS:
-            _, factor, pull = self._free(changes, jump)
-            found.append(0.5 * pull.square().sum() - factor.diagonal().log().sum() - math.log(len(JUMPS)))
+            _, factor, pull = self._free(change_std(changes, self.pixels, jump))
+            found.append(_log_odds(factor, pull) - math.log(len(JUMPS)))
         return float(torch.logsumexp(torch.stack(found), 0))
 
     def condition_on(self, changes: Mapping[int, str | None]) -> ChangeTest:
         """Test the other cameras, given that these may have changed."""
-        scaled, factor, pull = self._free(changes, LARGE)
+        scaled, factor, pull = self._free(change_std(changes, self.pixels))
         taken = torch.linalg.solve_triangular(factor, scaled, upper=False)
         return ChangeTest(self.pull - taken.mT @ pull, self.learnt - taken.mT @ taken, self.pixels, self.lasting)
 
@@ -205,20 +246,62 @@ class ChangeTest:
         covariance = torch.linalg.pinv(self.learnt[part, part], hermitian=True)
         return covariance @ self.pull[part], covariance
 
-    def _free(self, changes: Mapping[int, str | None], jump: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Describe the effect of R parameters that may have changed, in units of their standard deviations.
+    def estimate(self, camera: int, kind: str) -> tuple[Tensor, Tensor]:
+        """Estimate all changes of a camera by the mean over what may have changed with a kind, if no other changed.
+
+        Returns:
+            The changes (K,) and their covariance (K, K).
+        """
+        turns = [change_std({camera: "rotation"}, self.pixels, jump) for jump in JUMPS]
+        for std in turns:
+            std[camera, CHANGES["position"]] = 0.0
+        turn, _ = self._average(camera, [(std, False) for std in turns])
+        return self._average(camera, possible_changes(camera, kind, self.pixels, float(turn[:3].norm())))
+
+    def _average(self, camera: int, possibilities: Sequence[tuple[Tensor, bool]]) -> tuple[Tensor, Tensor]:
+        """Average a camera's changes (K,) over possible ones, with their covariance (K, K); see `possible_changes`.
+
+        What all other possibilities would explain beyond these is an error of the model, and makes them less certain.
+        """
+        own = slice(camera * self.pixels.shape[1], (camera + 1) * self.pixels.shape[1])
+        evidence, means, covariances = [], [], []
+        for std, _ in possibilities:
+            _, factor, pull = self._free(std)
+            rows = std.flatten().nonzero()[:, 0]
+            half = torch.zeros(len(factor), self.pixels.numel(), dtype=std.dtype)
+            half[:, rows] = torch.linalg.solve_triangular(factor, torch.diag(std.flatten()[rows]), upper=False)
+            evidence.append(_log_odds(factor, pull))
+            means.append(half[:, own].mT @ pull)
+            covariances.append(half[:, own].mT @ half[:, own])
+        odds, unusual = torch.stack(evidence), torch.tensor([unusual for _, unusual in possibilities])
+        penalty = UNUSUAL_SHARE * odds[~unusual].max().clamp_min(0) - UNUSUAL_LOG_PRIOR
+        share, mean = (odds - penalty * unusual).softmax(0), torch.stack(means)
+        unexplained = odds.max() - share @ odds + UNUSUAL_LOG_PRIOR
+        inflation = (2 * unexplained / self.pixels.shape[1]).clamp_min(1.0)
+        estimate = share @ mean
+        between = mean - estimate
+        within = inflation * torch.einsum("m,mij->ij", share, torch.stack(covariances))
+        return estimate, within + (between.mT * share) @ between
+
+    def _free(self, std: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Describe the effect of R parameters that may have changed, in units of their standard deviations (C, K).
 
         Returns:
             Covariance with all gradients (R, K C), Cholesky factor (R, R) of the covariance of their own, jump
             included, and the whitened gradient (R,).
         """
-        std = change_std(changes, self.pixels, jump).flatten()
+        std = std.flatten()
         rows = std.nonzero()[:, 0]
         scaled = std[rows, None] * self.learnt[rows]
         own = scaled[:, rows] * std[rows]
         factor = torch.linalg.cholesky(own + torch.eye(len(rows), dtype=std.dtype))
         pull = torch.linalg.solve_triangular(factor, (std * self.pull)[rows, None], upper=False)[:, 0]
         return scaled, factor, pull
+
+
+def _log_odds(factor: Tensor, pull: Tensor) -> Tensor:
+    """Log odds of changes against none, from what `ChangeTest._free` returns."""
+    return 0.5 * pull.square().sum() - factor.diagonal().log().sum()
 
 
 def _own_blocks(matrix: Tensor, cameras: int) -> Tensor:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
-from imgcal.estimation import displace, error_between
+from imgcal.estimation import MOUNT_JOINT, displace, error_between
 from imgcal.monitoring.case import mean_evidence
 from imgcal.monitoring.change_test import (
     CHANGES,
     FORMS_OF,
     LARGE,
+    MOTION_KINDS,
+    TURNS,
     ChangeTest,
     Comparison,
     camera_change_errors,
@@ -37,6 +39,8 @@ LENS_KINDS, LENS_LOG_PRIOR = ("focal_length", "principal_point"), -3.0
 """Changes of the lens alone, and their prior log odds against a rotation or a shift: bumps hit the camera."""
 LENS_REST = 2.0
 """A change of the lens alone is the main kind only if it leaves this many times less unexplained than other kinds."""
+CERTAIN_SIGMAS = 5.0
+"""Least size, in standard deviations, of another kind of motion that is reported beside the main kind."""
 DECIDE_AFTER = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """Numbers of snapshots since a change at which its kind is decided if possible."""
 
@@ -52,6 +56,8 @@ class Change:
     sigma: float  # one standard deviation of the size
     decided: bool = False  # this report is final
     evidence: float = math.nan  # chi-squared for "it stood still"; nan = not tested
+    also: tuple[tuple[str, float, float], ...] = field(default=(), metadata={"saved": False})
+    """Other kinds of motion that are certain, with size and standard deviation; only where the kind is decided."""
 
 
 @dataclass
@@ -151,22 +157,30 @@ class PendingChange:
         """
         decided, kinds = [], dict[int, str | None]()
         for camera, change in changes.items():
-            found = self.decide(test, camera, last)
-            if found is None:
+            decision = self.decide(test, camera, last)
+            if decision is None:
                 continue
-            kinds[camera], kind = found
-            size = (math.nan, math.nan) if kind is None else self.size(test, camera, kind)
+            kinds[camera], kind = decision
+            sizes = {} if kind is None else self.sizes(test, camera, kind)
+            size = (math.nan, math.nan) if kind is None else sizes.pop(kind)
             scores = test.condition_on(self.others(camera)).each.scores()
             evidence = max(float(scores[name][camera]) for name in ([kind] if kind else CHANGES))
-            decided.append(Change(camera, change.since, kind or "unknown", *size, decided=True, evidence=evidence))
+            motion = {one: sizes[one] for one in MOTION_KINDS if one in sizes}
+            also = tuple((one, *of) for one, of in motion.items() if of[0] >= CERTAIN_SIGMAS * of[1])
+            found = Change(camera, change.since, kind or "unknown", *size, decided=True, evidence=evidence, also=also)
+            decided.append(found)
         return tuple(decided), kinds
 
-    def size(self, test: ChangeTest, camera: int, kind: str) -> tuple[float, float]:
-        """Size of a camera's change, assuming this kind alone, and its standard deviation."""
-        change, covariance = test.condition_on(self.others(camera)).jump(camera, kind)
-        size = float(change.norm())
-        along = change / max(size, 1e-30)
-        return size, float((along @ covariance @ along).clamp_min(0).sqrt())
+    def sizes(self, test: ChangeTest, camera: int, kind: str) -> dict[str, tuple[float, float]]:
+        """Sizes of a camera's changes of all kinds, whatever changed beside this one, and their standard deviations."""
+        every, joint = test.condition_on(self.others(camera)).estimate(camera, kind)
+        found = {}
+        for name, part in CHANGES.items():
+            change, covariance = every[part], joint[part, part]
+            size = float(change.norm())
+            along = change / max(size, 1e-30)
+            found[name] = size, float((along @ covariance @ along).clamp_min(0).sqrt())
+        return found
 
     def adopt_kinds(self, test: ChangeTest) -> tuple[RigBelief, RigBelief, Tensor]:
         """Restrict the changes of cameras to the `kinds`.
@@ -176,11 +190,13 @@ class PendingChange:
         Returns:
             The belief before, the belief now, and its information (D, D), both without drift since.
         """
-        step = torch.zeros_like(self.before.unit)
+        step, std = torch.zeros_like(self.before.unit), change_std(self.kinds, pixel_changes(self.before.rig))
         for camera, kind in self.kinds.items():
             if kind is not None:
                 step[camera, CHANGES[kind]] = test.condition_on(self.others(camera)).jump(camera, kind)[0]
-        first = free_cameras(replace(self.before, rig=self.before.rig.retract(step)), self.kinds)
+            if kind in TURNS:
+                std[camera, CHANGES["position"]] = MOUNT_JOINT * step[camera, CHANGES[kind]].norm()
+        first = widen(replace(self.before, rig=self.before.rig.retract(step)), std.square())
         information = first.information + self.brought
         factor = torch.linalg.cholesky(information)
         pull = first.information @ self.distance(first) + self.weighted

@@ -51,7 +51,8 @@ class Relearning:
         name = self.names[change.camera]
         unit, scale = SHOWN_UNITS.get(kind, (None, 1.0))
         size, sigma = (None, None) if unit is None else (change.size * scale, change.sigma * scale)
-        how = HOW[kind] if size is None else f"{HOW[kind]} {size:.3g} +- {sigma:.1g} {unit}"
+        parts = ((kind, change.size, change.sigma), *change.also)
+        how = HOW[kind] if size is None else " and ".join(_describe(*part) for part in parts)
         evidence = change.evidence if math.isfinite(change.evidence) else None
         message = f"{name} {how}"
         if len(self.names) == 2:
@@ -84,19 +85,24 @@ class Relearning:
             if camera in best_known or bool(known.all()):
                 event = self.events.pop(camera)
                 del self.before[camera]
-                sigma = change_sigma(std[camera], event.change)
-                how_well = "" if sigma is None else f" to +- {sigma:.2g} {event.unit}"
+                accuracy = change_sigma(std[camera], event.change)
+                how_well = "" if accuracy is None else f" to +- {accuracy:.2g} {event.unit}"
                 events.append(
                     replace(
                         event,
                         time=time,
                         snapshot=number,
                         kind="relearnt",
-                        sigma=sigma,
                         message=f"{event.message}; known again{how_well}",
                     )
                 )
         return events
+
+
+def _describe(kind: str, size: float, sigma: float) -> str:
+    """Say what a camera did, for example "turned 0.3 +- 0.01 deg"."""
+    unit, scale = SHOWN_UNITS[kind]
+    return f"{HOW[kind]} {size * scale:.3g} +- {sigma * scale:.1g} {unit}"  # type: ignore[index]
 
 
 def relative_std(belief: RigBelief) -> Tensor:

@@ -60,10 +60,10 @@ function holds(event) { // whether what an event reports is still so
 }
 function readable(event) { // in the past tense once it is over
   if (PAST[event.kind] && !holds(event)) return `${event.camera} ${PAST[event.kind]}`;
-  const text = event.message.replaceAll(" +- ", " ± ").replace(/; known again.*$/, ""), when = event.since === null ? "" : ` at ${clock(event.since)}`;
+  const [text, again = ""] = event.message.replaceAll(" +- ", " ± ").split("; known again"), when = event.since === null ? "" : ` at ${clock(event.since)}`;
   if (event.kind === "moved") return text + when;
   if (event.kind !== "relearnt") return text;
-  return `${text}${when}; known again${event.sigma === null ? "" : ` to ±${digits(event.sigma)} ${event.unit}`}`;
+  return `${text}${when}; known again${again.replace("± ", "±")}`;
 }
 const shortClock = (seconds) => clock(seconds).slice(0, 5);
 const plural = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;

@@ -29,7 +29,9 @@ def test_a_camera_is_known_again_when_it_is_known_as_well_as_before() -> None:
     assert relearning.report_relearnt(known, frozenset({1}), frozenset(), 1.3, 12) == []
     (learnt,) = relearning.report_relearnt(known, frozenset(), frozenset(), 1.4, 16)
     assert (learnt.kind, learnt.camera, learnt.since, learnt.snapshot) == ("relearnt", "cam02", 1.0, 16)
-    assert learnt.sigma == pytest.approx(change_sigma(relative_std(known)[1], "rotation"))
+    assert (learnt.size, learnt.sigma) == (told.size, told.sigma)  # the size is no better known than before
+    accuracy = change_sigma(relative_std(known)[1], "rotation")
+    assert learnt.message == f"cam02 turned 0.3 +- 0.01 deg; known again to +- {accuracy:.2g} deg"
     assert relearning.events == {}
 
 
@@ -38,3 +40,11 @@ def test_of_two_cameras_it_is_said_that_it_may_be_the_other() -> None:
     change = Change(1, 0, "unknown", math.nan, math.nan)
     told = Relearning(rig.camera_names).report_change(change, 1.0, 1.1, 4, RigBelief.of_prior(rig, obj))
     assert told.message == "cam03 moved, or cam01: with two cameras it is impossible to tell which"
+
+
+def test_a_shift_beside_a_turn_is_reported_in_the_message() -> None:
+    rig, obj = imgcal.load_rig("T4").to(torch.float64), imgcal.load_object("asymmetric8")
+    change = Change(1, 0, "rotation", math.radians(5), math.radians(0.02), also=(("position", 12.34, 0.52),))
+    told = Relearning(rig.camera_names).report_change(change, 1.0, 1.1, 4, RigBelief.of_prior(rig, obj))
+    assert told.message == "cam02 turned 5 +- 0.02 deg and was shifted by 12.3 +- 0.5 mm"
+    assert (told.change, told.unit) == ("rotation", "deg")
