@@ -28,12 +28,12 @@ from imgcal.formats import (
     vicon,
 )
 from imgcal.formats.file_storage import is_matrix, merge_storages
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, known_points
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, coinciding_cameras, known_points
 from imgcal.formats.format import Files, Format
 from imgcal.formats.limits import ROUNDING
 from imgcal.formats.source import Source
 from imgcal.io import is_file_name
-from imgcal.messages import with_article
+from imgcal.messages import name_cameras, with_article
 from imgcal.types import limits
 
 FORMATS = (  # asked in this order: who knows a file by more comes before who knows it by less
@@ -81,7 +81,8 @@ def read_foreign_rig(
         InputError: one line with the file, what it is and what it lacks.
     """
     source = Source([Path(one) for one in ([paths] if isinstance(paths, str | Path) else paths)], rig)
-    return _read(source, recognize_format(source) if name is None else _check_requested(source, find_format(name)))
+    one = recognize_format(source) if name is None else _check_requested(source, find_format(name))
+    return _check_placed(_read(source, one), source, one)
 
 
 def read_foreign_lenses(path: str | Path, name: str | None = None) -> ForeignRig:
@@ -218,6 +219,26 @@ def _read(source: Source, one: Format) -> ForeignRig:
     if len(rig.cameras) > limits.MOST_CAMERAS:
         raise InputError(f"{source.where}: found {len(rig.cameras)} cameras, expected at most {limits.MOST_CAMERAS}")
     return _make_names_sound(replace(rig, format=one.name))
+
+
+def _check_placed(rig: ForeignRig, source: Source, one: Format) -> ForeignRig:
+    """Note cameras that have the pose of another one.
+
+    Raises:
+        InputError: all cameras have one pose.
+    """
+    groups = coinciding_cameras(rig)
+    if groups and len(groups[0]) == len(rig.cameras):
+        raise InputError(
+            f"{source.where}: this is {with_article(one.title)}: {name_cameras(groups[0])}: all are at one place and "
+            "look the same way: extrinsics were never calibrated; imgcal calibrate --cameras finds the poses"
+        )
+    notes = [
+        f"{name_cameras(names)}: at one place, looking the same way: right for streams of one device, else their "
+        "extrinsics were never calibrated"
+        for names in groups
+    ]
+    return replace(rig, notes=(*rig.notes, *notes))
 
 
 def _join_copy(rig: ForeignRig, one: Format, source: Source) -> ForeignRig:

@@ -1,17 +1,19 @@
 """Which format a file is; and the gate: real files of every tool, against pixels that other programs have computed."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from imgcal.errors import InputError
-from imgcal.formats import FORMATS, find_format, is_foreign, read_foreign_rig
+from imgcal.formats import FORMATS, Files, ForeignRig, find_format, is_foreign, read_foreign_rig
 from imgcal.formats.file_storage import storage_text
+from imgcal.formats.registry import read_foreign_lenses
 from imgcal.io import data_path
 from imgcal.types import limits
-from tests.imgcal.formats.rigs import put, read_in_mm
+from tests.imgcal.formats.rigs import brown, put, put_files, read_in_mm, rig_of
 
 SAMPLES = {
     "anipose/melokeo_4cam.toml": "anipose",
@@ -108,6 +110,39 @@ def test_what_is_no_rig_is_named(tmp_path: Path, files: dict[str, str | bytes], 
 def test_a_folder_without_a_calibration(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"found b.yaml, notes.md, expected"):
         read_foreign_rig(put(tmp_path, notes__md="x", b__yaml="a: ["))
+
+
+def write(rig: ForeignRig, name: str) -> Files:
+    one = find_format(name)
+    assert one.write is not None
+    return one.write(rig.in_camera_frame() if one.from_first else rig)
+
+
+@pytest.mark.parametrize("name", ["colmap", "easymocap", "pymvg", "multical", "kalibr", "opencv-stereo",
+                                  "opencv-multiview", "anipose", "caliscope", "freemocap", "mrcal"])  # fmt: skip
+def test_cameras_that_were_never_placed_are_refused(tmp_path: Path, name: str) -> None:
+    """Whether they are all at the origin or elsewhere; for lenses alone their places do not matter."""
+    apart = rig_of(brown(), brown())
+    for first in (apart.cameras[0], replace(apart.cameras[0], rotation=np.eye(3), translation=np.zeros(3))):
+        second = replace(apart.cameras[1], rotation=first.rotation, translation=first.translation)
+        path = put_files(tmp_path / "out", write(replace(apart, cameras=(first, second)), name))
+        with pytest.raises(InputError, match="at one place and look the same way: extrinsics were never calibrated"):
+            read_foreign_rig(path, name)
+        assert len(read_foreign_lenses(path, name).cameras) == 2
+
+
+def test_two_streams_of_one_device_are_noted(tmp_path: Path) -> None:
+    rig = rig_of(brown(), brown(), brown(), names=("a", "ir", "colour"))
+    _, ir, colour = rig.cameras
+    same = replace(colour, rotation=ir.rotation, translation=ir.translation)
+    for name in ("anipose", "kalibr", "multical"):
+        files = write(replace(rig, cameras=(rig.cameras[0], ir, same)), name)
+        found = read_foreign_rig(put_files(tmp_path / "out", files), name)
+        assert len(found.cameras) == 3
+        (note,) = [note for note in found.notes if "streams of one device" in note]
+        assert note.startswith("cameras cam1, cam2:" if name == "kalibr" else "cameras ir, colour:")
+    path = put_files(tmp_path / "apart", write(rig, "anipose"))
+    assert not any("streams" in note for note in read_foreign_rig(path).notes)
 
 
 def test_names_are_those_of_files(tmp_path: Path) -> None:
