@@ -81,6 +81,7 @@ class ForeignRig:
     frame: str  # which frame the rig's is, in words
     notes: tuple[str, ...] = ()  # what was assumed, and what was left out
     covariance: RigCovariance | None = None
+    unit_hint: str = ""  # of a file that does not say its unit: which format would, if it is that
     root: int | None = None  # the camera whose frame is the rig's by definition; None = the frame is a world
     own: CameraRig | None = None  # what this was made from, for values that other tools lack (prior, volume, ...)
 

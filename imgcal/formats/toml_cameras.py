@@ -232,8 +232,11 @@ def camera_table(camera: ForeignCamera, coefficients: int = 5) -> Table:
 
 def _read_anipose(source: Source) -> ForeignRig:
     notes: list[str] = []
-    cameras = read_cameras(_tables(source).cameras, notes)
-    return ForeignRig(ANIPOSE.name, cameras, None, "the file's world (anipose: near the first camera)", tuple(notes))
+    tables = _tables(source)
+    cameras = read_cameras(tables.cameras, notes)
+    hint = "of fisheyes, Pose2Sim's looks like anipose's: --from pose2sim reads metres" if _are_fisheyes(tables) else ""
+    frame = "the file's world (anipose: near the first camera)"
+    return ForeignRig(ANIPOSE.name, cameras, None, frame, tuple(notes), unit_hint=hint)
 
 
 def _write_anipose(rig: ForeignRig) -> Files:
@@ -247,8 +250,11 @@ def _is_pose2sim(source: Source) -> bool:
         return False
     # Anipose writes five, of a fisheye four as well.
     counts = {len(numbers(table.get("distortions", []), "distortions")) for table in tables.cameras.values()}
-    fisheyes = [table.get("fisheye") is True for table in tables.cameras.values()]
-    return counts == {4} and not all(fisheyes)
+    return counts == {4} and not _are_fisheyes(tables)
+
+
+def _are_fisheyes(tables: Tables) -> bool:
+    return all(table.get("fisheye") is True for table in tables.cameras.values())
 
 
 def _read_pose2sim(source: Source) -> ForeignRig:
