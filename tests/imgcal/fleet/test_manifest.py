@@ -61,7 +61,9 @@ def test_a_row_that_cannot_be_used_says_so_and_ends_nothing(tmp_path: Path) -> N
     one, two = items(tmp_path / "m.csv", rig="T4", object="cube8")
     assert "row 0: found time 'noon'" in one.fault
     assert two.fault == "row 1: found no capture, expected one in its column"
-    assert items(tmp_path / "m.csv")[0].fault == "row 0: found no rig, expected one in its column, or --rig for all rows"
+    assert (
+        items(tmp_path / "m.csv")[0].fault == "row 0: found no rig, expected one in its column, or --rig for all rows"
+    )
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,9 @@ def test_extrinsics_of_zeros_are_refused(tmp_path: Path) -> None:
 def test_fisheyes_alone_could_be_anipose_s(tmp_path: Path) -> None:
     rig = rig_of(fisheye(0.01), fisheye(0.02))
     path = put_files(tmp_path, convert_rig(rig, "pose2sim", "x").files)
-    with pytest.raises(InputError, match=r"unit of length \(of fisheyes, .*: --from pose2sim reads metres\): give imgcal"):
+    with pytest.raises(
+        InputError, match=r"unit of length \(of fisheyes, .*: --from pose2sim reads metres\): give imgcal"
+    ):
         read_in_mm(path)
     assert apart(rig, read_in_mm(path, name="pose2sim")) < 1e-8
 
