@@ -92,9 +92,9 @@ def read_foreign_rig(
     """
     source = Source([Path(one) for one in ([paths] if isinstance(paths, str | Path) else paths)], rig)
     one = recognize_format(source) if name is None else _check_requested(source, find_format(name))
-    rig = _read(source, one)
-    _check_others(rig, source, one, by_content=name is None)
-    return _check_placed(rig, source, one)
+    found = _read(source, one)
+    _check_others(found, source, one, by_content=name is None)
+    return _check_placed(found, source, one)
 
 
 def read_foreign_lenses(path: str | Path, name: str | None = None) -> ForeignRig:
