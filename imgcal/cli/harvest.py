@@ -53,10 +53,9 @@ PATCHES_TEXT = """`train_patches.safetensors` ({train}) and `held_out_patches.sa
 measurer: `imgcal train measurer-cnn --from {folder} --out measurer`. Tensors (M patches): `light` (M, 24, 24) above
 the ground of the patch in units of its marker; `radius` (M,) and `offset` (M, 2) of the marker, patch pixels, from
 the middle of the patch; `camera`, `snapshot` (M,)."""
-TOO_FEW_PATCHES = "too few markers are known to a pixel to hold some of them out"
 NO_PATCHES = (
-    "no marker's place is known to a pixel. Is --rig the rig that imgcal calibrate made of this capture, not the "
-    "factory's? Are the markers those of --object?"
+    "too few markers have a place that is known to a pixel. Is --rig what imgcal calibrate made of this capture, not "
+    "the factory rig?"
 )
 
 
@@ -92,8 +91,7 @@ class Harvest(arguments.Harvest):
         said = [f"{plural(len(part), 'crop')} with {_count_markers(part)} markers" for part in splits]
         print(f"{self.out}: {said[0]} for training, {said[1]} held out", file=sys.stderr)
         if not parts:
-            reason = TOO_FEW_PATCHES if len(patches) else NO_PATCHES
-            print(f"note: no patches for the measurer: {reason}", file=sys.stderr)
+            print(f"note: no patches for the measurer: {NO_PATCHES}", file=sys.stderr)
 
     def _split_patches(self, patches: PatchDataset, snapshots: int, cameras: int) -> Sequence[PatchDataset]:
         """Hold out patches like crops; none where either part would be empty: crops are of use without them."""
@@ -131,7 +129,7 @@ def write_dataset(
 def _card(folder: Path, splits: Sequence[FrameDataset], patches: Sequence[PatchDataset], source: Source) -> str:
     """Say what is in the dataset."""
     train, held_out = splits
-    of_patches = "There are no patches: too few markers are known so well that the measurer could learn from them."
+    of_patches = f"There are no patches for the measurer: {NO_PATCHES}"
     if patches:
         of_patches = PATCHES_TEXT.format(train=len(patches[0]), held_out=len(patches[1]), folder=folder)
     return CARD_TEXT.format(
