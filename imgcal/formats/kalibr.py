@@ -58,7 +58,7 @@ def _read(source: Source) -> ForeignRig:
         poses = follow_links(root, names, links)
         notes.append("some cameras are linked by the IMU only (T_cam_imu)")
     if off := _contradictions(links, poses):
-        notes.append(f"{list_names(off)}: said in two ways that contradict each other; T_cn_cnm1 comes before the IMU")
+        notes.append(f"{list_names(off)}: contradicts the other poses in the file; T_cn_cnm1 counts before T_cam_imu")
     cameras = tuple(
         ForeignCamera(name, lenses[name], image_size(entries[name].get("resolution"), name), *poses[name])
         for name in names
