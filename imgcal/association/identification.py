@@ -26,7 +26,7 @@ from imgcal.association.hypotheses import (
     has_many_triples,
     likely_blobs,
 )
-from imgcal.association.identity import Identity, IdentityOptions, Status
+from imgcal.association.identity import TOO_FEW_BLOBS, Identity, IdentityOptions, Status
 from imgcal.association.minimal_labels import compare_labellings, has_minimal_blobs
 from imgcal.association.search import DECISIVE, VERIFIED, Search, match_on_lattice
 from imgcal.association.stick_poses import fit_sticks
@@ -208,7 +208,7 @@ def _relocalize(scene: Scene, options: IdentityOptions) -> Identity:
     cameras = np.flatnonzero(scene.blobs.count >= 4)
     if len(cameras) == 0:
         return _refuse(
-            scene, f"too few blobs: at most {scene.blobs.count.max()} in a camera, expected at least 4 in one"
+            scene, f"{TOO_FEW_BLOBS}: at most {scene.blobs.count.max()} in a camera, expected at least 4 in one"
         )
     compared = compare_labellings(scene, options) if has_minimal_blobs(scene) else None
     if compared is not None and compared.accepted:

@@ -21,6 +21,8 @@ BOARD_OUTLIER, BOARD_THRESHOLD = 50.0, 20.0
 """Printed boards, in standard deviations: labels beyond the first are left out, those beyond the second count less."""
 CLEAR = 0.5
 """Maximum ratio of the angles of the nearest and the second nearest orientation for a given pose to decide."""
+TOO_FEW_BLOBS = "too few blobs"
+"""How the reason begins where no camera has as many blobs as a pose needs."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from imgcal.association.identity import PipelineOptions
+from imgcal.association.identity import TOO_FEW_BLOBS, PipelineOptions
 from imgcal.association.proposals import Sight
 from imgcal.association.tracker import SnapshotIdentity, Tracker, to_observations
 from imgcal.errors import InputError, RefusedError
@@ -164,7 +164,7 @@ def associate(
 
         labelled = associate_several(detections, rig, obj, options, progress)
         if not labelled.used:
-            raise RefusedError(f"identity: {_most_frequent_reason(labelled.snapshots)}")
+            raise _refusal(labelled.snapshots, sight)
         return labelled
     count = len(detections.snapshot_names)
     if obj.pose_rank < 6:
@@ -180,7 +180,7 @@ def associate(
     snapshots = tuple(series.results[s][0] for s in range(count))
     labelled = Associations(_label_blobs(detections, series.rows, series.results, series.looked), snapshots)
     if not labelled.used:
-        raise RefusedError(f"identity: {_most_frequent_reason(snapshots)}")
+        raise _refusal(snapshots, sight)
     return labelled
 
 
@@ -297,6 +297,14 @@ class _Series:
         blobs, labelled = np.bincount(camera), np.bincount(camera[labels >= 0], minlength=camera.max() + 1)
         least = PATTERN if self.rigs.get(s) is self.tracker.rig else 1
         return bool((blobs[labelled == 0] >= least).any())
+
+
+def _refusal(snapshots: Sequence[SnapshotIdentity], sight: Sight | None) -> RefusedError:
+    """Say why no snapshot could be decided, and what may help where nothing but blobs was looked at."""
+    reason = _most_frequent_reason(snapshots)
+    advice = "if frames show more markers, which are not round or too faint, try --detector auto"
+    helps = sight is None and reason.startswith(TOO_FEW_BLOBS)
+    return RefusedError(f"identity: {reason}", command=advice if helps else "")
 
 
 def _most_frequent_reason(snapshots: Sequence[SnapshotIdentity]) -> str:

@@ -44,7 +44,7 @@ class Simulate:
     charuco, aprilgrid, checkerboard, circles); several that move independently: --object A B; lights = a body with
     unknown markers (--lights)"""
     out: Path  #: folder to write; must not hold a capture yet
-    lights: int = 15  #: number of markers on the body, with --object lights
+    lights: int | None = None  #: number of markers on the body, with --object lights; default: 15
     snapshots: int = 10  #: number of poses of the object
     seed: int = 0  #: the same seed gives the same capture
     drift: Literal["physical", "relative", "none"] | None = None

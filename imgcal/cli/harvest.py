@@ -9,7 +9,7 @@ from pathlib import Path
 
 from imgcal.cli import arguments
 from imgcal.cli.common import check_folder, open_rig, parse_range, progress, read_detections
-from imgcal.errors import RefusedError
+from imgcal.errors import InputError, RefusedError
 from imgcal.io import load_object, open_capture, publishing, write_text
 from imgcal.messages import plural
 from imgcal.pipeline import capture_sight
@@ -53,7 +53,10 @@ PATCHES_TEXT = """`train_patches.safetensors` ({train}) and `held_out_patches.sa
 measurer: `imgcal train measurer-cnn --from {folder} --out measurer`. Tensors (M patches): `light` (M, 24, 24) above
 the ground of the patch in units of its marker; `radius` (M,) and `offset` (M, 2) of the marker, patch pixels, from
 the middle of the patch; `camera`, `snapshot` (M,)."""
-NO_PATCHES = "No marker is known so well that the measurer could learn from it: there are no patches."
+NO_PATCHES = (
+    "too few markers have a place that is known to a pixel. Is --rig what imgcal calibrate made of this capture, not "
+    "the factory rig?"
+)
 
 
 class Harvest(arguments.Harvest):
@@ -62,6 +65,8 @@ class Harvest(arguments.Harvest):
     def run(self) -> None:
         """Cut and write."""
         check_folder(self.out)
+        if any((self.out / name).exists() for name in (TRAIN, HELD_OUT)):
+            raise InputError(f"{self.out}: found a dataset there already, expected a new folder")
         rig, obj = open_rig(self.rig), load_object(self.object)
         obj.require_rigid("to harvest crops")
         capture = open_capture(self.capture, rig, self.videos_differ)
@@ -85,6 +90,8 @@ class Harvest(arguments.Harvest):
         write_dataset(self.out, splits, parts, source)
         said = [f"{plural(len(part), 'crop')} with {_count_markers(part)} markers" for part in splits]
         print(f"{self.out}: {said[0]} for training, {said[1]} held out", file=sys.stderr)
+        if not parts:
+            print(f"note: no patches for the measurer: {NO_PATCHES}", file=sys.stderr)
 
     def _split_patches(self, patches: PatchDataset, snapshots: int, cameras: int) -> Sequence[PatchDataset]:
         """Hold out patches like crops; none where either part would be empty: crops are of use without them."""
@@ -122,7 +129,7 @@ def write_dataset(
 def _card(folder: Path, splits: Sequence[FrameDataset], patches: Sequence[PatchDataset], source: Source) -> str:
     """Say what is in the dataset."""
     train, held_out = splits
-    of_patches = NO_PATCHES
+    of_patches = f"There are no patches for the measurer: {NO_PATCHES}"
     if patches:
         of_patches = PATCHES_TEXT.format(train=len(patches[0]), held_out=len(patches[1]), folder=folder)
     return CARD_TEXT.format(

@@ -27,6 +27,7 @@ from imgcal.synthesis import (
     DIFFICULTIES,
     Drift,
     FrameModel,
+    PhysicalDrift,
     PoseRange,
     RelativeDrift,
     Truth,
@@ -44,6 +45,8 @@ from imgcal.types import FIDUCIAL_RADIUS, CalibrationObject, CameraRig, limits
 WRITTEN = ("capture.yaml", "rig.yaml", "object.csv", "objects", "board.yaml", "truth", "frames")
 
 MOST_SNAPSHOTS = 100_000
+LIGHTS = 15
+"""Markers on a body of unknown ones, unless the user says how many."""
 
 
 class Simulate(arguments.Simulate):
@@ -51,10 +54,15 @@ class Simulate(arguments.Simulate):
 
     def run(self) -> None:
         """Simulate and write."""
-        bounds = (("snapshots", 1, MOST_SNAPSHOTS), ("seed", 0, 2**63 - 1), ("lights", 1, limits.MOST_FIDUCIALS))
-        for name, least, most in bounds:
-            if not least <= getattr(self, name) <= most:
-                found = shorten(str(getattr(self, name)))
+        lights = LIGHTS if self.lights is None else self.lights
+        bounds = (
+            ("snapshots", self.snapshots, 1, MOST_SNAPSHOTS),
+            ("seed", self.seed, 0, 2**63 - 1),
+            ("lights", lights, 1, limits.MOST_FIDUCIALS),
+        )
+        for name, value, least, most in bounds:
+            if not least <= value <= most:
+                found = shorten(str(value))
                 raise InputError(f"--{name}: found {found}, expected at least {least} and at most {most}")
         if not FIDUCIAL_RADIUS.low <= self.marker_radius <= FIDUCIAL_RADIUS.high:
             raise InputError(f"--marker-radius: found {self.marker_radius}, expected {FIDUCIAL_RADIUS}")
@@ -75,8 +83,10 @@ class Simulate(arguments.Simulate):
         if obj.has_lights:
             raise InputError("--object: found unknown markers and known objects, expected one or the other to simulate")
         are_known = not obj.unknown_markers
+        if are_known and self.lights is not None:
+            raise InputError(f"--lights: found {lights} with an object of known markers, expected --object lights")
         if not are_known:
-            obj = place_markers(rig, self.lights, generator)
+            obj = place_markers(rig, lights, generator)
         truth = self._truth(rig, obj, generator)
         with publishing(self.out, WRITTEN, mark="frames") as out:
             self._write(truth, rig, obj, generator, out)
@@ -146,6 +156,8 @@ class Simulate(arguments.Simulate):
         kind = self.drift or ("physical" if self.kappa is None else "relative")
         if self.kappa is not None and kind != "relative":
             raise InputError(f"--kappa: found {self.kappa:g} with --drift {kind}, expected --drift relative")
+        if self.physical != PhysicalDrift() and kind != "physical":
+            raise InputError(f"--physical.*: found values with a {kind} drift, expected --drift physical")
         kappa = 0.025 if self.kappa is None else self.kappa
         if not 0 <= kappa < 1:
             raise InputError(f"--kappa: found {kappa:g}, expected 0 or more, and less than 1")

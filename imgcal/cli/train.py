@@ -26,12 +26,14 @@ class Train(arguments.Train):
         import torch
 
         from imgcal.cli.training_folder import RESULT, STATE, train_in
-        from imgcal.training import adaptation, is_finished, load_experiment
+        from imgcal.training import adaptation, change_experiment, is_finished, load_experiment
 
-        changes = [] if self.dataset is None else adaptation(self.experiment, self.dataset)
-        changes += [change for changes in self.set for change in changes]
+        if self.minutes is not None and not 0 < self.minutes < float("inf"):
+            raise InputError(f"--minutes: found {self.minutes:g}, expected more than 0")
+        changes = [change for changes in self.set for change in changes]
         changes += [] if self.minutes is None else [f"training.minutes={float(self.minutes)!r}"]
-        experiment = load_experiment(self.experiment, changes)
+        own = [] if self.dataset is None else adaptation(self.experiment, self.dataset)
+        experiment = change_experiment(load_experiment(self.experiment, own), *changes)
         check_folder(self.out)
         there = (self.out / STATE).exists()
         if there and not self.resume:

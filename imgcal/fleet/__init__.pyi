@@ -1,10 +1,10 @@
 from .dataset import Dataset
 from .drift_information import KINDS, DriftInformation, parameter_units
 from .engine import Done, Engine, Lost
-from .fleet_summary import HOURS, KindOfRig, refusals, rig_kinds
+from .fleet_summary import KindOfRig, refusals, rig_kinds
 from .job import Settings
 from .learnt_prior import LearntPrior, OutlierCamera, Spread, Trend, learn_prior, outlier_cameras
-from .manifest import Item, Manifest, write_manifest
+from .manifest import HOURS, Item, Manifest, write_manifest
 from .run import FleetCount, recalibrate_fleet
 from .work_items import Mapper, StoredResults, workers
 

@@ -16,11 +16,10 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.fleet.dataset import Dataset
 from imgcal.fleet.drift_information import DriftInformation
 from imgcal.fleet.learnt_prior import LearntPrior, Trend, learn_prior
+from imgcal.fleet.manifest import HOURS
 from imgcal.messages import list_names, plural
 from imgcal.types import PINHOLE, parameter_names
 
-HOURS = "hours"
-"""Column of the manifest: since the factory calibration. With it, rates of drift are learned."""
 COLUMNS = (
     "device", "capture", "time", "status", "given", "cameras", "lenses", "prior_std", "unit", "whitened_offset",
     "information_factor", "inflation",

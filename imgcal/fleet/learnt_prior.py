@@ -21,7 +21,7 @@ from torch import Tensor
 
 from imgcal.errors import InputError, RefusedError
 from imgcal.fleet.drift_information import KINDS, DriftInformation
-from imgcal.types import PARAMETER_KINDS, DriftRate, RigPrior
+from imgcal.types import PARAMETER_KINDS, DriftRate, RigPrior, limits
 
 SIGMAS = 5.0
 """Standard deviations (two-sided) outside the fleet's spread from which a camera is an outlier."""
@@ -144,7 +144,7 @@ def learn_prior(
         Spreads with their standard deviations, slopes, and the cameras that do not belong.
 
     Raises:
-        InputError: values of another number than there are devices, or not finite.
+        InputError: values of another number than there are devices, not finite, or hours out of `limits.AGE`.
         RefusedError: too few devices, or the variances do not come to rest.
     """
     if len(drift) < LEAST_DEVICES:
@@ -152,6 +152,9 @@ def learn_prior(
             f"fleet: found {len(drift)} devices, expected at least {LEAST_DEVICES} to learn a prior from"
         )
     age = _column("hours", hours, len(drift))
+    if age is not None and not limits.AGE.holds_all(age):
+        wrong = age[~limits.AGE.holds(age)]
+        raise InputError(f"hours: found {float(wrong[0]):g}, expected {limits.AGE}")
     if age is not None and bool((age <= age.min() + 1e-6 * age.abs().max()).all()):
         age = None  # nothing shows what has grown
     model = _model(drift, age, by_camera)
@@ -220,7 +223,7 @@ def _model(drift: DriftInformation, hours: Tensor | None, by_camera: bool) -> _M
     cameras = len(drift.camera_names)
     masks, names, features = [], [], []
     for grows in (False,) if hours is None else (False, True):
-        feature = torch.ones(len(drift), dtype=torch.float64) if hours is None or not grows else hours.clamp_min(0)
+        feature = torch.ones(len(drift), dtype=torch.float64) if hours is None or not grows else hours
         for kind, part in PARAMETER_KINDS.items():
             for camera in range(cameras) if by_camera else (None,):
                 mask = torch.zeros(cameras, drift.parameters, dtype=torch.float64)

@@ -17,10 +17,13 @@ from typing import Any
 from imgcal.errors import InputError
 from imgcal.io import is_shipped
 from imgcal.messages import list_names, quote
+from imgcal.types import limits
 
 REQUIRED = ("capture",)
 PARQUET = (".parquet", ".pq")
 KNOWN = ("capture", "rig", "object", "device", "time")
+HOURS = "hours"
+"""Column of the manifest: since the factory calibration. With it, rates of drift are learned."""
 EARLIEST, LATEST = -2_208_988_800.0, 7_258_118_400.0  # s since 1970: the years 1900 and 2200
 PROBLEMS = (
     (r"Empty CSV file|file size is 0 bytes", "found an empty file"),
@@ -151,7 +154,7 @@ class Manifest:
             "object": _base_folder(self.url, text["object"]) if text["object"] else self.object,
         }
         faults += [
-            f"found no {name}, expected one in its column, or for all by an option"
+            f"found no {name}, expected one in its column{'' if name == 'capture' else f', or --{name} for all rows'}"
             for name, value in named.items()
             if not value
         ]
@@ -160,6 +163,9 @@ class Manifest:
             moment = _seconds(values.get("time"))
         except ValueError as error:
             faults.append(str(error))
+        hours = dict(given).get(HOURS, 0.0)
+        if not limits.AGE.low <= hours <= limits.AGE.high:
+            faults.append(f"{HOURS}: found {hours:g}, expected {limits.AGE}")
         paths = {name: value or "" for name, value in named.items()}
         fault = f"row {row}: {faults[0]}" if faults else None
         return Item(row, paths["capture"], paths["rig"], paths["object"], text["device"] or "", moment, given, fault)

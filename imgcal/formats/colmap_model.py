@@ -18,7 +18,7 @@ from imgcal.formats.chains import IDENTITY, Link, Pose, compose, find_linked, in
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.lens import Array, Lens, Model
 from imgcal.formats.values import quaternion_from_rotation, rotation_from_quaternion
-from imgcal.messages import name_cameras, shorten
+from imgcal.messages import name_cameras, plural, shorten
 
 HALF = 0.5
 MODELS = (
@@ -225,10 +225,12 @@ def _convert_images(
         if camera in frames.setdefault(frame, {}):
             raise FormatError(f"found two images of {camera} in one frame: {image.name}")
         frames[frame][camera] = image
-    if len(folders) == 1 and len({image.camera for image in images}) == 1 and len(images) > 2:
+    intrinsics = len({image.camera for image in images})
+    if len(folders) == 1 and intrinsics < len(images):
         notes.append(
-            f"found no rigs.txt, and {len(images)} images with one set of intrinsics: treated as that many cameras at "
-            "one moment, which is wrong if one camera moved"
+            f"found no rigs.txt, and {len(images)} images in one folder with {plural(intrinsics, 'set')} of "
+            "intrinsics: treated as that many cameras at one moment, which is wrong if a camera has several images: "
+            "then it needs rigs.txt, or a folder for each camera with one file name for each moment"
         )
     frames = dict(sorted(frames.items(), key=lambda item: -len(item[1])))  # the fullest first
     frame, first = next(iter(frames.items()))

@@ -76,10 +76,11 @@ def in_millimetres(
         return rig.scale(_factor(rig, distance), "mm")
     stated = unit if unit is not None else rig.unit
     if stated is None and len(rig.cameras) > 1:
+        hint = f" ({rig.unit_hint})" if rig.unit_hint else ""
         raise InputError(
-            f"{where}: the file does not state its unit of length: give imgcal convert --unit mm, cm, m, inch, or the "
-            "length of one unit (--unit 417.2mm), or the distance between two cameras (--distance NAME NAME MM); in "
-            'Python load_rig(..., unit="mm")'
+            f"{where}: the file does not state its unit of length{hint}: give imgcal convert --unit mm, cm, m, inch, "
+            "or the length of one unit (--unit 417.2mm), or the distance between two cameras (--distance NAME NAME "
+            'MM); in Python load_rig(..., unit="mm")'
         )
     return rig.scale(millimetres(stated or "mm"), "mm")
 

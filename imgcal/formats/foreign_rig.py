@@ -16,6 +16,8 @@ from imgcal.types import CameraRig
 
 SIDE = 7  # points along each side of an image, its border included
 DEPTHS = (0.5, 1.0, 4.0)  # in units of the rig's size
+SAME = 1e-9
+"""Most by which the poses of two cameras may differ, in rad and relative to the largest coordinate (1 at least)."""
 
 
 class FormatError(InputError):
@@ -79,6 +81,7 @@ class ForeignRig:
     frame: str  # which frame the rig's is, in words
     notes: tuple[str, ...] = ()  # what was assumed, and what was left out
     covariance: RigCovariance | None = None
+    unit_hint: str = ""  # of a file that does not say its unit: which format would, if it is that
     root: int | None = None  # the camera whose frame is the rig's by definition; None = the frame is a world
     own: CameraRig | None = None  # what this was made from, for values that other tools lack (prior, volume, ...)
 
@@ -115,6 +118,17 @@ def known_points(rig: ForeignRig) -> list[Array]:
         points_cam = np.concatenate([rays * depth * size for depth in DEPTHS])
         found.append((points_cam - camera.translation) @ camera.rotation)
     return found
+
+
+def coinciding_cameras(rig: ForeignRig) -> list[list[str]]:
+    """Find cameras that have the same pose, but for the digits of a double: names, a list for each such pose."""
+    rotations = np.array([camera.rotation.ravel() for camera in rig.cameras])
+    centres = np.array([camera.centre for camera in rig.cameras])
+    turned = np.abs(rotations[:, None] - rotations).max(axis=-1)
+    apart = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    same = (turned <= SAME) & (apart <= SAME * max(1.0, float(np.abs(centres).max())))
+    groups = {tuple(np.flatnonzero(row)) for row in same if row.sum() > 1}
+    return [[rig.names[place] for place in group] for group in sorted(groups)]
 
 
 def worst_difference(rig: ForeignRig, other: ForeignRig) -> tuple[float, int]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from imgcal.formats import places
-from imgcal.formats.chains import Link, Pose, follow_links, inverse, pose_from_matrix
+from imgcal.formats.chains import Link, Pose, compose, follow_links, inverse, pose_from_matrix
 from imgcal.formats.fitting import Holds
 from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, Place
 from imgcal.formats.format import Files, Format
@@ -23,6 +23,7 @@ from imgcal.messages import list_names
 TITLE = "Kalibr camchain"
 CAMERA = re.compile(r"cam(\d+)")
 BETWEEN = re.compile(r"T_(cam\d+|imu\d*)_(cam\d+|imu\d*)")
+ROTATION_SAME, PLACE_SAME = 1e-3, 1e-2  # rad; of the largest distance to the first camera
 NO_LENS = {
     "omni": "an omnidirectional model (omni)", "ds": "a double sphere (ds)", "eucm": "an extended unified model (eucm)",
 }  # fmt: skip
@@ -56,6 +57,8 @@ def _read(source: Source) -> ForeignRig:
     except FormatError:
         poses = follow_links(root, names, links)
         notes.append("some cameras are linked by the IMU only (T_cam_imu)")
+    if off := _contradictions(links, poses):
+        notes.append(f"{list_names(off)}: contradicts the other poses in the file; T_cn_cnm1 counts before T_cam_imu")
     cameras = tuple(
         ForeignCamera(name, lenses[name], image_size(entries[name].get("resolution"), name), *poses[name])
         for name in names
@@ -148,6 +151,23 @@ def _links(values: dict[str, Any], entries: dict[str, dict[str, Any]], names: li
         elif "T_imu_cam" in entry:  # OpenVINS
             links.append(Link(name, "imu", inverse(_pose(entry["T_imu_cam"], f"{name}: T_imu_cam"))))
     return links
+
+
+def _contradictions(links: list[Link], poses: dict[str, Pose]) -> list[str]:
+    """Name the links that say something else than the poses of the cameras do, the IMU's pose being what says first."""
+    known = dict(poses)
+    size = max(float(np.linalg.norm(pose[1])) for pose in poses.values())
+    off = []
+    for link in links:
+        if link.source not in known and link.destination in known:
+            known[link.source] = compose(inverse(link.pose), known[link.destination])
+        if not {link.source, link.destination} <= known.keys():
+            continue
+        turned, moved = compose(known[link.destination], inverse(known[link.source]))
+        shift = float(np.linalg.norm(moved - link.pose[1]))
+        if np.abs(turned - link.pose[0]).max() > ROTATION_SAME or shift > PLACE_SAME * size:
+            off.append(f"{link.destination} from {link.source}")
+    return list(dict.fromkeys(off))
 
 
 def _node(name: str) -> str:

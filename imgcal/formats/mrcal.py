@@ -45,8 +45,6 @@ def _is_model(values: dict[str, Any]) -> bool:
 def _read(source: Source) -> ForeignRig:
     cameras = [_camera(document.path, values) for document, values in source.mappings if _is_model(values)]
     notes = []
-    if len(cameras) > 1 and not any(camera.translation.any() for camera in cameras):
-        raise FormatError("all cameras are at the origin of their reference: extrinsics were never calibrated")
     if len(cameras) == 1:
         notes.append("this is one camera; the others are in files of their own: give all, or their folder")
     return ForeignRig(FORMAT.name, tuple(cameras), None, "mrcal's reference frame", tuple(notes))

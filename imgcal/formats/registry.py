@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import tempfile
 from collections.abc import Sequence
@@ -27,13 +28,14 @@ from imgcal.formats import (
     toml_cameras,
     vicon,
 )
+from imgcal.formats.documents import Document
 from imgcal.formats.file_storage import is_matrix, merge_storages
-from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, known_points
+from imgcal.formats.foreign_rig import ForeignCamera, ForeignRig, FormatError, coinciding_cameras, known_points
 from imgcal.formats.format import Files, Format
 from imgcal.formats.limits import ROUNDING
 from imgcal.formats.source import Source
 from imgcal.io import is_file_name
-from imgcal.messages import with_article
+from imgcal.messages import list_names, name_cameras, with_article
 from imgcal.types import limits
 
 FORMATS = (  # asked in this order: who knows a file by more comes before who knows it by less
@@ -63,6 +65,14 @@ COPIES = {
 }
 """Formats in which a tool keeps the same calibration twice, in one folder."""
 
+ORIGINALS = {
+    colmap_text.FORMAT.name: (colmap_text.CONFIG.name,),
+    colmap_binary.FORMAT.name: (colmap_text.CONFIG.name,),
+    toml_cameras.POSE2SIM.name: (qualisys.FORMAT.name, vicon.FORMAT.name),
+}
+"""What a tool makes its own file from, and leaves beside it."""
+
+COLMAP_STEMS = frozenset(("cameras", "images", "rigs", "frames", "points3D"))
 BY_NAME = {one.name: one for one in FORMATS}
 NATIVE = re.compile(rb"(?m)^[\"']?format[\"']?[ \t]*:")
 
@@ -81,7 +91,10 @@ def read_foreign_rig(
         InputError: one line with the file, what it is and what it lacks.
     """
     source = Source([Path(one) for one in ([paths] if isinstance(paths, str | Path) else paths)], rig)
-    return _read(source, recognize_format(source) if name is None else _check_requested(source, find_format(name)))
+    one = recognize_format(source) if name is None else _check_requested(source, find_format(name))
+    found = _read(source, one)
+    _check_others(found, source, one, by_content=name is None)
+    return _check_placed(found, source, one)
 
 
 def read_foreign_lenses(path: str | Path, name: str | None = None) -> ForeignRig:
@@ -99,10 +112,12 @@ def read_foreign_lenses(path: str | Path, name: str | None = None) -> ForeignRig
     """
     source = Source([Path(path)])
     one = recognize_format(source) if name is None else _check_requested(source, find_format(name))
-    if one.read_lenses is None:
-        return _read(source, one)
     read = one.read_lenses
-    return _read(source, replace(one, read=lambda found: ForeignRig(one.name, tuple(read(found)), None, "unknown")))
+    if read is not None:
+        one = replace(one, read=lambda found: ForeignRig(one.name, tuple(read(found)), None, "unknown"))
+    rig = _read(source, one)
+    _check_others(rig, source, one, by_content=name is None)
+    return rig
 
 
 def read_back(files: Files, name: str, rig: str | None = None) -> ForeignRig:
@@ -218,6 +233,82 @@ def _read(source: Source, one: Format) -> ForeignRig:
     if len(rig.cameras) > limits.MOST_CAMERAS:
         raise InputError(f"{source.where}: found {len(rig.cameras)} cameras, expected at most {limits.MOST_CAMERAS}")
     return _make_names_sound(replace(rig, format=one.name))
+
+
+def _check_others(rig: ForeignRig, source: Source, one: Format, *, by_content: bool) -> None:
+    """Check that no file holds another calibration, and that every file that the user names is of use.
+
+    Args:
+        rig: as it was read.
+        source: its files, and perhaps others.
+        one: its format.
+        by_content: the user has not named the format: a folder must not hold another calibration.
+
+    Raises:
+        InputError: there is one, or a file is of no use.
+    """
+    if source.alone:
+        return
+    used = {place.path for camera in rig.cameras for place in camera.places}
+    used = used or {document.path for document in source.documents if one.recognizes(source.of_document(document))}
+    others = {}
+    for document in source.documents:
+        if document.path not in used and (by_content or document.path in source.paths):
+            name = _recognize_document(source, document)
+            if name and name not in ORIGINALS.get(one.name, ()):
+                others[document.path] = name
+    if others:
+        found = [f"{list_names(sorted(path.name for path in used))} ({one.name})"]
+        found += [f"{path.name} ({name})" for path, name in others.items()]
+        raise InputError(f"{source.where}: found {', '.join(found)}: give the files of one calibration")
+    for path in source.paths:
+        if path.is_file() and path not in used and not _is_needed(path, rig, source, one):
+            raise InputError(f"{path}: found no part of {with_article(one.title)} in it, expected only its files")
+
+
+def _recognize_document(source: Source, document: Document) -> str:
+    """Name the format of a document alone; empty where it is no calibration."""
+    value = document.value
+    if isinstance(value, dict) and str(value.get("format")).startswith("imgcal-rig/"):
+        return "imgcal"
+    part = source.of_document(document)
+    for one in FORMATS:
+        with contextlib.suppress(FormatError):
+            if one.recognizes(part):
+                return one.name
+    return ""
+
+
+def _is_needed(path: Path, rig: ForeignRig, source: Source, one: Format) -> bool:
+    """Tell whether a file without numbers of a camera says something: the size of images, for example."""
+    if one.name in COPIES and path.stem in COLMAP_STEMS:
+        return True
+    try:
+        rest = _read(Source([other for other in source.paths if other != path], source.rig), one)
+    except InputError:
+        return True
+    described = [[(camera.name, camera.lens, camera.image_size) for camera in each.cameras] for each in (rig, rest)]
+    return described[0] != described[1]
+
+
+def _check_placed(rig: ForeignRig, source: Source, one: Format) -> ForeignRig:
+    """Note cameras that have the pose of another one.
+
+    Raises:
+        InputError: all cameras have one pose.
+    """
+    groups = coinciding_cameras(rig)
+    if groups and len(groups[0]) == len(rig.cameras):
+        raise InputError(
+            f"{source.where}: this is {with_article(one.title)}: {name_cameras(groups[0])}: all are at one place and "
+            "look the same way: extrinsics were never calibrated; imgcal calibrate --cameras finds the poses"
+        )
+    notes = [
+        f"{name_cameras(names)}: at one place, looking the same way: right for streams of one device, else their "
+        "extrinsics were never calibrated"
+        for names in groups
+    ]
+    return replace(rig, notes=(*rig.notes, *notes))
 
 
 def _join_copy(rig: ForeignRig, one: Format, source: Source) -> ForeignRig:

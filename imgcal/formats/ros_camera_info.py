@@ -21,6 +21,7 @@ from imgcal.formats.lens import Array, Lens, Model
 from imgcal.formats.source import Source
 from imgcal.formats.values import array, camera_matrix, coefficients, image_size, nearest_rotation, numbers, text
 from imgcal.io import Flow, yaml_text
+from imgcal.messages import name_cameras
 
 TITLE = "ROS camera_info file"
 KEYS = {
@@ -43,6 +44,7 @@ class _Info:
     projection: Array  # (3, 4)
     path: Path
     keys: dict[str, tuple[str, ...]]  # to the numbers of k, d, r and p
+    cut: bool  # images are binned, or a part of what the sensor has
 
     @property
     def places(self) -> tuple[Place, ...]:
@@ -77,6 +79,7 @@ def _read(source: Source) -> ForeignRig:
                           "rig.yaml), or the folder to imgcal calibrate --cameras, which finds the poses")  # fmt: skip
     if len(infos) == 1:
         return _single(infos[0])
+    cut = [info.name for info in infos if info.cut]
     infos.sort(key=lambda info: float(np.abs(info.shift).sum()))  # the left one has no Tx
     left, right = infos
     if not right.shift.any():
@@ -86,6 +89,8 @@ def _read(source: Source) -> ForeignRig:
         )
     notes = ["a stereo pair: X_right = R_r^T (R_l X_left + (Tx / fx', 0, 0)), metres; the rig's frame is the left "
              "camera's, unrectified"]  # fmt: skip
+    if cut:
+        notes.append(_note_cut(cut))
     if left.shift.any():
         notes.append("both files have Tx or Ty in P: their difference is used")
     if right.shift[0] > left.shift[0]:
@@ -130,7 +135,24 @@ def _single(info: _Info) -> ForeignRig:
         "; R and P are those of a stereo pair: give both files, or their folder, for the pair" if pair else ""
     )
     camera = replace(unplaced_camera(info.name, info.lens, info.image_size), places=info.places)
-    return ForeignRig(FORMAT.name, (camera,), "m", f"camera {info.name}", (note,))
+    notes = (note, _note_cut([info.name])) if info.cut else (note,)
+    return ForeignRig(FORMAT.name, (camera,), "m", f"camera {info.name}", notes)
+
+
+def _note_cut(names: list[str]) -> str:
+    return (
+        f"{name_cameras(names)}: the file has binning or a region of interest (roi): K and the size are those of the "
+        "full image, and so is the rig; frames must be full images, too"
+    )
+
+
+def _is_cut(values: dict[str, Any], size: tuple[int, int] | None) -> bool:
+    """Tell whether the images of a camera are binned or only a part, by values that may be anything."""
+    roi = values.get("roi")
+    roi = roi if isinstance(roi, dict) else {}
+    sides = (roi.get("width") or 0, roi.get("height") or 0)
+    binned = any((values.get(key) or 0) not in (0, 1) for key in ("binning_x", "binning_y"))
+    return binned or bool(roi.get("x_offset") or roi.get("y_offset")) or sides not in ((0, 0), size)
 
 
 def _info(values: dict[str, Any], document: Document) -> _Info:
@@ -165,7 +187,7 @@ def _info(values: dict[str, Any], document: Document) -> _Info:
         found = next((one for one in KEYS[key] if values.get(one) is not None), None)
         if found is not None:
             keys[key] = (found, "data") if isinstance(values[found], dict) else (found,)
-    return _Info(name, lens, size, rectified, projection, document.path, keys)
+    return _Info(name, lens, size, rectified, projection, document.path, keys, _is_cut(values, size))
 
 
 def _write(rig: ForeignRig) -> Files:

@@ -37,6 +37,7 @@ class Source:
             InputError: a path that does not exist, a device, or one that is given twice.
         """
         self.rig = rig
+        self.paths = tuple(paths)
         self.where = quote(", ".join(map(str, paths)))
         self.alone = False  # one file, whose faults the user must hear about
         self.files: list[Path] = []
@@ -89,6 +90,12 @@ class Source:
     def find_file(self, name: str) -> Path | None:
         """The file of a name, if it is there."""
         return next((path for path in self.files if path.name == name), None)
+
+    def of_document(self, document: Document) -> Source:
+        """A source of one of its documents alone, without what it may be one calibration with."""
+        part = Source([document.path], self.rig)
+        part.files, part.documents = [document.path], [document]
+        return part
 
     def describe(self) -> str:
         """Its files in a few words, for messages."""

@@ -98,10 +98,10 @@ def read_cameras(tables: Mapping[str, Table], notes: list[str]) -> tuple[Foreign
     """Read the cameras that have a lens and a pose; the others are named in `notes`.
 
     Raises:
-        FormatError: none is left, or no pose has ever been calibrated.
+        FormatError: none is left.
     """
     cameras: list[ForeignCamera] = []
-    without_pose, without_lens, at_origin = [], [], []
+    without_pose, without_lens = [], []
     for key, table in tables.items():
         name = camera_name(key, table)
         if is_missing(table.get("matrix")) or is_missing(table.get("distortions")):
@@ -111,8 +111,6 @@ def read_cameras(tables: Mapping[str, Table], notes: list[str]) -> tuple[Foreign
             without_pose.append(name)
             continue
         cameras.append(_camera(name, table))
-        if not any(numbers(table["rotation"], name)) and not any(numbers(table["translation"], name)):
-            at_origin.append(name)
     own = len(notes)
     if without_lens:
         notes.append(f"{name_cameras(without_lens)}: left out, intrinsics are not calibrated")
@@ -122,10 +120,6 @@ def read_cameras(tables: Mapping[str, Table], notes: list[str]) -> tuple[Foreign
         raise FormatError(
             f"no camera has both intrinsics and a pose: {'; '.join(notes[own:])}; imgcal calibrate --cameras finds "
             "the poses"
-        )
-    if len(at_origin) > 1:
-        raise FormatError(
-            f"{name_cameras(at_origin)}: rotation and translation are zero: extrinsics were never calibrated"
         )
     return tuple(cameras)
 
@@ -238,8 +232,11 @@ def camera_table(camera: ForeignCamera, coefficients: int = 5) -> Table:
 
 def _read_anipose(source: Source) -> ForeignRig:
     notes: list[str] = []
-    cameras = read_cameras(_tables(source).cameras, notes)
-    return ForeignRig(ANIPOSE.name, cameras, None, "the file's world (anipose: near the first camera)", tuple(notes))
+    tables = _tables(source)
+    cameras = read_cameras(tables.cameras, notes)
+    hint = "of fisheyes, Pose2Sim's looks like anipose's: --from pose2sim reads metres" if _are_fisheyes(tables) else ""
+    frame = "the file's world (anipose: near the first camera)"
+    return ForeignRig(ANIPOSE.name, cameras, None, frame, tuple(notes), unit_hint=hint)
 
 
 def _write_anipose(rig: ForeignRig) -> Files:
@@ -253,8 +250,11 @@ def _is_pose2sim(source: Source) -> bool:
         return False
     # Anipose writes five, of a fisheye four as well.
     counts = {len(numbers(table.get("distortions", []), "distortions")) for table in tables.cameras.values()}
-    fisheyes = [table.get("fisheye") is True for table in tables.cameras.values()]
-    return counts == {4} and not all(fisheyes)
+    return counts == {4} and not _are_fisheyes(tables)
+
+
+def _are_fisheyes(tables: Tables) -> bool:
+    return all(table.get("fisheye") is True for table in tables.cameras.values())
 
 
 def _read_pose2sim(source: Source) -> ForeignRig:

@@ -61,6 +61,8 @@ def convert_rig(
         RefusedError: a lens cannot be expressed within `limit`.
     """
     if to == OURS:
+        if unit is not None and millimetres(unit, "--out-unit") != 1.0:
+            raise InputError(f"--out-unit {unit}: an imgcal rig file is always in mm")
         return _convert_to_ours(rig, name, limit, hold_distortion)
     target = find_format(to)
     if target.write is None:

@@ -73,6 +73,7 @@ PRIOR_DISTORTION = Range(1e-12, 1e6, "")
 PRIOR_ROTATION = Range(1e-12, 10.0, "rad")
 PRIOR_POSITION = Range(1e-9, 1e7, "mm")
 
+AGE = Range(0.0, 1e6, "h")  # of a device since its factory calibration
 
 SPREADS = {
     "focal_length": replace(PRIOR_FOCAL_LENGTH, low=0.0),

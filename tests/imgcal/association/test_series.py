@@ -70,8 +70,9 @@ def test_rows_that_come_three_times_and_in_any_order_change_nothing(seen, o10, a
 def test_blobs_all_in_few_places_are_refused(fiducials, seen, o10, asymmetric8):
     few = seen.select(np.isin(seen.fiducial, np.arange(8)[fiducials]) & (seen.snapshot == 0))
     many = without_labels(few.select(np.repeat(np.arange(len(few)), 40)))
-    with pytest.raises(RefusedError, match="too few blobs"):
+    with pytest.raises(RefusedError, match="too few blobs") as refused:
         associate(many, o10, asymmetric8)
+    assert refused.value.for_command.endswith("try --detector auto")
 
 
 def test_tens_of_thousands_of_snapshots_are_split_in_one_pass(seen, o10, asymmetric8, monkeypatch):

@@ -72,6 +72,13 @@ def test_a_file_of_one_camera_is_named(tmp_path: Path, capsys: pytest.CaptureFix
     assert read_rig(tmp_path / "one.yaml").num_cameras == 1
 
 
+def test_a_rig_file_of_ours_has_one_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, error = run(capsys, "O10", "--out-unit", "m", "--out", tmp_path / "rig.yaml")
+    assert (code, error) == (2, "imgcal: --out-unit m: an imgcal rig file is always in mm\n")
+    assert not (tmp_path / "rig.yaml").exists()
+    assert run(capsys, "O10", "--out-unit", "mm", "--out", tmp_path / "rig.yaml")[0] == 0
+
+
 def test_nothing_is_guessed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "model"
     assert run(capsys, "T4", "--to", "colmap", "--out", folder)[0] == 0

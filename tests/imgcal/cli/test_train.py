@@ -135,7 +135,8 @@ def test_a_second_training_in_a_folder_is_refused_and_harms_nothing(experiment, 
         (["--set", "optimizer.learning_rates.head=0.1"], "unknown group head, nearest: heads"),
         (["--set", "rig=O1"], "O1: no such file, nor one of the shipped rigs"),
         (["--set", "training.init_from=nothing.safetensors"], "nothing.safetensors: cannot be read"),
-        (["--minutes", "-1"], "training: minutes: found -1.0"),
+        (["--minutes", "-1"], "imgcal: --minutes: found -1, expected more than 0"),
+        (["--minutes", "nan"], "imgcal: --minutes: found nan, expected more than 0"),
         (["--resume"], "found no state.safetensors there"),
     ],
 )
@@ -145,6 +146,12 @@ def test_unusable_input_is_one_line(experiment, tmp_path, capsys, arguments, exp
     assert expected in error
     assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_an_error_names_only_what_the_user_typed(tmp_path, capsys):
+    given = ["train", "measurer-cnn", "--from", "ds", "--out", str(tmp_path / "out"), "--set", "training.batch_size=-1"]
+    assert main(given) == 2
+    assert capsys.readouterr().err.startswith("imgcal: --set training.batch_size=-1: training: batch_size: found -1")
 
 
 def test_a_rig_without_cameras(experiment, tmp_path, capsys):

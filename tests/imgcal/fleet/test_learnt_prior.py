@@ -149,3 +149,6 @@ def test_too_few_devices_are_refused() -> None:
         learn_prior(seen_through(offsets(7), 1))
     with pytest.raises(imgcal.InputError, match="expected 20 finite ones"):
         learn_prior(seen_through(offsets(20), 1), hours=[1.0] * 19)
+    for wrong in (-1e5, 1e9):
+        with pytest.raises(imgcal.InputError, match=r"hours: found .*, expected 0 to 1e\+06 h"):
+            learn_prior(seen_through(offsets(20), 1), hours=[1.0] * 19 + [wrong])

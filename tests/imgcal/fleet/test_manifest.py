@@ -60,8 +60,10 @@ def test_a_row_that_cannot_be_used_says_so_and_ends_nothing(tmp_path: Path) -> N
     write_manifest(tmp_path / "m.csv", [{"capture": "a", "time": "noon"}, {"capture": None, "time": None}])
     one, two = items(tmp_path / "m.csv", rig="T4", object="cube8")
     assert "row 0: found time 'noon'" in one.fault
-    assert "row 1: found no capture" in two.fault
-    assert "found no rig" in items(tmp_path / "m.csv")[0].fault or "noon" in items(tmp_path / "m.csv")[0].fault
+    assert two.fault == "row 1: found no capture, expected one in its column"
+    assert (
+        items(tmp_path / "m.csv")[0].fault == "row 0: found no rig, expected one in its column, or --rig for all rows"
+    )
 
 
 @pytest.mark.parametrize(
@@ -107,6 +109,15 @@ def test_a_time_out_of_range_is_a_fault_of_its_row(time: str, tmp_path: Path) ->
     one, two = items(tmp_path / "m.csv", rig="T4", object="cube8")
     assert one.fault.startswith("row 0: found time") and one.time is None
     assert two.fault is None
+    assert process(one, Settings())["status"] == "unusable"
+
+
+@pytest.mark.parametrize("hours", ["-1e5", "-1", "1e9"])
+def test_an_impossible_age_is_a_fault_of_its_row(hours: str, tmp_path: Path) -> None:
+    (tmp_path / "m.csv").write_text(f"capture,hours\na.csv,{hours}\nb.csv,0\n")
+    one, two = items(tmp_path / "m.csv", rig="T4", object="cube8")
+    assert one.fault == f"row 0: hours: found {float(hours):g}, expected 0 to 1e+06 h"
+    assert two.fault is None and two.given == (("hours", 0.0),)
     assert process(one, Settings())["status"] == "unusable"
 
 

@@ -22,9 +22,8 @@ translation = {translation}
 VECTOR = [0.1, 0.3, -0.2]
 
 
-def text(
-    new: bool, n: int, rotation: object = tuple(VECTOR), translation: object = (0.1, 0.2, 0.3), count: int = 0
-) -> str:
+def text(new: bool, n: int, rotation: object = tuple(VECTOR), translation: object = None, count: int = 0) -> str:
+    translation = (0.1, 0.2, 0.3 * n) if translation is None else translation
     shown = [f'"{v}"' if isinstance(v, str) else str(list(v)) for v in (rotation, translation)]
     return CAMERA.format(head="cameras." if new else "cam_", key="cam_id" if new else "port", n=n, rotation=shown[0],
                          translation=shown[1], count=count)  # fmt: skip

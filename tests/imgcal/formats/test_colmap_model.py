@@ -101,6 +101,14 @@ def test_images_of_one_moment_are_a_rig() -> None:
         rig_from_model("colmap", CAMERAS, images(taken)[:1], [])
 
 
+def test_several_images_of_a_camera_in_one_folder_are_noted() -> None:
+    taken = {f"{camera}_{moment}.png": pose() for moment in range(3) for camera in "ab"}
+    (note,) = [note for note in rig_from_model("colmap", CAMERAS, images(taken), []).notes if "rigs.txt" in note]
+    assert note.startswith("found no rigs.txt, and 6 images in one folder with 2 sets of intrinsics: treated as")
+    taken = {"a_0.png": pose(), "b_0.png": pose()}
+    assert not any("rigs.txt" in note for note in rig_from_model("colmap", CAMERAS, images(taken), []).notes)
+
+
 def test_a_rig_names_cameras_by_the_folders_of_their_images() -> None:
     rigs = [ColmapRig(1, {1: (np.eye(3), np.zeros(3)), 2: pose()})]
     taken = {"a/left/0.png": pose(), "b/right/0.png": pose()}

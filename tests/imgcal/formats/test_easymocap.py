@@ -21,8 +21,8 @@ def files(
     outside: dict[str, object] = {"names": list(extri)}
     for name in intri:
         inside |= {f"K_{name}": K, f"dist_{name}": np.array([[-0.1, 0.02, 0, 0, 0.0]])}
-    for name in extri:
-        outside |= {f"R_{name}": TURN, f"T_{name}": np.array([[0.1], [0.2], [3.0]])} | (
+    for place, name in enumerate(extri):
+        outside |= {f"R_{name}": TURN, f"T_{name}": np.array([[0.1], [0.2], [3.0 + place]])} | (
             {f"Rot_{name}": R} if rot else {}
         )
     return {"intri__yml": storage_text(inside), "extri__yml": storage_text(outside)}

@@ -43,6 +43,20 @@ def test_poses_are_a_chain(tmp_path: Path) -> None:
     assert rig.cameras[1].lens.coefficients == (-0.1, 0.02, 0.001, -0.002)
 
 
+def test_poses_that_contradict_each_other_are_noted(tmp_path: Path) -> None:
+    between, of_imu = pose(), pose()
+    for agrees in (True, False):
+        imu = compose(between, of_imu) if agrees else compose(pose(), of_imu)
+        content = {
+            "cam0": camera(T_cam_imu=rows(of_imu)),
+            "cam1": camera(T_cam_imu=rows(imu), T_cn_cnm1=rows(between)),
+        }
+        rig = read(tmp_path, content)
+        assert np.allclose(rig.cameras[1].translation, between[1])
+        found = [note for note in rig.notes if "contradict" in note]
+        assert [note.startswith("cam1 from imu:") for note in found] == [True] * (not agrees)
+
+
 def test_variants_of_extrinsics(tmp_path: Path) -> None:
     between, of_imu = pose(), pose()
     flat = np.array(rows(between)).ravel().tolist()

@@ -27,7 +27,8 @@ def text(model: str = "LENSMODEL_OPENCV5", ks: str = "-0.1, 0.02, 0, 0, 0.01", k
 
 def test_both_names_of_extrinsics(tmp_path: Path) -> None:
     for key in ("extrinsics", "rt_cam_ref"):
-        folder = put(tmp_path, left__cameramodel=text(key=key), right__cameramodel=text("LENSMODEL_PINHOLE", ""))
+        right = text("LENSMODEL_PINHOLE", "").replace("1., 2, -3.", "4., 2, -3.")
+        folder = put(tmp_path, left__cameramodel=text(key=key), right__cameramodel=right)
         rig = read_foreign_rig(folder)
         assert (rig.format, rig.unit, rig.names) == ("mrcal", None, ["left", "right"])
         assert np.allclose(rig.cameras[0].rotation, rotation_from_vector(np.array([0.1, 0.2, 0.3])))

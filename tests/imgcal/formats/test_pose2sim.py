@@ -5,7 +5,7 @@ import pytest
 
 from imgcal.errors import InputError, RefusedError
 from imgcal.formats import convert_rig, read_foreign_rig
-from tests.imgcal.formats.rigs import apart, brown, put, put_files, read_in_mm, rig_of
+from tests.imgcal.formats.rigs import apart, brown, fisheye, put, put_files, read_in_mm, rig_of
 from tests.imgcal.formats.test_anipose import TEXT
 
 FOUR = TEXT.replace(", 0.0, 0.0, 0.0, 0.0]\nrot", ", 0.0, 0.0, 0.0]\nrot")
@@ -22,6 +22,16 @@ def test_extrinsics_of_zeros_are_refused(tmp_path: Path) -> None:
     zeros = FOUR.replace("[0.0, 0.3, 0.0]", "[0.0, 0.0, 0.0]").replace("[-200.0, 0.0, 10.0]", "[0.0, 0.0, 0.0]")
     with pytest.raises(InputError, match=r"this is a Pose2Sim Calib.toml: cameras left, right: .*never calibrated"):
         read_foreign_rig(put(tmp_path, Calib__toml=zeros) / "Calib.toml")
+
+
+def test_fisheyes_alone_could_be_anipose_s(tmp_path: Path) -> None:
+    rig = rig_of(fisheye(0.01), fisheye(0.02))
+    path = put_files(tmp_path, convert_rig(rig, "pose2sim", "x").files)
+    with pytest.raises(
+        InputError, match=r"unit of length \(of fisheyes, .*: --from pose2sim reads metres\): give imgcal"
+    ):
+        read_in_mm(path)
+    assert apart(rig, read_in_mm(path, name="pose2sim")) < 1e-8
 
 
 def test_written_and_read(tmp_path: Path) -> None:

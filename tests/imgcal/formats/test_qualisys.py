@@ -17,7 +17,7 @@ def camera(
 ) -> str:
     rows = " ".join(f'r{i + 1}{j + 1}="{float(AXES[i, j])!r}"' for i in range(3) for j in range(3))
     return f"""<camera serial="{serial}" {attributes}><fov_video left="10" top="20" right="1289" bottom="819"/>
-      <transform x="1000" y="-2000" z="1500" {rows}/>
+      <transform x="{1000 if serial == "17" else 1100}" y="-2000" z="1500" {rows}/>
       <intrinsic focallength="9" sensorMinU="0" sensorMaxU="{unit * 1300 - 1}"
        sensorMinV="0" sensorMaxV="{unit * 840 - 1}"
        focalLengthU="{900 * unit}" focalLengthV="{901 * unit}" centerPointU="{650 * unit}" centerPointV="{420 * unit}"

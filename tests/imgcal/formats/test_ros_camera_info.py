@@ -55,6 +55,22 @@ def test_one_file_is_one_camera(tmp_path: Path) -> None:
     assert any("give both files" in note for note in rig.notes)
 
 
+def test_binning_and_a_region_of_interest_are_noted(tmp_path: Path) -> None:
+    left, right = pair()
+    plain = "binning_x: 0\nbinning_y: 1\nroi: {x_offset: 0, y_offset: 0, width: 0, height: 0, do_rectify: false}\n"
+    for more, noted in (
+        (plain, False),
+        (plain.replace("width: 0, height: 0", "width: 1280, height: 800"), False),
+        (plain.replace("_x: 0", "_x: 2"), True),
+        (plain.replace("x_offset: 0", "x_offset: 100"), True),
+        (plain.replace("height: 0", "height: 400"), True),
+    ):
+        folder = put(tmp_path, left__yaml=left, right__yaml=right + more)
+        for given, names in ((folder, "camera right"), (folder / "right.yaml", "camera right")):
+            found = [note for note in read_foreign_rig(given).notes if "binning" in note]
+            assert [note.startswith(names) for note in found] == [True] * noted
+
+
 def test_the_message_itself_is_read_too(tmp_path: Path) -> None:
     text = yaml.safe_dump({"width": 640, "height": 480, "distortion_model": "equidistant", "D": [0.1, 0.2, 0.0, 0.0],
                            "K": K1.ravel().tolist(), "R": [0.0] * 9, "P": [0.0] * 12})  # fmt: skip

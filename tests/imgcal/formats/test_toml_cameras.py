@@ -25,13 +25,6 @@ def test_who_has_no_pose_is_named_and_left_out() -> None:
         read_cameras({"c": LENS}, [])
 
 
-def test_zeros_are_no_extrinsics() -> None:
-    zero = {**LENS, "rotation": [0.0, 0.0, 0.0], "translation": [0.0, 0.0, 0.0]}
-    assert len(read_cameras({"a": zero, "b": POSED}, [])) == 2  # one camera may be the origin
-    with pytest.raises(FormatError, match="cameras a, c: rotation and translation are zero"):
-        read_cameras({"a": zero, "b": POSED, "c": zero}, [])
-
-
 def test_a_fisheye_has_four_coefficients() -> None:
     fish = {**POSED, "distortions": [0.1, 0.2, 0.3, 0.4], "fisheye": True}
     assert read_cameras({"a": fish}, [])[0].lens.model == "fisheye"

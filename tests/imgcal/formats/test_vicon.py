@@ -14,7 +14,8 @@ RADIAL = "ViconRadial2 642 399 -3.0e-8 1.0e-14 0"
 
 
 def camera(device: str, frames: int = 1, radial: str = RADIAL, aspect: float = 1.0) -> str:
-    frame = f"""<KeyFrame FRAME="0" FOCAL_LENGTH="1500" ORIENTATION="{X!r} {Y!r} {Z!r} {W!r}" POSITION="1000 -2000 1500"
+    place = "1000 -2000 1500" if device == "21" else "1100 -2000 1500"
+    frame = f"""<KeyFrame FRAME="0" FOCAL_LENGTH="1500" ORIENTATION="{X!r} {Y!r} {Z!r} {W!r}" POSITION="{place}"
         PRINCIPAL_POINT="640 400" VICON_RADIAL2="{radial}" WORLD_ERROR="0.2"/>"""
     return f"""<Camera DEVICEID="{device}" PIXEL_ASPECT_RATIO="{aspect}" SENSOR_SIZE="1280 800" SKEW="0">
         <KeyFrames>{frame * frames}</KeyFrames></Camera>"""
