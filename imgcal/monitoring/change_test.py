@@ -28,11 +28,12 @@ from imgcal.types import PARAMETER_KINDS, CameraRig
 
 CHANGES: Mapping[str, slice] = {kind: part for kind, part in PARAMETER_KINDS.items() if kind != "distortion"}
 """Kinds of change, and the camera parameters that each one covers."""
-FORMS = {**CHANGES, "tilt": slice(0, 2)}
-"""The same, and a rotation about an axis in the image plane, as by the joints of a mount."""
-FORMS_OF = {kind: (kind, "tilt") if kind == "rotation" else (kind,) for kind in CHANGES}
+FORMS = {**CHANGES, "tilt": slice(0, 2), "turn in place": slice(0, 3), "tilt in place": slice(0, 2)}
+"""The same, a rotation about an axis in the image plane, as by the joints of a mount, and both without a shift."""
 TURNS = ("rotation", "tilt")
-"""Forms in which a camera turns about a joint of its mount."""
+"""Forms in which a camera turns about a joint of its mount, which shifts it."""
+FORMS_OF = {kind: (*TURNS, "turn in place", "tilt in place") if kind == "rotation" else (kind,) for kind in CHANGES}
+"""Forms whose mean evidence is that of a kind: the joint may be at the projection centre, or far from it."""
 MOTION_KINDS, MOTION = ("rotation", "position"), slice(0, 6)
 """Kinds of change that move the camera, and the parameters that they cover."""
 UNUSUAL_LOG_PRIOR, UNUSUAL_SHARE = -30.0, 0.05
@@ -252,9 +253,7 @@ class ChangeTest:
         Returns:
             The changes (K,) and their covariance (K, K).
         """
-        turns = [change_std({camera: "rotation"}, self.pixels, jump) for jump in JUMPS]
-        for std in turns:
-            std[camera, CHANGES["position"]] = 0.0
+        turns = [change_std({camera: "turn in place"}, self.pixels, jump) for jump in JUMPS]
         turn, _ = self._average(camera, [(std, False) for std in turns])
         return self._average(camera, possible_changes(camera, kind, self.pixels, float(turn[:3].norm())))
 

@@ -87,6 +87,7 @@ def test_the_size_of_a_turn_is_right_wherever_the_joint_of_the_mount_is(joint: f
 def test_a_tilt_that_a_shift_of_the_lens_explains_as_well_is_a_rotation(tilt, principal_point, kind) -> None:
     """A rotation about any axis has one more parameter, and pays for it."""
     odds = {"tilt": tilt, "rotation": 10.0, "position": 5.0, "focal_length": 0.0, "principal_point": principal_point}
+    odds |= {"tilt in place": tilt, "turn in place": 10.0}
 
     def evidence(changes: Mapping[int, str | None]) -> float:
         return odds.get(changes[1] or "", 8.0)
@@ -103,7 +104,8 @@ def test_a_shift_of_the_lens_needs_more_evidence_than_a_rotation() -> None:
     since = PendingChange.of(result, before, 0.0, {1: None})
 
     def decide(principal_point: float) -> tuple[str | None, str | None] | None:
-        odds = {"rotation": 12.0, "tilt": 12.0, "position": 3.0, "principal_point": principal_point}
+        odds = dict.fromkeys(("rotation", "tilt", "turn in place", "tilt in place"), 12.0)
+        odds |= {"position": 3.0, "principal_point": principal_point}
         test = SimpleNamespace(odds=lambda changes: odds.get(changes[1] or "", 5.0))
         return since.decide(test, 1, last=False)  # type: ignore[arg-type]
 
