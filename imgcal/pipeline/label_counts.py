@@ -91,10 +91,8 @@ def count_labels(
 
     points = poses.apply(obj.points.to(factory.focal_length))
     projection = factory.expand(len(used)).project_values(points, obj.radius)
-    size = factory.image_size.numpy()[:, None]
-    uv = projection.uv.numpy()
     visible = projection.visible.numpy() & labelled.columns(obj)
-    inside = ((uv > MARGIN * size) & (uv < (1 - MARGIN) * size)).all(-1) & visible
+    inside = is_well_inside(projection.uv.numpy(), factory) & visible
     fitting, expected = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
     fitting[used], expected[used] = kept.sum(-1), inside.sum(-1)
     usable = count(detections.usable)
@@ -111,6 +109,12 @@ def count_labels(
         found=looked[:, None] & (fitting >= np.maximum(LEAST_FOUND, LEAST_SHARE * expected)),
         crowd=np.where(looked[:, None], _usual_false_blobs(spare), _usual_extra_blobs(spare, whole)),
     )
+
+
+def is_well_inside(uv: NDArray[np.float64], rig: CameraRig) -> NDArray[np.bool_]:
+    """Tell which pixels (*B, C, N, 2) are so far from the image border that a drifted camera shows them, too."""
+    size = rig.image_size.numpy()[:, None]
+    return np.asarray(((uv > MARGIN * size) & (uv < (1 - MARGIN) * size)).all(-1))
 
 
 def _least_of_whole(labelled: Associations, obj: CalibrationObject) -> Counts:

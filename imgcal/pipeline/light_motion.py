@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from imgcal.estimation import LEAST_SNAPSHOTS
 from imgcal.pipeline.camera_places import CameraView
-from imgcal.pipeline.label_counts import MARGIN
-from imgcal.pipeline.motion_check import split_cleanly
+from imgcal.pipeline.label_counts import is_well_inside
+from imgcal.pipeline.motion_check import compare_views, split_cleanly
 from imgcal.types import CameraRig, Detections, MovedCamera, MovedError
 
 MOST_MIXED = 0.4
@@ -51,23 +51,21 @@ def _find_lost_cameras(
 ) -> list[tuple[int, str]]:
     """Find the first moment after each move, in chronological order, and the camera's name."""
     shape = (len(blobs.snapshot_names), rig.num_cameras)
-    image, size = rig.project(torch.from_numpy(points)), rig.image_size.numpy()[:, None]
-    uv = image.uv.numpy()
-    inside = ((uv > MARGIN * size) & (uv < (1 - MARGIN) * size)).all(-1) & image.visible.numpy()  # (C, R)
+    image = rig.project(torch.from_numpy(points))
+    inside = is_well_inside(image.uv.numpy(), rig) & image.visible.numpy()  # (C, R)
     in_place, expected, usable = (np.zeros(shape, dtype=np.int64) for _ in range(3))
     np.add.at(in_place, moment, seen)
     np.add.at(expected, moment, inside.T | seen)
     np.add.at(usable, (blobs.snapshot, blobs.camera), 1)
-    elsewhere = np.minimum(expected, usable) - in_place
-    agrees, differs = in_place > elsewhere, (elsewhere > in_place) & (2 * elsewhere >= expected)
+    agrees, differs = compare_views(in_place, np.minimum(expected, usable) - in_place, expected)
     suspects = np.flatnonzero(differs.sum(0) >= LEAST_SNAPSHOTS).tolist()
-    moves = []
+    arranged, moves = _by_moment(moment, points, shape[0]), []
     for camera in suspects:
         rows = np.flatnonzero(agrees[:, camera] | differs[:, camera])
         wrong = differs[rows, camera]
         place = split_cleanly(wrong, LEAST_SNAPSHOTS, len(suspects), MOST_MIXED)
         if place is not None:
-            view = CameraView(blobs.select(blobs.camera == camera), *_by_moment(moment, points, shape[0]), rig, camera)
+            view = CameraView(blobs.select(blobs.camera == camera), *arranged, rig, camera)
             if view.some_turn_explains(rows[wrong]) and not view.one_place_explains(rows[~wrong], rows[wrong]):
                 moves.append((int(rows[place]), rig.camera_names[camera]))
     return sorted(moves)

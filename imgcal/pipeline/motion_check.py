@@ -270,8 +270,7 @@ def _find_gone(
     """
     counts, moments = fit.tally, labelled.moments[labelled.used]
     moves = []
-    agrees, differs = counts.kept > counts.unexplained, counts.unexplained > counts.kept
-    differs &= 2 * counts.unexplained >= counts.expected
+    agrees, differs = compare_views(counts.kept, counts.unexplained, counts.expected)
     doubtful = int((differs.sum(0) >= LEAST_SNAPSHOTS).sum())
     for camera, name in enumerate(rig.camera_names):
         rows = np.flatnonzero(agrees[:, camera] | differs[:, camera])
@@ -283,6 +282,11 @@ def _find_gone(
         if place is not None and _shows_object_elsewhere(fit, labelled, rig, obj, rows[~wrong], rows[wrong], camera):
             moves.append(MovedCamera(name, labelled.snapshots[rows[place]].name, "unknown"))
     return moves
+
+
+def compare_views(kept: Rows, unexplained: Rows, expected: Rows) -> tuple[Bools, Bools]:
+    """Tell where cameras agree with the rest of the rig, and where they differ: (S, C) each; see `LabelCounts`."""
+    return kept > unexplained, (unexplained > kept) & (2 * unexplained >= expected)
 
 
 def split_cleanly(wrong: Bools, least: int, cameras: int, mixed: float = MOST_MIXED) -> int | None:
