@@ -51,17 +51,17 @@ def test_the_moment_is_found_from_a_wrong_start(bumped):
 
 def test_the_size_of_a_turn_about_a_joint_of_the_mount_is_right():
     """It shifts the camera, too, which looks like more of a turn."""
-    rig, wand, truth = faults.wand_in_a_room(COUNT, 2)
-    angle, joint, inward = np.radians(1.0), torch.tensor([0.0, 150.0, 0.0]).double(), truth.rig.cam_from_rig.rotation.mT
+    rig, wand, truth = faults.wand_in_a_room(COUNT, 4)
+    angle, joint, inward = np.radians(3.0), torch.tensor([0.0, 150.0, 0.0]).double(), truth.rig.cam_from_rig.rotation.mT
     turn = rotation_from_vector(torch.tensor([angle, 0.0, 0.0]).double())
     step = torch.zeros_like(RigPrior().std(truth.rig)).double()
     step[CAMERA, 0], step[CAMERA, 3:6] = angle, inward[CAMERA].double() @ (joint - turn.mT @ joint)
     truth = faults.changed_from(truth, wand, CAMERA, FIRST, lambda r: r.retract(step))
-    observations, _ = accepted_observations(associate(faults.blobs(truth, 2, labelled=True), rig, wand), rig, wand)
+    observations, _ = accepted_observations(associate(faults.blobs(truth, 4, labelled=True), rig, wand), rig, wand)
     fit = estimate(observations, rig, wand)
     (move,) = find_moves(fit.problem, fit.solution.state, rig.camera_names, NAMES, OPTIONS)
     assert (move.camera, move.kind) == ("cam04", "rotation")
-    assert abs(move.size - 1.0) < 3 * move.sigma < 0.1
+    assert abs(move.size - 3.0) < 3 * move.sigma < 0.1
 
 
 def test_labels_that_are_dropped_leave_the_pose_of_their_snapshot(bumped):
