@@ -302,7 +302,7 @@ class _Series:
 def _refusal(snapshots: Sequence[SnapshotIdentity], sight: Sight | None) -> RefusedError:
     """Say why no snapshot could be decided, and what may help where nothing but blobs was looked at."""
     reason = _most_frequent_reason(snapshots)
-    advice = "if frames show more markers, which are not round or too faint, try --detector auto"
+    advice = "if the frames show more markers, faint or not round, try --detector auto"
     helps = sight is None and reason.startswith(TOO_FEW_BLOBS)
     return RefusedError(f"identity: {reason}", command=advice if helps else "")
 

@@ -40,7 +40,7 @@ class Train(arguments.Train):
             raise InputError(f"{self.out}: found a training there already, expected a new folder, or --resume")
         if self.resume and not there:
             raise InputError(
-                f"{self.out}: found no {STATE} there, expected one to --resume from; without --resume it begins"
+                f"{self.out}: found no {STATE} there, expected one to --resume from; omit --resume to begin"
             )
         if experiment.training.threads is not None:
             torch.set_num_threads(experiment.training.threads)

@@ -154,7 +154,7 @@ def _links(values: dict[str, Any], entries: dict[str, dict[str, Any]], names: li
 
 
 def _contradictions(links: list[Link], poses: dict[str, Pose]) -> list[str]:
-    """Name the links that say something else than the poses of the cameras do, the IMU's pose being what says first."""
+    """Name the links that contradict the cameras' poses; the first link to the IMU defines its pose."""
     known = dict(poses)
     size = max(float(np.linalg.norm(pose[1])) for pose in poses.values())
     off = []

@@ -88,8 +88,7 @@ def count_frames(path: Path) -> int:
 def read_frame(path: str | Path, page: int = 0, size: Size | None = None) -> Frame:
     """Read a grey image of 8 or 16 bit.
 
-    Pixels are those of the file, in its order: how it would be turned for display (Orientation in TIFF and Exif) is
-    no matter of the camera.
+    Pixels are returned as they are stored: an orientation for display (TIFF, Exif) is ignored.
 
     Args:
         path: image file.

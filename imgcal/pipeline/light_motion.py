@@ -1,4 +1,4 @@
-"""Find cameras that moved while unknown markers were shown, by more than the markers' labels follow.
+"""Find cameras that moved while unknown markers were shown, farther than labels can follow.
 
 Only blobs that fit the rig have a label, so a camera has none after such a move: its blobs are where no marker should
 be. As for known objects, one other place of the camera must explain them; reflections do not follow the markers.
