@@ -36,15 +36,22 @@ def draw_new(splats: Splats, image_size: tuple[int, int]) -> tuple[Tensor, Tenso
     """Draw splats into new images (B, K, H, W); return the images, then what `draw` returns."""
     kind = np.float64 if splats.uv.dtype == torch.float64 else np.float32
     # NumPy asks Linux for huge pages: a large new tensor spends most of its time on faults of small pages.
-    images = torch.from_numpy(np.empty((len(splats.uv), splats.colours.shape[2], *image_size), dtype=kind))
-    return images, *draw(images, splats)
+    images = np.empty((len(splats.uv), splats.colours.shape[2], *image_size), dtype=kind)
+    return torch.from_numpy(images), *_draw(images, splats)
 
 
 def draw(images: Tensor, splats: Splats) -> tuple[Tensor, Tensor]:
     """Draw splats, overwriting images (B, K, H, W); return what `windows` returns."""
-    steps, starts = windows(splats, max(images.shape[2:]))
-    _in_threads(_add, [images.numpy(), *_arrays(splats.sizes, splats.weight, splats.colours, steps, starts)])
-    return steps, starts
+    return _draw(images.numpy(), splats)
+
+
+def _draw(images: Array, splats: Splats) -> tuple[Tensor, Tensor]:
+    # Large images push Python and PyTorch out of the caches, and each call then costs several microseconds: convert
+    # each tensor once.
+    uv, sizes, weight, colours, visible = _arrays(*splats)
+    steps, starts, edges = _windows(uv, sizes, visible, REACH[splats.uv.dtype], max(images.shape[2:]))
+    _in_threads(_add, [images, sizes, weight, colours, steps, starts])
+    return edges, torch.from_numpy(starts)
 
 
 def windows(splats: Splats, longest: int) -> tuple[Tensor, Tensor]:
@@ -55,11 +62,16 @@ def windows(splats: Splats, longest: int) -> tuple[Tensor, Tensor]:
 
     """
     uv, sizes, visible = _arrays(splats.uv, splats.sizes, splats.visible)
-    half = min(math.ceil(REACH[splats.uv.dtype] * _widest(sizes, visible)), longest)
-    edges = torch.empty((*splats.uv.shape, 2 * half + 2), dtype=splats.uv.dtype)
-    starts = torch.empty(splats.uv.shape, dtype=torch.int32)
-    _place(uv, sizes, visible, longest, *_arrays(edges, starts))
-    return edges.erf_(), starts  # all edges at once, which is vectorized
+    _, starts, edges = _windows(uv, sizes, visible, REACH[splats.uv.dtype], longest)
+    return edges, torch.from_numpy(starts)
+
+
+def _windows(uv: Array, sizes: Array, visible: Flags, reach: float, longest: int) -> tuple[Array, Places, Tensor]:
+    """Do the work of `windows`; return the error function, the first pixels, and the former as a tensor, too."""
+    half = min(math.ceil(reach * _widest(sizes, visible)), longest)
+    steps, starts = np.empty((*uv.shape, 2 * half + 2), dtype=uv.dtype), np.empty(uv.shape, dtype=np.int32)
+    _place(uv, sizes, visible, longest, steps, starts)
+    return steps, starts, torch.from_numpy(steps).erf_()  # all edges at once, which is vectorized
 
 
 def gradients(upstream: Tensor, splats: Splats, steps: Tensor, starts: Tensor) -> tuple[Tensor, ...]:
@@ -72,7 +84,8 @@ def gradients(upstream: Tensor, splats: Splats, steps: Tensor, starts: Tensor) -
 
 def _arrays(*tensors: Tensor) -> list[NDArray[Any]]:
     """Share the memory of contiguous tensors; copy the others."""
-    return [tensor.detach().contiguous().numpy() for tensor in tensors]
+    plain = (tensor.detach() if tensor.requires_grad else tensor for tensor in tensors)
+    return [(tensor if tensor.is_contiguous() else tensor.contiguous()).numpy() for tensor in plain]
 
 
 def _in_threads(work: Callable[..., None], arrays: list[NDArray[Any]]) -> None:

@@ -1,6 +1,7 @@
 """Draw fiducials as Gaussian splats: differentiable, anti-aliased, sub-pixel exact."""
 
 import math
+from contextlib import nullcontext
 from typing import Literal
 
 import torch
@@ -81,15 +82,20 @@ def splat(
             raise ValueError(f"{name} must have shape {expected}, found {tuple(value.shape)}")
     dtype = uv.dtype if uv.dtype == torch.float64 else torch.float32
     # Autocast would round the profiles to bfloat16, and the gradient of a coordinate with them.
-    with torch.autocast(uv.device.type, enabled=False):
-        sizes = torch.as_tensor(size, dtype=dtype, device=uv.device).expand(*batch, count)
-        ones = torch.ones((), dtype=dtype, device=uv.device)
+    kind = uv.device.type
+    with torch.autocast(kind, enabled=False) if torch.is_autocast_enabled(kind) else nullcontext():
+
+        def one_each(value: Tensor | float, dtype: torch.dtype) -> Tensor:  # (images, N)
+            if not isinstance(value, Tensor):
+                return torch.full((images, count), value, dtype=dtype, device=uv.device)
+            return value.to(uv.device, dtype).expand(*batch, count).reshape(images, count)
+
         splats = Splats(
             uv.to(dtype).reshape(images, count, 2),
-            sizes.reshape(images, count),
-            (ones if intensity is None else intensity.to(dtype)).expand(*batch, count).reshape(images, count),
+            one_each(size, dtype),
+            one_each(1.0 if intensity is None else intensity, dtype),
             colours.to(dtype).expand(*batch, *colours.shape[-2:]).reshape(images, count, colours.shape[-1]),
-            (ones > 0 if visible is None else visible).expand(*batch, count).reshape(images, count),
+            one_each(True if visible is None else visible, torch.bool),
         )
         shape = (*batch, colours.shape[-1], *image_size)
         if out is not None:
