@@ -49,9 +49,9 @@ def _draw(images: Array, splats: Splats) -> tuple[Tensor, Tensor]:
     # Large images push Python and PyTorch out of the caches, and each call then costs several microseconds: convert
     # each tensor once.
     uv, sizes, weight, colours, visible = _arrays(*splats)
-    steps, starts, edges = _windows(uv, sizes, visible, REACH[splats.uv.dtype], max(images.shape[2:]))
+    steps, starts = _windows(uv, sizes, visible, REACH[splats.uv.dtype], max(images.shape[2:]))
     _in_threads(_add, [images, sizes, weight, colours, steps, starts])
-    return edges, torch.from_numpy(starts)
+    return torch.from_numpy(steps), torch.from_numpy(starts)
 
 
 def windows(splats: Splats, longest: int) -> tuple[Tensor, Tensor]:
@@ -62,16 +62,16 @@ def windows(splats: Splats, longest: int) -> tuple[Tensor, Tensor]:
 
     """
     uv, sizes, visible = _arrays(splats.uv, splats.sizes, splats.visible)
-    _, starts, edges = _windows(uv, sizes, visible, REACH[splats.uv.dtype], longest)
-    return edges, torch.from_numpy(starts)
+    steps, starts = _windows(uv, sizes, visible, REACH[splats.uv.dtype], longest)
+    return torch.from_numpy(steps), torch.from_numpy(starts)
 
 
-def _windows(uv: Array, sizes: Array, visible: Flags, reach: float, longest: int) -> tuple[Array, Places, Tensor]:
-    """Do the work of `windows`; return the error function, the first pixels, and the former as a tensor, too."""
+def _windows(uv: Array, sizes: Array, visible: Flags, reach: float, longest: int) -> tuple[Array, Places]:
     half = min(math.ceil(reach * _widest(sizes, visible)), longest)
     steps, starts = np.empty((*uv.shape, 2 * half + 2), dtype=uv.dtype), np.empty(uv.shape, dtype=np.int32)
     _place(uv, sizes, visible, longest, steps, starts)
-    return steps, starts, torch.from_numpy(steps).erf_()  # all edges at once, which is vectorized
+    torch.from_numpy(steps).erf_()  # all edges at once, which is vectorized
+    return steps, starts
 
 
 def gradients(upstream: Tensor, splats: Splats, steps: Tensor, starts: Tensor) -> tuple[Tensor, ...]:

@@ -81,15 +81,15 @@ def splat(
             expected = f"{tuple(uv.shape[:-1])} or broadcast to it"
             raise ValueError(f"{name} must have shape {expected}, found {tuple(value.shape)}")
     dtype = uv.dtype if uv.dtype == torch.float64 else torch.float32
+
+    def one_each(value: Tensor | float, dtype: torch.dtype) -> Tensor:  # (images, N)
+        if not isinstance(value, Tensor):
+            return torch.full((images, count), value, dtype=dtype, device=uv.device)
+        return value.to(uv.device, dtype).expand(*batch, count).reshape(images, count)
+
     # Autocast would round the profiles to bfloat16, and the gradient of a coordinate with them.
     kind = uv.device.type
     with torch.autocast(kind, enabled=False) if torch.is_autocast_enabled(kind) else nullcontext():
-
-        def one_each(value: Tensor | float, dtype: torch.dtype) -> Tensor:  # (images, N)
-            if not isinstance(value, Tensor):
-                return torch.full((images, count), value, dtype=dtype, device=uv.device)
-            return value.to(uv.device, dtype).expand(*batch, count).reshape(images, count)
-
         splats = Splats(
             uv.to(dtype).reshape(images, count, 2),
             one_each(size, dtype),
