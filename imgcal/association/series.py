@@ -48,8 +48,15 @@ class Associations:
 
     @property
     def used(self) -> list[int]:
-        """Numbers of the snapshots that are not refused."""
-        return [i for i, snapshot in enumerate(self.snapshots) if snapshot.status != "refused"]
+        """Numbers of the snapshots that are neither refused nor part of the average of another one."""
+        return [i for i, s in enumerate(self.snapshots) if s.status != "refused" and s.rests_with < 0]
+
+    @property
+    def used_rows(self) -> NDArray[np.int64]:
+        """For each row, the used row that stands for it, itself or the average of a rest, -1 = refused: (S,)."""
+        row, used = np.full(len(self.snapshots), -1), self.used
+        row[used] = np.arange(len(used))
+        return np.array([row[i if s.rests_with < 0 else s.rests_with] for i, s in enumerate(self.snapshots)], np.int64)
 
     @property
     def moments(self) -> NDArray[np.int64]:
@@ -64,7 +71,7 @@ class Associations:
     def moment_counts(self) -> tuple[int, int]:
         """Number of the input's snapshots with a used row, and of all."""
         moments = self.moments
-        return len(np.unique(moments[self.used])), len(np.unique(moments))
+        return len(np.unique(moments[self.used_rows >= 0])), len(np.unique(moments))
 
     @property
     def part_of_rows(self) -> NDArray[np.int64]:
@@ -333,9 +340,10 @@ def drop_snapshots(labelled: Associations, rows: Sequence[int], reason: str = UN
 
 def refuse_snapshots(labelled: Associations, rows: Sequence[int], reason: str) -> Associations:
     """Remove the labels of snapshots (numbers among the used ones), and record the reason."""
-    numbers, snapshots = [labelled.used[row] for row in rows], list(labelled.snapshots)
-    for number in numbers:
-        snapshots[number] = replace(snapshots[number], status="refused", reason=reason, rig_from_object=None)
+    numbers, snapshots = np.flatnonzero(np.isin(labelled.used_rows, rows)), list(labelled.snapshots)
+    for number in numbers.tolist():
+        refused = replace(snapshots[number], status="refused", reason=reason, rig_from_object=None, rests_with=-1)
+        snapshots[number] = refused
     detections = labelled.detections
     fiducial = np.where(np.isin(detections.snapshot, numbers), -1, detections.fiducial)
     return replace(labelled, detections=replace(detections, fiducial=fiducial), snapshots=tuple(snapshots))

@@ -150,7 +150,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
             **counts_by_camera(calibration, camera),
         }
     alternatives = max(snapshots[s].alternatives for s in labelled.used)
-    names = {snapshots[s].name for s in labelled.used}
+    names = {snapshots[s].name for s in np.flatnonzero(labelled.used_rows >= 0)}
     return {
         "version": imgcal.__version__,
         "status": "ok",
@@ -189,6 +189,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "predicted_error": calibration.predicted_error.summary(),
         "scale": calibration.scale.values,
         "repeats": calibration.repeats.values,
+        "rests": calibration.rests.values,
         "unit_doubt": unit_doubt(calibration.factory, calibration.obj, calibration.from_scratch) or None,
         "seconds": seconds,
     }
@@ -268,7 +269,7 @@ def refused_summary(
         "moved": [move.as_values() for move in moved], "late": [], "doubtful": [], "unsynchronized": None,
         "per_camera": blobs_by_camera(detections, rig), "per_snapshot": {},
         "object": [], "object_displaced": [], "object_lost": [], "object_scale_sigma": None, "object_bent_sigma": None,
-        "board_bend": None, "covariance": None, "predicted_error": None, "scale": None, "repeats": None,
+        "board_bend": None, "covariance": None, "predicted_error": None, "scale": None, "repeats": None, "rests": None,
         "unit_doubt": None,
         "motion": None, "timing_untested": None, "knowledge": None, "seconds": seconds,
     }  # fmt: skip
@@ -327,8 +328,9 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
         print(f"note: {result['unsynchronized']['note']}", file=sys.stderr)
     if result["unit_doubt"]:
         print(f"note: {result['unit_doubt']}", file=sys.stderr)
-    if result["repeats"]["note"]:
-        print(f"note: {result['repeats']['note']}", file=sys.stderr)
+    for left_out in (result["repeats"], result["rests"]):
+        if left_out["note"]:
+            print(f"note: {left_out['note']}", file=sys.stderr)
     for kind, factor in result["prior_too_narrow"].items():
         kind = kind.replace("_", " ")
         print(f"note: {kind} drifted {factor:.1f} times as far as the rig's prior allows: widened", file=sys.stderr)

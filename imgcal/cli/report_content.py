@@ -98,6 +98,7 @@ def describe(
         scale=str(calibration.scale),
         moves=tuple(map(str, calibration.moved)),
         late=tuple(map(str, calibration.late)),
+        rests=str(calibration.rests),
         doubtful=tuple(map(str, calibration.doubtful)),
         unknown=found.knowledge.sentences,
         advice=found.knowledge.advice,
@@ -121,7 +122,7 @@ def summarize_snapshots(labelled: Associations, used: NDArray[np.bool_]) -> tupl
     _, first, number = np.unique(labelled.moments, return_index=True, return_inverse=True)
     row = labelled.detections.snapshot
     found, taken = (np.bincount(number[rows], minlength=len(first)) for rows in (row, row[used]))
-    kept = set(number[labelled.used].tolist())
+    kept = set(number[labelled.used_rows >= 0].tolist())
     return tuple(
         SnapshotSummary(
             labelled.snapshots[at].name,
@@ -158,23 +159,23 @@ def _about_object(calibration: Calibration) -> str:
 
 def _blob_residuals(calibration: Calibration, residual: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Residual (M, 2) and sigma (M,) of each blob, nan where it was not used; residual is (S, C, N, 2)."""
-    detections, used = calibration.labelled.detections, calibration.labelled.used
-    row = np.full(len(calibration.labelled.snapshots), -1)
-    row[used] = np.arange(len(used))
-    s, c, n = row[detections.snapshot], detections.camera, detections.fiducial
+    detections, seen = calibration.labelled.detections, calibration.observations.seen.numpy()
+    s, c, n = calibration.labelled.used_rows[detections.snapshot], detections.camera, detections.fiducial
     valid = (s >= 0) & (n >= 0)
-    valid[valid] = calibration.observations.seen.numpy()[s[valid], c[valid], n[valid]]
+    valid[valid] = seen[s[valid], c[valid], n[valid]]
+    where = s[valid], c[valid], n[valid]
     by_blob, sigma = np.full((len(detections), 2), np.nan), detections.sigma.copy()
-    by_blob[valid] = residual.numpy()[s[valid], c[valid], n[valid]]
-    sigma[valid] = calibration.observations.sigma.numpy()[s[valid], c[valid], n[valid]]
+    # The estimate has the average of a rest; the residual of each of its blobs is its own.
+    by_blob[valid] = residual.numpy()[where] + (calibration.observations.uv.numpy()[where] - detections.uv[valid])
+    sigma[valid] = calibration.observations.sigma.numpy()[where]
     return by_blob, sigma
 
 
 def _poses(calibration: Calibration) -> RigidTransform:
-    count, used = len(calibration.labelled.snapshots), calibration.labelled.used
-    rotation, translation = torch.full((count, 3, 3), torch.nan), torch.full((count, 3), torch.nan)
-    rotation[used] = calibration.rig_from_object.rotation.float()
-    translation[used] = calibration.rig_from_object.translation.float()
+    rows = calibration.labelled.used_rows
+    used, poses = np.flatnonzero(rows >= 0), calibration.rig_from_object[rows[rows >= 0]]
+    rotation, translation = torch.full((len(rows), 3, 3), torch.nan), torch.full((len(rows), 3), torch.nan)
+    rotation[used], translation[used] = poses.rotation.float(), poses.translation.float()
     return RigidTransform(rotation.double(), translation.double())
 
 

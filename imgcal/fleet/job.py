@@ -265,7 +265,7 @@ def result_columns(result: Calibration) -> dict[str, Any]:
         "inflation": estimate.mean_inflation,
         "rms_px": float(result.rms),
         "chi2_per_dof": float(result.chi2_per_dof),
-        "snapshots": len(result.labelled.used),
+        "snapshots": result.labelled.moment_counts[0],
         "labels": int(result.observations.seen.sum()),
         "outliers": result.outliers,
         "moved": [str(move) for move in result.moved],

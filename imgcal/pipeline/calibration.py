@@ -28,6 +28,7 @@ from imgcal.pipeline.label_counts import LabelCounts, count_labels
 from imgcal.pipeline.lights import FoundLights
 from imgcal.pipeline.object_checks import CERTAIN, find_displaced, find_lost_fiducials
 from imgcal.pipeline.repeats import Repeats
+from imgcal.pipeline.rests import Rests
 from imgcal.pipeline.scale import KnownDistance, Scale, find_scale, remaining_tolerance
 from imgcal.pipeline.synchronization import Unsynchronized
 from imgcal.types import (
@@ -112,6 +113,11 @@ class Calibration:
             f"{float(self.chi2_per_dof):.2f}, identity {self.identity}, {used})"
         )
 
+    @property
+    def rests(self) -> Rests:
+        """Snapshots averaged with others, because they show the object at rest."""
+        return Rests.of(self.labelled)
+
     @cached_property
     def rig(self) -> CameraRig:
         """The recalibrated rig with its uncertainty: the start of a running rig (`RigKeeper`)."""
@@ -133,14 +139,15 @@ class Calibration:
     @property
     def poses_by_object(self) -> Mapping[str, Mapping[str, RigidTransform]]:
         """rig_from_object () by object name and snapshot name, mm, in the frame of the object's file."""
-        rows, poses, parts = self.labelled.used, self.rig_from_object, self.obj.each
+        parts = self.obj.each
         found: dict[str, dict[str, RigidTransform]] = {part.name: {} for part in parts}
-        for row, part, rotation, translation in zip(
-            rows, self.labelled.part_of_rows.tolist(), poses.rotation, poses.translation, strict=True
-        ):
-            origin = parts[part].origin
+        for snapshot, row in zip(self.labelled.snapshots, self.labelled.used_rows.tolist(), strict=True):
+            if row < 0:
+                continue
+            rotation, translation = self.rig_from_object.rotation[row], self.rig_from_object.translation[row]
+            origin = parts[snapshot.part].origin
             shift = translation if origin is None else translation - rotation @ origin.to(rotation)
-            found[parts[part].name][self.labelled.snapshots[row].name] = RigidTransform(rotation, shift)
+            found[parts[snapshot.part].name][snapshot.name] = RigidTransform(rotation, shift)
         return found
 
     @property

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from imgcal.association import Associations, accepted_observations, drop_merged, drop_snapshots
 from imgcal.estimation import UNPOSED, UndeterminedPosesError, initial_pose, require_poses
 from imgcal.geometry import RigidTransform
+from imgcal.pipeline.rests import average_rests
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
 
@@ -19,7 +20,7 @@ class LabelledCapture:
     """Labelled snapshots, S of which are used and determine the object's pose."""
 
     labelled: Associations
-    observations: Observations  # (S, C, N)
+    observations: Observations  # (S, C, N), each rest of the object averaged
     poses: RigidTransform  # (S,) rig_from_object, the first guess
 
     def drop_snapshots(
@@ -32,31 +33,39 @@ class LabelledCapture:
         self, rows: NDArray[np.int64], fiducial: NDArray[np.int64], rig: CameraRig, obj: CalibrationObject
     ) -> LabelledCapture:
         """Replace each fiducial by `fiducial` (N,) of it in some of the used snapshots, by their index among these."""
-        numbers = np.array(self.labelled.used)[rows]
+        numbers = np.flatnonzero(np.isin(self.labelled.used_rows, rows))
         detections, snapshots = self.labelled.detections, list(self.labelled.snapshots)
         there = np.isin(detections.snapshot, numbers) & (detections.fiducial >= 0)
         labels = np.where(there, fiducial[detections.fiducial], detections.fiducial)
-        for number in self.labelled.used:  # poses are found anew
+        for number in np.flatnonzero(self.labelled.used_rows >= 0).tolist():  # poses are found anew
             snapshots[number] = replace(snapshots[number], rig_from_object=None)
         table = replace(detections, fiducial=labels)
         return arrange_labels(replace(self.labelled, detections=table, snapshots=tuple(snapshots)), rig, obj)
 
 
 def arrange_labels(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> LabelledCapture:
-    """Remove merged blobs, and snapshots whose labels do not determine the pose; find missing poses.
+    """Remove merged blobs, and snapshots whose labels do not determine the pose; find missing poses; average rests.
 
     Raises:
         RefusedError: no snapshot is left.
     """
+    alone = tuple(s if s.rests_with < 0 else replace(s, rests_with=-1) for s in labelled.snapshots)
+    each = _arrange_each(replace(labelled, snapshots=alone), rig, obj)
+    labelled, observations, rows = average_rests(each.labelled, each.observations)
+    return each if labelled is each.labelled else LabelledCapture(labelled, observations, each.poses[rows])
+
+
+def _arrange_each(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> LabelledCapture:
+    """Do the work of `arrange_labels` with every snapshot for itself."""
     observations, poses = accepted_observations(labelled, rig, obj)
     try:
         require_poses(observations.seen.numpy(), obj.points, obj.part_of if obj.parts else None)
     except UndeterminedPosesError as error:
-        return arrange_labels(drop_snapshots(labelled, error.rows, error.reason), rig, obj)
+        return _arrange_each(drop_snapshots(labelled, error.rows, error.reason), rig, obj)
     if poses is None:
         poses, snapshots = initial_pose(observations, rig, obj), list(labelled.snapshots)
         for row, snapshot in enumerate(labelled.used):
             snapshots[snapshot] = replace(snapshots[snapshot], rig_from_object=poses[row])
         labelled = replace(labelled, snapshots=tuple(snapshots))
     left = drop_merged(labelled, poses, rig, obj)
-    return LabelledCapture(labelled, observations, poses) if left is labelled else arrange_labels(left, rig, obj)
+    return LabelledCapture(labelled, observations, poses) if left is labelled else _arrange_each(left, rig, obj)

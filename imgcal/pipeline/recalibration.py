@@ -121,7 +121,7 @@ def calibrate(
                 )
                 return replace(fit, labelled=name_repeats(fit.labelled, repeats), repeats=repeats)
         case.explain(error, labelled)
-    used, given = len(fit.labelled.used), len(detections.snapshot_names)
+    used, given = fit.labelled.moment_counts
     if case.may_be_misread and used < LEAST_USED * given:
         case.try_conventions(RefusedError(f"identity: only {used} of {given} snapshots could be used"))
     seconds = {
@@ -174,7 +174,8 @@ class _Case:
         def fit(some: Detections, rig: CameraRig) -> float:
             with require_solvable():
                 found = fit_steady(associate(some, rig, self.obj, options), some, rig, self.obj, options)
-            if len(found.labelled.used) < MOST_USED * len(some.snapshot_names):
+            used, given = found.labelled.moment_counts
+            if used < MOST_USED * given:
                 raise RefusedError("identity: the object was found in few of the snapshots")
             return float(found.rms)
 

@@ -108,6 +108,8 @@ def judge(content: ReportContent) -> Verdict:
     reservations = _reservations(content)
     identity = IDENTITY.get(content.identity, f"Identity: {content.identity}.")
     found = (_improvement(content), *sentences(content), *_movement(content), identity)
+    if content.rests:
+        found = (*found, f"{content.rests}.")
     if content.reason:
         found = (*found, content.reason)
     further = (*advice(content), *([content.advice] if content.advice else []))

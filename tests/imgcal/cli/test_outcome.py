@@ -19,6 +19,7 @@ RESULT = {
     "lights": None,
     "doubtful": [],
     "repeats": {"note": "3 blobs are listed twice"},
+    "rests": {"note": "2 snapshots show the object at rest"},
     "unit_doubt": "rig and object seem to be in metres",
     "identity": "unique",
     "snapshots_used": 5,
@@ -54,8 +55,9 @@ def test_results_go_to_standard_output_and_notes_to_standard_error(capsys: pytes
         "report  out/report.html",
     ]
     notes = said.err.splitlines()
-    assert all(note.startswith("note: ") for note in notes) and len(notes) == 6
+    assert all(note.startswith("note: ") for note in notes) and len(notes) == 7
     assert "guess was no better" in notes[0] and notes.pop(1) == "note: rig and object seem to be in metres"
     assert notes.pop(1) == "note: 3 blobs are listed twice"
+    assert notes.pop(1) == "note: 2 snapshots show the object at rest"
     assert "focal length drifted 2.3 times" in notes[1]
     assert "fiducial 3 of the object is 1.23 +- 0.1 mm from its place" in notes[2] and "fiducial 6" in notes[3]

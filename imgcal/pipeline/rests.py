@@ -1,0 +1,182 @@
+"""Snapshots that show the object at rest count as one: errors that stay as they are while nothing moves do not average.
+
+The error of a blob has two parts. One differs from frame to frame, the other is the same as long as object and camera
+stay where they are: where the marker's image lies in the grid of pixels, half of it hidden, an uneven light. If twenty
+frames of one pose counted as independent, the second part would seem to be known twenty times as well as it is. The
+frames of a rest are therefore averaged into one snapshot, and only what differs between them is averaged away: with a
+blob's variance sigma^2 and the share q of it that the differences between frames show,
+
+    sigma_mean^2 = sigma^2 (1 - q + q / frames).
+
+Source: the variance of the mean of a cluster with intraclass correlation 1 - q (Kish, Survey Sampling, 1965).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from imgcal.association import Associations
+from imgcal.medians import MEDIAN_SQUARED, median, median_of_known
+from imgcal.messages import plural
+from imgcal.types import Observations
+
+LEAST_MOTION = 0.1
+"""Pixels by which blobs may differ, beyond their noise, in snapshots of one rest."""
+RELATIVE_DEVIATION = 1.44
+"""Standard deviation of the median of n squared lengths, relative to their median, times the root of n."""
+SIGMAS = 4.0
+"""Standard deviations by which this median may exceed its expectation in snapshots of one rest."""
+REMEMBERED = 8
+"""Number of latest rests that a snapshot may belong to: those before it, if a frame of another kind came between."""
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Rests:
+    """Snapshots that were averaged with others."""
+
+    snapshots: tuple[tuple[str, str], ...] = ()  # their names, and those of the snapshots that stand for them
+
+    @classmethod
+    def of(cls, labelled: Associations) -> Rests:
+        """List them."""
+        names = [snapshot.name for snapshot in labelled.snapshots]
+        pairs = ((s.name, names[s.rests_with]) for s in labelled.snapshots if s.rests_with >= 0)
+        return cls(tuple(dict.fromkeys(pairs)))
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Values for scripts."""
+        return {"snapshots": dict(self.snapshots), "note": str(self)}
+
+    def __str__(self) -> str:
+        """Summary for people; empty if there are none."""
+        if not self.snapshots:
+            return ""
+        count, rests = len(self.snapshots), len({of for _, of in self.snapshots})
+        verb = "shows" if count == 1 else "show"
+        return (
+            f"{plural(count, 'snapshot')} {verb} the object at rest, as {plural(rests, 'other snapshot')} "
+            f"{'does' if rests == 1 else 'do'}: each rest is averaged and counts as one snapshot"
+        )
+
+
+def average_rests(labelled: Associations, observations: Observations) -> tuple[Associations, Observations, Rows]:
+    """Average the snapshots of each rest.
+
+    Args:
+        labelled: S used snapshots, in chronological order.
+        observations: of these, (S, C, N).
+
+    Returns:
+        The snapshots, in which one of each rest is used and the others refer to it; the observations of the R used
+        ones; their indices (R,) among the S.
+    """
+    count = len(labelled.used)
+    uv, sigma, seen = observations.uv.numpy(), observations.sigma.numpy(), observations.seen.numpy()
+    together = int(np.bincount(labelled.moments[labelled.used]).max()) if count else 1
+    first = find_rests(uv, sigma, seen, labelled.part_of_rows, together)
+    if (first == np.arange(count)).all():
+        return labelled, observations, np.arange(count)
+    groups = [np.flatnonzero(first == row) for row in np.unique(first)]
+    share = _share_of_flicker(uv, sigma, seen, groups)
+    shown = seen.sum((1, 2))
+    kept = np.array([group[shown[group].argmax()] for group in groups])
+    uv, sigma = uv.copy(), sigma.copy()
+    for row, group in zip(kept, groups, strict=True):
+        if len(group) > 1:
+            uv[row], sigma[row] = _average(uv[group], sigma[group], seen[group], share)
+    order = np.argsort(kept)
+    kept, groups = kept[order], [groups[i] for i in order]
+    used, snapshots = labelled.used, list(labelled.snapshots)
+    for row, group in zip(kept.tolist(), groups, strict=True):
+        for other in group[group != row].tolist():
+            snapshots[used[other]] = replace(snapshots[used[other]], rests_with=used[row])
+    averaged = Observations(torch.from_numpy(uv[kept]), torch.from_numpy(sigma[kept]), observations.seen[kept])
+    return replace(labelled, snapshots=tuple(snapshots)), averaged, kept
+
+
+def find_rests(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows, together: int = 1) -> Rows:
+    """Find snapshots that show the object where an earlier one does, within their noise.
+
+    Args:
+        uv: (S, C, N, 2) pixels.
+        sigma: (S, C, N) pixels.
+        seen: (S, C, N).
+        part: (S,) the object in each.
+        together: largest number of snapshots of one moment, if several objects or markers are in view.
+
+    Returns:
+        (S,) the first snapshot of each one's rest; its own number if the object has moved.
+    """
+    count = len(uv)
+    first, asked = np.arange(count), np.zeros(count, dtype=np.bool_)
+    for lag in range(1, min(together + 2, count)):  # a frame of another kind may come between
+        asked[lag:] |= _are_alike(slice(lag, None), slice(None, -lag), uv, sigma, seen)
+    if not asked.any():
+        return first
+    rests: deque[int] = deque(maxlen=REMEMBERED * together)
+    for row in range(count):
+        if asked[row]:
+            earlier = np.array([rest for rest in rests if part[rest] == part[row]], dtype=np.int64)
+            alike = earlier[_are_alike(np.array([row]), earlier, uv, sigma, seen)]
+            if len(alike):
+                first[row] = alike[-1]
+                continue
+        rests.append(row)
+    return first
+
+
+def _are_alike(
+    some: slice | Rows, others: slice | Rows, uv: Floats, sigma: Floats, seen: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Tell which pairs of snapshots show the same within the noise: half of the labels of every camera, at least."""
+    both = seen[some] & seen[others]
+    count = both.sum(-1)
+    allowed = MEDIAN_SQUARED * (1 + SIGMAS * RELATIVE_DEVIATION / np.sqrt(np.maximum(count, 1)))
+    apart = np.square(uv[some] - uv[others]).sum(-1)
+    near = both & (apart <= allowed[..., None] * (sigma[some] ** 2 + sigma[others] ** 2) + LEAST_MOTION**2)
+    most = np.maximum(seen[some].sum((1, 2)), seen[others].sum((1, 2)))
+    enough = 2 * count.sum(-1) >= np.maximum(most, 1)
+    return np.asarray(enough & (2 * near.sum(-1) >= count).all(-1))
+
+
+def _share_of_flicker(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], groups: list[Rows]) -> float:
+    """Share of the blobs' variance that differs between the frames of a rest, at most 1."""
+    before = np.concatenate([group[:-1] for group in groups])
+    after = np.concatenate([group[1:] for group in groups])
+    both = seen[before] & seen[after]
+    apart = np.square(uv[after] - uv[before]).sum(-1)[both] / (sigma[before] ** 2 + sigma[after] ** 2)[both]
+    return min(1.0, median(apart) / MEDIAN_SQUARED * (1 + RELATIVE_DEVIATION / len(apart) ** 0.5))
+
+
+def _average(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], share: float) -> tuple[Floats, Floats]:
+    """Average the frames of a rest, without labels that are elsewhere in some.
+
+    Args:
+        uv: (F, C, N, 2) pixels.
+        sigma: (F, C, N) pixels.
+        seen: (F, C, N).
+        share: of the variance that differs between frames.
+
+    Returns:
+        (C, N, 2) pixels and (C, N) pixels; zero and one where nothing was seen.
+    """
+    where = np.where(seen[..., None], uv, np.nan)
+    middle = np.nan_to_num(median_of_known(where))
+    variance = np.where(seen, sigma**2, 0.0)
+    far = np.square(uv - middle).sum(-1) > SIGMAS**2 * MEDIAN_SQUARED * variance + LEAST_MOTION**2
+    taken = seen & ~far
+    taken |= seen & ~taken.any(0)
+    count = np.maximum(taken.sum(0), 1)
+    mean = np.where(taken[..., None], uv, 0.0).sum(0) / count[..., None]
+    own = np.where(taken, variance, 0.0).sum(0) / count * (1 - share + share / count)
+    return mean, np.where(taken.any(0), np.sqrt(own), 1.0)
