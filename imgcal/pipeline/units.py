@@ -9,16 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from imgcal.association import to_observations
 from imgcal.errors import RefusedError
 from imgcal.estimation import single_camera_poses
-from imgcal.geometry import vector_from_rotation
+from imgcal.geometry import RigidTransform, vector_from_rotation
 from imgcal.pipeline.lines_of_sight import choose_telling_snapshots, sight_angles
-from imgcal.types import CalibrationObject, CameraRig, Detections
+from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 
 UNSOLVABLE = (np.linalg.LinAlgError, torch.linalg.LinAlgError)
 """Raised where equations have no solution."""
@@ -38,8 +41,11 @@ SAME_UNIT = 1.3
 """Maximum deviation, as a factor, of a ratio of lengths from that of a unit."""
 LEAST_RATIO, LEAST_LOOKS = 3.0, 6.0
 """Minimum ratio of lengths for different units: between cameras with labels, and from image sizes without labels."""
-LEAST_TURN = math.radians(20)
-"""Minimum rotation error of most pairs of cameras for a rig with rotations in degrees."""
+LEAST_TURN, MOST_TURNED = math.radians(20), 0.9
+"""Minimum rotation error for a rig with rotations in degrees, and minimum share of the pairs of cameras with it: if two
+of four cameras are exchanged, 0.83."""
+LARGEST_MISFIT = 0.02
+"""Largest residual of an image by itself, as a share of the object's extent in it, if object and labels are right."""
 
 
 def unit_doubt(rig: CameraRig, obj: CalibrationObject, from_scratch: bool = False) -> str:
@@ -184,24 +190,51 @@ def _doubt_by_poses(detections: Detections, rig: CameraRig, obj: CalibrationObje
     chosen = labelled.choose_snapshots(choose_telling_snapshots(labelled, rig.num_cameras))
     seen = to_observations(chosen, rig, obj)
     placed, known = single_camera_poses(seen, rig, obj)
-    lengths, turns = [], []
+    images = int(known.sum())
+    known &= _fit_alone(seen, placed, rig, obj)
+    if 2 * int(known.sum()) < images:  # object or labels are wrong: the others fit by chance
+        return ""
+    lengths, turns, alike = [], [], []
     for first in range(rig.num_cameras):
         for second in range(first):
             both = known[:, first] & known[:, second]
             if both.any():
                 in_rig = rig.cam_from_rig[second] @ rig.cam_from_rig[first].inverse()
                 found = placed[both, second] @ placed[both, first].inverse()
-                turns.append(vector_from_rotation(found.rotation @ in_rig.rotation.mT).norm(dim=-1))
+                turns.append(_angles(found.rotation, in_rig.rotation).median())
+                # The relation of two cameras is the same in every snapshot, or the object or its labels are wrong.
+                alike.append(_angles(found.rotation[:, None], found.rotation).median(-1).values.min() < LEAST_TURN / 2)
                 lengths.append(found.translation.norm(dim=-1) / in_rig.translation.norm().clamp_min(1e-12))
     if not lengths:
         return ""
-    turn, ratio = float(torch.cat(turns).median()), float(torch.cat(lengths).median())
-    if turn > LEAST_TURN:
+    turn, ratio = torch.stack(turns), float(torch.cat(lengths).median())
+    if bool(((turn > LEAST_TURN) & torch.stack(alike)).double().mean() >= MOST_TURNED):
         return (
-            f"the rotations between cameras are {math.degrees(turn):.0f} deg off what the images show; expected "
-            "rotations in radians that take the rig to the camera (cam_from_rig)"
+            f"the rotations between cameras are {math.degrees(turn.median()):.0f} deg off what the images show; "
+            "expected rotations in radians that take the rig to the camera (cam_from_rig)"
         )
     return _describe_smaller(ratio, LEAST_RATIO)
+
+
+def _angles(some: Tensor, others: Tensor) -> Tensor:
+    """Angles (...,) between rotations (..., 3, 3), rad."""
+    return vector_from_rotation(some @ others.mT).norm(dim=-1)
+
+
+def _fit_alone(seen: Observations, placed: RigidTransform, rig: CameraRig, obj: CalibrationObject) -> NDArray[np.bool_]:
+    """Tell in which images (S, C) the object fits its labels, at cam_from_object (S, C): others show no pose."""
+    cameras = replace(rig.to(torch.float64), cam_from_rig=RigidTransform.identity(rig.num_cameras, dtype=torch.float64))
+    points = placed.apply(obj.points.double())  # (S, C, N, 3)
+    uv = torch.stack(
+        [cameras.select([c]).expand(len(points)).project(points[:, c]).uv[:, 0] for c in range(rig.num_cameras)], 1
+    )
+    there, count = seen.seen[..., None], seen.seen.sum(-1).clamp_min(1)[..., None]
+    middle = torch.where(there, seen.uv, 0.0).sum(-2) / count
+    missed, extent = (
+        torch.where(seen.seen, values.square().sum(-1), 0.0).sum(-1)
+        for values in (uv - seen.uv, seen.uv - middle[..., None, :])
+    )
+    return np.asarray(missed <= LARGEST_MISFIT**2 * extent)
 
 
 def _doubt_by_directions(detections: Detections, rig: CameraRig) -> str:

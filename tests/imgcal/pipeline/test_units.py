@@ -139,6 +139,20 @@ def test_a_refusal_for_another_reason_names_no_unit():
             calibrate(wrong, rig, obj, SHORT)
 
 
+@pytest.mark.parametrize("mistake", ["fiducials exchanged", "object mirrored", "another object", "cameras exchanged"])
+def test_wrong_labels_objects_and_names_do_not_blame_the_rotations(mistake):
+    rig, obj, blobs = rig_of("T4"), load_object("asymmetric8"), seen("T4", "asymmetric8")
+    if mistake == "fiducials exchanged":
+        blobs = replace(blobs, fiducial=np.array([3, 2, 1, 0, 4, 5, 6, 7])[blobs.fiducial])
+    elif mistake == "object mirrored":
+        obj = replace(obj, points=obj.points * torch.tensor([1.0, 1.0, -1.0]))
+    elif mistake == "another object":
+        obj = replace(obj, points=obj.points[:, [2, 1, 0]] * torch.tensor([1.0, 1.3, 1.0]))
+    else:
+        blobs = replace(blobs, camera=np.array([0, 3, 2, 1])[blobs.camera])
+    assert image_doubt(blobs, rig, obj) == ""
+
+
 @pytest.mark.parametrize("distance_known", [True, False])
 @pytest.mark.parametrize("name", RIGS)
 def test_which_one_is_in_metres_is_said(name, distance_known):
