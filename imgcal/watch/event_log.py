@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections import deque
 from pathlib import Path
 
 from imgcal.errors import InputError
@@ -12,10 +13,12 @@ from imgcal.watch.line_file import LineFile
 
 MOST_BYTES = 2**26
 """File size at which a new file is started; the previous one is kept as `events.1.jsonl`."""
+MOST_WAITING = 10_000
+"""Maximum number of unwritten events; the oldest is dropped beyond that."""
 
 
 class EventLog:
-    """Appends events to a file; see `LineFile`."""
+    """Appends events to a file; see `LineFile`. Those that could not be written wait for the next attempt."""
 
     def __init__(self, path: Path, most_bytes: int = MOST_BYTES) -> None:
         """Open or create the file.
@@ -28,29 +31,45 @@ class EventLog:
             self._file = LineFile(path)
         except OSError as error:
             raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+        self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)
 
     @property
     def size(self) -> int | None:
         """Size of the file in bytes; None = closed."""
         return self._file.size
 
-    def append(self, event: Event) -> None:
-        """Write an event.
+    def add(self, event: Event) -> None:
+        """Take an event, for the next `write`."""
+        self._waiting.append(event.to_json().encode(errors="replace") + b"\n")
+
+    def write(self) -> None:
+        """Write the events that wait.
 
         Raises:
-            OSError: nothing of the line was written, for example because the disk is full. Or the line was written, but
-                the file, which has become long, could not be renamed.
+            OSError: some could not be written, for example because the disk is full, and still wait. Or they were
+                written, but the file, which has become long, could not be renamed.
         """
-        line = event.to_json().encode(errors="replace") + b"\n"
-        size, problem = self._file.size, None
+        while self._waiting:
+            problem = self._append(self._waiting[0])
+            self._waiting.popleft()
+            if problem is not None:
+                raise problem
+
+    def _append(self, line: bytes) -> OSError | None:
+        """Append a line; return why the long file before it could not be put aside, None = it could.
+
+        Raises:
+            OSError: nothing of the line was written.
+        """
+        problem: OSError | None = None
+        size = self._file.size
         if size and size + len(line) > self._most:
             try:
                 self._put_aside()
             except OSError as error:
                 problem = error
         self._file.append(line)
-        if problem is not None:
-            raise problem
+        return problem
 
     def _put_aside(self) -> None:
         """Start a new file; if that fails, the old one stays open."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
@@ -171,13 +172,18 @@ class Watch:
             self._apply_learning()
             self._first = intake.first
             if snapshot is not None:
-                self.process(snapshot)
+                self.process(snapshot, live=intake.live)
             if time.monotonic() - self._saved >= SAVED_EVERY:
                 self.save()
             looked()
 
-    def process(self, snapshot: TimedSnapshot) -> RigState | None:
-        """Process one snapshot; None = it could not be used, or learning is paused."""
+    def process(self, snapshot: TimedSnapshot, live: bool = True) -> RigState | None:
+        """Process one snapshot; None = it could not be used, or learning is paused.
+
+        Args:
+            snapshot: the snapshot.
+            live: whether the next one will not wait; otherwise, slow outputs of poses are waited for.
+        """
         if self.paused:
             self.tally.paused += 1
             return None
@@ -203,7 +209,7 @@ class Watch:
         for event in state.events:
             self.publish_event(event)
         for output in self.poses:
-            output.publish(state)
+            output.publish(state, wait=not live)
         if self._page is not None:
             self._page.publish(state, snapshot.frames(names))
         if self.learning is not None:
@@ -213,10 +219,11 @@ class Watch:
     def publish_event(self, event: Event) -> None:
         """Pass an event to all outputs."""
         self.tally.events[event.kind] += 1
+        self._log.add(event)
         try:
-            self._log.append(event)
+            self._log.write()
         except OSError as error:
-            self._fail(EVENTS, str(error))
+            self._fail(EVENTS, f"{self._log.path}: {error.strerror}" if error.strerror else str(error))
         if self._hook is not None:
             self._hook.notify(event)
         if self.tally.latest is not None and event.kind in IN_HISTORY:
@@ -227,6 +234,8 @@ class Watch:
 
     def save(self) -> None:
         """Write the state from which the next start resumes."""
+        with contextlib.suppress(OSError):  # said when the event came
+            self._log.write()
         state = self.tally.latest
         unsaved = self._unsaved or bool(self._files.problems)
         if state is None or self._progress is None or not unsaved:

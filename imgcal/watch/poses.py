@@ -15,10 +15,12 @@ from imgcal.online import LightPoints, ObjectPose, RigState
 
 PoseStatus = Literal["ok", "degraded", "no_object"]
 MOST_WAITING = 128
-"""Maximum number of snapshots that wait for a sink; the oldest is dropped beyond that."""
+"""Maximum number of snapshots that wait for a sink; beyond that, the oldest is dropped, or a recording waits."""
+LONGEST_WAIT = 10.0
+"""Time (s) for which a recording waits for a sink that takes nothing."""
 IDLE_EVERY = 0.25  # s between two calls of `PoseSink.idle`
 LONGEST_END = 5.0
-"""Time (s) a sink has at the end for waiting poses."""
+"""Time (s) after which a sink that takes none of the waiting poses is given up at the end."""
 COVARIANCE = tuple((i, j) for i in range(6) for j in range(i, 6))
 AXES = ("rx_rad", "ry_rad", "rz_rad", "tx_mm", "ty_mm", "tz_mm")
 COLUMNS = (
@@ -164,7 +166,7 @@ class Poses:
             name: of the sink, for messages.
             sink: closed together with this object.
             most_waiting: maximum number of waiting snapshots.
-            end: seconds for waiting poses at the end.
+            end: seconds at the end after which a sink that takes nothing is given up.
             idle: seconds without a snapshot after which the sink may do something else.
         """
         self.name, self.dropped, self.failed = name, 0, 0
@@ -173,7 +175,7 @@ class Poses:
         """The first problem; None = no problem."""
         self._sink, self._most, self._end, self._idle = sink, most_waiting, end, idle
         self._waiting: deque[RigState] = deque()
-        self._changed, self._closing = threading.Condition(), False
+        self._changed, self._closing, self._hangs = threading.Condition(), False, False
         self._thread = threading.Thread(target=self._work, name="poses", daemon=True)
         self._thread.start()
 
@@ -187,26 +189,35 @@ class Poses:
         """See `PoseSink`."""
         return self._sink.table
 
-    def publish(self, state: RigState) -> None:
-        """Take the state after a snapshot; returns at once."""
+    def publish(self, state: RigState, wait: bool = False) -> None:
+        """Take the state after a snapshot; returns at once, or with `wait`, once there is room.
+
+        A sink that takes nothing for `LONGEST_WAIT` seconds is no longer waited for.
+        """
         with self._changed:
+            if wait and not self._hangs:
+                has_room = self._changed.wait_for(lambda: len(self._waiting) < self._most, LONGEST_WAIT)
+                self._hangs = not has_room
             self._waiting.append(state)
             if len(self._waiting) > self._most:
                 self._waiting.popleft()
                 self.dropped += 1
                 self._fail(f"poses were dropped: more than {self._most} were waiting")
-            self._changed.notify()
+            self._changed.notify_all()
 
     def __enter__(self) -> Poses:
         """Return itself."""
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Let the sink take the waiting poses for a while, and close it."""
+        """Let the sink take the waiting poses for as long as it takes some, and close it."""
         with self._changed:
             self._closing = True
-            self._changed.notify()
-        self._thread.join(self._end)
+            self._changed.notify_all()
+        before = math.inf
+        while self._thread.is_alive() and len(self._waiting) < before:
+            before = len(self._waiting)
+            self._thread.join(self._end)
         if self._thread.is_alive():
             with self._changed:
                 self.dropped += len(self._waiting)
@@ -220,6 +231,8 @@ class Poses:
                 if self._closing and not self._waiting:
                     break
                 state = self._waiting.popleft() if self._waiting else None
+                self._hangs = False
+                self._changed.notify_all()
             try:
                 if state is None:
                     self._sink.idle()

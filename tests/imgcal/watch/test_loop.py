@@ -1,4 +1,6 @@
+import errno
 import json
+import os
 import shutil
 import threading
 import time
@@ -160,6 +162,24 @@ def test_a_hook_that_fails_is_told_once(tmp_path):
     ):
         loop.run(intake, threading.Event())
     assert hook.failed == 3 and told == ["--hook: false ended with exit code 1"]
+
+
+def test_events_that_could_not_be_written_are_written_later_and_the_file_is_named(tmp_path, monkeypatch):
+    keeper, told = KeeperOfStates(), []
+    keeper.events = {0: [event(0)], 1: [event(1)]}
+    with Watch(keeper, tmp_path, problem=told.append) as loop:
+        with monkeypatch.context() as full:
+
+            def refuse(*_):
+                raise OSError(errno.ENOSPC, "No space left on device")
+
+            full.setattr(os, "write", refuse)
+            for number in range(2):
+                loop.process(snapshot(float(number)))
+        assert events_of(tmp_path) == [] and loop.tally.problems["events.jsonl"] == 2
+        assert [line for line in told if "events" in line] == [f"{tmp_path / 'events.jsonl'}: No space left on device"]
+        loop.save()
+    assert events_of(tmp_path) == ["moved", "moved"]
 
 
 def test_it_stops_when_told(tmp_path):

@@ -1,5 +1,6 @@
 import json
 import threading
+import time
 from dataclasses import replace
 
 import pytest
@@ -8,6 +9,7 @@ import torch
 from imgcal.geometry import RigidTransform, rotation_from_vector
 from imgcal.online import ObjectPose
 from imgcal.watch import PoseRecord, Poses, PoseSink
+from imgcal.watch import poses as module
 from imgcal.watch.poses import COLUMNS, UnwrittenError
 from tests.imgcal.watch.states import some_state
 
@@ -90,6 +92,31 @@ def test_a_sink_that_hangs_holds_up_nobody():
         for number in range(50):
             poses.publish(replace(state, snapshot=number))
     assert poses.lost >= 49 and poses.problem == "slow: poses were dropped: more than 3 were waiting"
+    go_on.set()
+
+
+def test_a_recording_waits_for_a_slow_sink():
+    class Slow(Sink):
+        def send(self, given):
+            time.sleep(0.005)
+            super().send(given)
+
+    sink, state = Slow(), some_state()
+    with Poses("poses.csv", sink, most_waiting=3, end=0.05) as poses:
+        for number in range(40):
+            poses.publish(replace(state, snapshot=number), wait=True)
+    assert [one.snapshot for one in sink.records] == list(range(40)) and sink.closed
+    assert poses.lost == 0 and poses.problem is None
+
+
+def test_a_recording_does_not_wait_for_ever(monkeypatch):
+    monkeypatch.setattr(module, "LONGEST_WAIT", 0.1)
+    go_on = threading.Event()
+    sink, state = Sink(waits=go_on), some_state()
+    with Poses("hangs", sink, most_waiting=3, end=0.1) as poses:
+        for number in range(500):  # it waits once, and not for every snapshot
+            poses.publish(replace(state, snapshot=number), wait=True)
+    assert poses.lost >= 499 and poses.problem == "hangs: poses were dropped: more than 3 were waiting"
     go_on.set()
 
 
