@@ -21,7 +21,7 @@ from imgcal.estimation.pose_initialization import initial_pose
 from imgcal.estimation.pose_support import LEAST_BREADTH, breadth
 from imgcal.estimation.relative_poses import as_transforms, relate, tree
 from imgcal.geometry import RigidTransform
-from imgcal.messages import list_names
+from imgcal.messages import name_cameras
 from imgcal.types import CalibrationObject, CameraRig, Observations, RigPrior
 
 LEAST_FIDUCIALS = 4
@@ -147,9 +147,8 @@ def require_connected(alone: Sequence[int], cameras: CameraRig) -> None:
     """Raise `RefusedError` if some cameras have nothing in common with the others."""
     if alone:
         raise RefusedError(
-            f"start without a factory calibration: camera {list_names(cameras.camera_names[c] for c in alone)} "
-            "cannot be placed relative to the others: carry the whole object through the view that it shares with "
-            "other cameras"
+            f"start without a factory calibration: {name_cameras([cameras.camera_names[c] for c in alone])} cannot be "
+            "placed relative to the others: carry the whole object through the view shared with other cameras"
         )
 
 

@@ -123,7 +123,12 @@ def calibrate_from_scratch(
     is_labelled, is_stick = (detections.fiducial >= 0).any(), obj.pose_rank == 5
     alone = detections if is_labelled or is_stick else label_images(detections, cameras, obj, options, progress)
     with name_missing_labels(detections):
-        first = place_by_stick(detections, cameras, obj) if is_stick else _first_rig(alone, cameras, obj).rig
+        try:
+            first = place_by_stick(detections, cameras, obj) if is_stick else _first_rig(alone, cameras, obj).rig
+        except RefusedError as error:
+            if not is_stick:
+                _require_unmirrored(error, detections, cameras, obj, options)
+            raise
     placed = replace(first, prior=PLACED)
     labelled: Associations | None = None
     try:
@@ -270,6 +275,27 @@ def _first_rig(labelled: Detections, cameras: CameraRig, obj: CalibrationObject)
             "of view is far from the truth"
         )
     return first
+
+
+def _require_unmirrored(
+    error: RefusedError, detections: Detections, cameras: CameraRig, obj: CalibrationObject, options: PipelineOptions
+) -> None:
+    """Replace a refusal if the cameras can be placed by the object's mirror image.
+
+    Raises:
+        RefusedError: says so.
+    """
+    mirrored = replace(obj, points=obj.points * obj.points.new_tensor([-1.0, 1.0, 1.0]))
+    has_labels = bool((detections.fiducial >= 0).any())
+    try:
+        labelled = detections if has_labels else label_images(detections, cameras, mirrored, options)
+        spread = _first_rig(labelled, cameras, mirrored).spread
+    except (RefusedError, *UNSOLVABLE):
+        return
+    raise RefusedError(
+        f"the object's mirror image fits the images, to {spread:.1g} px, and the object does not: a coordinate in its "
+        f"file has the wrong sign, or all images are mirrored; so {error.reason}"
+    ) from error
 
 
 def _set_prior(cameras: CameraRig) -> CameraRig:

@@ -76,6 +76,22 @@ def test_what_the_data_do_not_say_is_refused():
         calibrate_from_scratch(replace(blobs, uv=noise), cameras, wand)
 
 
+@pytest.mark.parametrize("has_labels", [True, False])
+@pytest.mark.parametrize("mirrored", ["object", "images"])
+def test_a_mirrored_object_or_mirrored_images_are_named(mirrored, has_labels):
+    body = load_object("asymmetric8")
+    large = replace(body, points=4 * body.points)
+    _, labelled, blobs, cameras = capture(large, 30)
+    seen = labelled if has_labels else blobs
+    if mirrored == "object":
+        large = replace(large, points=large.points * torch.tensor([1.0, 1.0, -1.0]))
+    else:
+        width = cameras.image_size[:, 0].numpy()[seen.camera]
+        seen = replace(seen, uv=np.stack((width - 1 - seen.uv[:, 0], seen.uv[:, 1]), 1))
+    with pytest.raises(RefusedError, match=r"^the object's mirror image fits .* sign, or all images are mirrored; so "):
+        calibrate_from_scratch(seen, cameras, large)
+
+
 def test_an_object_in_metres_is_said():
     wand = load_object("wand4")
     _, labelled, blobs, cameras = capture(wand, 40)
