@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,7 @@ class Associations:
     detections: Detections  # `fiducial` filled in, -1 = not used
     snapshots: tuple[SnapshotIdentity, ...]  # S
     rig: CameraRig | None = None  # to which the poses belong; None = the factory rig
+    rests_with: Mapping[int, int] = field(default_factory=dict)  # rows of an object at rest: the row of their average
 
     def __repr__(self) -> str:
         """Summarize how much was decided, and how."""
@@ -49,14 +50,15 @@ class Associations:
     @property
     def used(self) -> list[int]:
         """Numbers of the snapshots that are neither refused nor part of the average of another one."""
-        return [i for i, s in enumerate(self.snapshots) if s.status != "refused" and s.rests_with < 0]
+        return [i for i, s in enumerate(self.snapshots) if s.status != "refused" and i not in self.rests_with]
 
     @property
     def used_rows(self) -> NDArray[np.int64]:
         """For each row, the used row that stands for it, itself or the average of a rest, -1 = refused: (S,)."""
         row, used = np.full(len(self.snapshots), -1), self.used
         row[used] = np.arange(len(used))
-        return np.array([row[i if s.rests_with < 0 else s.rests_with] for i, s in enumerate(self.snapshots)], np.int64)
+        row[list(self.rests_with)] = row[list(self.rests_with.values())]
+        return row
 
     @property
     def moments(self) -> NDArray[np.int64]:
@@ -342,11 +344,12 @@ def refuse_snapshots(labelled: Associations, rows: Sequence[int], reason: str) -
     """Remove the labels of snapshots (numbers among the used ones), and record the reason."""
     numbers, snapshots = np.flatnonzero(np.isin(labelled.used_rows, rows)), list(labelled.snapshots)
     for number in numbers.tolist():
-        refused = replace(snapshots[number], status="refused", reason=reason, rig_from_object=None, rests_with=-1)
-        snapshots[number] = refused
+        snapshots[number] = replace(snapshots[number], status="refused", reason=reason, rig_from_object=None)
+    rests = {row: at for row, at in labelled.rests_with.items() if snapshots[row].status != "refused"}
     detections = labelled.detections
     fiducial = np.where(np.isin(detections.snapshot, numbers), -1, detections.fiducial)
-    return replace(labelled, detections=replace(detections, fiducial=fiducial), snapshots=tuple(snapshots))
+    detections = replace(detections, fiducial=fiducial)
+    return replace(labelled, detections=detections, snapshots=tuple(snapshots), rests_with=rests)
 
 
 def _continue(before: Pose, last: Pose, points: NDArray[np.float64]) -> Pose:

@@ -37,7 +37,6 @@ class SnapshotIdentity:
     found_by: str = "classical"  # blobs, or the name of the proposer
     moment: int = -1  # number of the input's snapshot if several rows share one; -1 = its own number
     part: int = 0  # number of the object, of several
-    rests_with: int = -1  # row whose average includes this one, because the object is at rest; -1 = none
 
 
 class LearntRig:

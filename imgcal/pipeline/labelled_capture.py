@@ -49,8 +49,7 @@ def arrange_labels(labelled: Associations, rig: CameraRig, obj: CalibrationObjec
     Raises:
         RefusedError: no snapshot is left.
     """
-    alone = tuple(s if s.rests_with < 0 else replace(s, rests_with=-1) for s in labelled.snapshots)
-    each = _arrange_each(replace(labelled, snapshots=alone), rig, obj)
+    each = _arrange_each(replace(labelled, rests_with={}) if labelled.rests_with else labelled, rig, obj)
     labelled, observations, rows = average_rests(each.labelled, each.observations)
     return each if labelled is each.labelled else LabelledCapture(labelled, observations, each.poses[rows])
 

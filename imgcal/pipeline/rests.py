@@ -49,8 +49,7 @@ class Rests:
     def of(cls, labelled: Associations) -> Rests:
         """List them."""
         names = [snapshot.name for snapshot in labelled.snapshots]
-        pairs = ((s.name, names[s.rests_with]) for s in labelled.snapshots if s.rests_with >= 0)
-        return cls(tuple(dict.fromkeys(pairs)))
+        return cls(tuple({names[row]: names[at] for row, at in labelled.rests_with.items()}.items()))
 
     @property
     def values(self) -> dict[str, Any]:
@@ -96,12 +95,10 @@ def average_rests(labelled: Associations, observations: Observations) -> tuple[A
             uv[row], sigma[row] = _average(uv[group], sigma[group], seen[group], share)
     order = np.argsort(kept)
     kept, groups = kept[order], [groups[i] for i in order]
-    used, snapshots = labelled.used, list(labelled.snapshots)
-    for row, group in zip(kept.tolist(), groups, strict=True):
-        for other in group[group != row].tolist():
-            snapshots[used[other]] = replace(snapshots[used[other]], rests_with=used[row])
+    used = labelled.used
+    rests = {used[other]: used[row] for row, group in zip(kept, groups, strict=True) for other in group if other != row}
     averaged = Observations(torch.from_numpy(uv[kept]), torch.from_numpy(sigma[kept]), observations.seen[kept])
-    return replace(labelled, snapshots=tuple(snapshots)), averaged, kept
+    return replace(labelled, rests_with=dict(sorted(rests.items()))), averaged, kept
 
 
 def find_rests(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows, together: int = 1) -> Rows:
