@@ -52,10 +52,11 @@ def autocorrelation(series: NDArray[np.floating], lags: int) -> tuple[NDArray[np
     wide = x.shape[2]
     samples, there = _rows(np.where(known, x, 0.0)), _rows(known.astype(np.float64))
     products, pairs = np.empty((lags + 1, sources)), np.empty((lags + 1, sources))
+    complete = bool(known.all())
     for lag in range(lags + 1):
         ahead, behind = np.s_[:, lag * wide :], np.s_[:, : (count - lag) * wide]
         products[lag] = np.einsum("cn,cn->c", samples[ahead], samples[behind])
-        pairs[lag] = (count - lag) * wide if known.all() else np.einsum("cn,cn->c", there[ahead], there[behind])
+        pairs[lag] = (count - lag) * wide if complete else np.einsum("cn,cn->c", there[ahead], there[behind])
     mean = np.divide(products, pairs, out=np.full_like(products, np.nan), where=pairs > 0)
     variance = mean[0]
     rho = np.divide(mean, variance, out=np.full_like(mean, np.nan), where=variance > 0)

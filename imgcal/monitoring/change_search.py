@@ -42,6 +42,11 @@ FIT_CHI2_PER_DOF = 4.0
 """Largest chi-squared per degree of freedom of a snapshot that fits, where it would otherwise be refused."""
 
 
+def slow_tests(recent: RecentSnapshots, count: int) -> set[int]:
+    """Numbers of latest snapshots to test without a suspicion; arguments as for `find_alarm`."""
+    return {age for age, (every, at) in SLOW_TESTS.items() if age <= len(recent) and count % every == at}
+
+
 def find_alarm(
     recent: RecentSnapshots, count: int, episode: Callable[[int, float], int], least_shifts: Sequence[float]
 ) -> int | None:
@@ -53,8 +58,7 @@ def find_alarm(
         episode: number of successive snapshots that a passing error may last, given the camera and the shift in pixels.
         least_shifts: smallest image shift, in pixels, that counts as a change; one for each camera.
     """
-    ages = {age for age, (every, at) in SLOW_TESTS.items() if age <= len(recent) and count % every == at}
-    screened = recent.screen()
+    ages, screened = slow_tests(recent, count), recent.screen()
     suspicion = SCREEN_CHI2 + 2 * math.log(max(1.0, screened.shape[1] / SCREENED_CAMERAS))
     if screened.max() >= suspicion:
         ages.add(int(SCREENED_AGES[int(screened.max(1).argmax())]))

@@ -45,7 +45,7 @@ PACE_DOUBT = 6.0
 LEARNING_SECONDS = 133.0
 """Time in which a random walk goes as far as the ramp that it replaces."""
 ADDED_TOGETHER = 32
-"""Snapshots whose information is summed in one go."""
+"""Snapshots whose information is summed in one go; one more where the last of them has other work."""
 
 
 @dataclass
@@ -184,7 +184,9 @@ class DriftLearning:
     stretch: Stretch | None = None  # the snapshots so far ...
     waiting: int = 0  # ... and how many of the latest are not added yet
 
-    def update(self, follows: RigFilter, recent: RecentSnapshots, seconds: float, quiet: bool) -> None:
+    def update(
+        self, follows: RigFilter, recent: RecentSnapshots, seconds: float, quiet: bool, busy: bool = False
+    ) -> None:
         """Take the latest snapshot, and update the filter's belief.
 
         Args:
@@ -192,6 +194,7 @@ class DriftLearning:
             recent: the latest snapshots, this one included.
             seconds: since the previous snapshot.
             quiet: no camera has changed recently.
+            busy: work that can wait is left to the next snapshot.
         """
         if follows.young or not quiet:
             self.stretch = None
@@ -202,7 +205,7 @@ class DriftLearning:
         stretch = self.stretch
         stretch.seconds, self.waiting = stretch.seconds + seconds, self.waiting + 1
         done = stretch.seconds >= STRETCH_SECONDS
-        if done or self.waiting == ADDED_TOGETHER:
+        if done or (self.waiting >= ADDED_TOGETHER and not busy):
             stretch.add(follows.belief, *recent.information(self.waiting))
             self.waiting = 0
         if done:

@@ -34,8 +34,9 @@ from imgcal.types import Observations
 # Correlation times.
 MEMORY_SNAPSHOTS = 1024
 """Number of latest snapshots used to measure correlation times ..."""
-FIRST_MEASUREMENTS, MEASUREMENT_INTERVAL = (48, 64, 96), 128
-"""... counts of snapshots at which they are first measured, and the interval after that."""
+FIRST_MEASUREMENTS, MEASUREMENT_INTERVAL, MEASUREMENT_OFFSET = (48, 64, 96), 128, 4
+"""... counts of snapshots at which they are first measured, and the interval after that with its offset, so that no
+snapshot waits for a slow test for changes (`change_search.SLOW_TESTS`), too."""
 WITHHELD_SECONDS, MOST_WITHHELD = 2.0, 0.25
 """Seconds of latest snapshots that are left out, but at most this share of all: until a change of a camera has been
 found, the shift of its image would pass for a persistent error that hides it."""
@@ -199,12 +200,13 @@ class NoiseCorrelation:
         self.taken += 1
         scale = np.maximum(self.scale.numpy(), np.sqrt(variance))
         self.off = torch.from_numpy(np.square(shift / scale[:, None]).sum(1))
-        if self.taken in FIRST_MEASUREMENTS or self.taken % MEASUREMENT_INTERVAL == 0:
+        later = self.taken > FIRST_MEASUREMENTS[-1] and self.taken % MEASUREMENT_INTERVAL == MEASUREMENT_OFFSET
+        if later or self.taken in FIRST_MEASUREMENTS:
             self._measure()
 
     def _measure(self) -> None:
         """Measure each camera alone and all together: cameras with few snapshots are assumed to be like the others."""
-        series = np.stack(self.shifts)[: len(self.shifts) - self._withheld]
+        series = np.concatenate(self.shifts).reshape(-1, self.cameras, 2)[: len(self.shifts) - self._withheld]
         seen = np.isfinite(series[..., 0])
         variance = np.nansum(np.square(series), axis=(0, 2)) / (2 * np.maximum(seen.sum(0), 1))
         whitened = series / np.sqrt(np.maximum(variance, 1e-12))[:, None]

@@ -24,6 +24,7 @@ from imgcal.monitoring.change_search import (
     find_alarm,
     likeliest_age,
     likeliest_camera,
+    slow_tests,
 )
 from imgcal.monitoring.change_test import JUMPS, LARGE
 from imgcal.monitoring.clock_slip import project_fiducials
@@ -228,7 +229,8 @@ class RigMonitor:
                 return replace(anew, changes=tuple(changes))
             if self._pending is not None:
                 self._begin_pending(result, self._pending.before, self._pending.seconds, self._pending.kinds)
-        self._drifting.update(self.filter, self._recent, seconds, quiet=self._pending is None and alarm is None)
+        quiet, busy = self._pending is None and alarm is None, bool(slow_tests(self._recent, self.filter.count))
+        self._drifting.update(self.filter, self._recent, seconds, quiet, busy)
         if self._pending is not None and self._pending.due:
             changes += self._decide_kinds(self._pending.overdue)
         return MonitorUpdate(result, tuple(changes))
