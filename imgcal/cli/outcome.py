@@ -172,6 +172,7 @@ def summary(calibration: Calibration, seconds: dict[str, float]) -> dict[str, An
         "rejected": {s.name: s.reason for s in snapshots if s.name not in names},
         "late": [vars(late) for late in calibration.late],
         "doubtful": [camera.as_values() for camera in calibration.doubtful],
+        "delays": None if calibration.delays is None else calibration.delays.values,
         "unsynchronized": None if calibration.unsynchronized is None else calibration.unsynchronized.values,
         "per_camera": per_camera,
         "per_snapshot": counts_by_snapshot(calibration),
@@ -266,7 +267,8 @@ def refused_summary(
         "rms_px_before": None, "rms_px_after": None, "first_guess": None,
         "chi2_per_dof": None, "model_error_px": None, "outliers": None, "prior_too_narrow": {},
         "snapshots_used": 0, "snapshots_rejected": len(detections.snapshot_names), "lights": None, "rejected": {},
-        "moved": [move.as_values() for move in moved], "late": [], "doubtful": [], "unsynchronized": None,
+        "moved": [move.as_values() for move in moved], "late": [], "doubtful": [],
+        "delays": None, "unsynchronized": None,
         "per_camera": blobs_by_camera(detections, rig), "per_snapshot": {},
         "object": [], "object_displaced": [], "object_lost": [], "object_scale_sigma": None, "object_bent_sigma": None,
         "board_bend": None, "covariance": None, "predicted_error": None, "scale": None, "repeats": None, "rests": None,
@@ -324,8 +326,9 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
             print(f"note: {lights['note']}", file=sys.stderr)
     for line in found.lines:
         print(line)
-    if result["unsynchronized"]:
-        print(f"note: {result['unsynchronized']['note']}", file=sys.stderr)
+    for timing in (result["delays"], result["unsynchronized"]):
+        if timing:
+            print(f"note: {timing['note']}", file=sys.stderr)
     if result["unit_doubt"]:
         print(f"note: {result['unit_doubt']}", file=sys.stderr)
     for left_out in (result["repeats"], result["rests"]):

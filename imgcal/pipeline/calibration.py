@@ -23,6 +23,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.monitoring import make_posterior
 from imgcal.pipeline.clock_offset import LEAST_BETTER, LateCamera, timing_motion
 from imgcal.pipeline.doubtful_cameras import DoubtfulCamera, doubtful_at_end
+from imgcal.pipeline.exposure_delays import Delays
 from imgcal.pipeline.initialization import Initialization
 from imgcal.pipeline.label_counts import LabelCounts, count_labels
 from imgcal.pipeline.lights import FoundLights
@@ -99,6 +100,7 @@ class Calibration:
     moved: tuple[MovedCamera, ...] = ()  # during the capture; only snapshots after the moves are used
     from_scratch: bool = False  # no factory calibration: `factory` is a first rig from the same data
     late: tuple[LateCamera, ...] = ()  # whose frames, from some snapshot on, are of other moments; those are not used
+    delays: Delays | None = None  # constant differences of exposure times, corrected; None = no sign of them
     unsynchronized: Unsynchronized | None = None  # unsynchronized cameras; None = no sign of them
     repeats: Repeats = Repeats()  # exact copies of earlier images; not used
     distance: KnownDistance | None = None  # between two cameras: defines the scale if nothing else does

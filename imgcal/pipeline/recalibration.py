@@ -20,6 +20,7 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.pipeline.board_turns import settle_turns
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.conventions import lines_of_sight_miss, require_conventions, require_meeting_rays
+from imgcal.pipeline.exposure_delays import find_delays, has_odd_camera
 from imgcal.pipeline.fitting import fit_lights, fit_since_last_move, fit_steady
 from imgcal.pipeline.initialization import Initializer
 from imgcal.pipeline.late_cameras import find_late_cameras, require_same_moments
@@ -191,7 +192,7 @@ def _fit_labels(labelled: Associations, given: Detections, case: _Case, initiali
         if has_stick and (again := label_again(fit, given, obj, options)) is not None:
             with contextlib.suppress(RefusedError), require_solvable():
                 fit = fit_with_timing(again, given, rig, obj, options)
-        is_steady = not fit.moved and fit.unsynchronized is None
+        is_steady = not fit.moved and fit.unsynchronized is None and fit.delays is None
         if obj.has_lights and is_steady and (lit := add_lights(fit.labelled, fit.estimate.rig, obj)) is not None:
             with contextlib.suppress(RefusedError), require_solvable():
                 fit = fit_steady(lit, given, rig, obj, options)
@@ -256,27 +257,38 @@ def fit_with_timing(
     initializer: Initializer | None = None,
     prior_std: Tensor | None = None,
 ) -> Calibration:
-    """Do what `fit_steady` does; if the cameras are not synchronized, with the additional noise.
+    """Do what `fit_steady` does; if cameras expose at other times, with blobs moved back, or with additional noise.
 
     Raises:
         RefusedError: the data are not sufficient.
     """
+
+    def fit_other(blobs: Detections) -> Calibration:
+        own = replace(given, uv=blobs.uv, sigma=blobs.sigma) if len(given) == len(blobs) else blobs
+        return fit_steady(replace(labelled, detections=blobs), own, rig, obj, options, initializer, prior_std)
+
+    fit: Calibration | None = None
     refusal: RefusedError | None = None
     try:
         fit = fit_steady(labelled, given, rig, obj, options, initializer, prior_std)
-        if fit.additive_noise < NOTICEABLE:
+        if fit.additive_noise == 0 and not has_odd_camera(fit.residual, fit.observations):
             return fit
     except RefusedError as error:
         refusal = error
-    found = find_unsynchronized(labelled, rig, obj)
-    if found is not None:
-        unsynchronized, noisy = found
-        given = replace(given, sigma=noisy.sigma) if len(given) == len(noisy) else noisy
-        labelled = replace(labelled, detections=noisy)
+    if (constant := find_delays(labelled, rig, obj)) is not None:
+        delays, together = constant
         with contextlib.suppress(RefusedError):
-            fit = fit_steady(labelled, given, rig, obj, options, initializer, prior_std)
-            return replace(fit, unsynchronized=unsynchronized)
-    if refusal is not None:
+            found = fit_other(together)
+            if fit is None or found.additive_noise < fit.additive_noise:
+                return replace(found, delays=delays)
+    if fit is not None and fit.additive_noise < NOTICEABLE:
+        return fit
+    if (changing := find_unsynchronized(labelled, rig, obj)) is not None:
+        unsynchronized, noisy = changing
+        with contextlib.suppress(RefusedError):
+            return replace(fit_other(noisy), unsynchronized=unsynchronized)
+    if fit is None:
+        assert refusal is not None
         raise refusal
     return fit
 

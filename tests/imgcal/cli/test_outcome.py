@@ -14,6 +14,7 @@ RESULT = {
     "rms_px_after": 0.0512,
     "predicted_error": {**PREDICTED, "worst_camera": "cam03", "worst_camera_px": 0.2},
     "scale": {"note": "scale comes from the object file"},
+    "delays": None,
     "unsynchronized": None,
     "board_bend": None,
     "lights": None,
