@@ -279,7 +279,7 @@ def fit_with_timing(
         delays, together = constant
         with contextlib.suppress(RefusedError):
             found = fit_other(together)
-            if fit is None or found.additive_noise < fit.additive_noise:
+            if fit is None or (found.additive_noise, found.outliers) < (fit.additive_noise, fit.outliers):
                 return replace(found, delays=delays)
     if fit is not None and fit.additive_noise < NOTICEABLE:
         return fit
