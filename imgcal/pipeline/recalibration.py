@@ -279,7 +279,7 @@ def fit_with_timing(
         delays, together = constant
         with contextlib.suppress(RefusedError):
             found = fit_other(together)
-            if fit is None or (found.additive_noise, found.outliers) < (fit.additive_noise, fit.outliers):
+            if fit is None or _misfit(found) < _misfit(fit):
                 return replace(found, delays=delays)
     if fit is not None and fit.additive_noise < NOTICEABLE:
         return fit
@@ -291,6 +291,11 @@ def fit_with_timing(
         assert refusal is not None
         raise refusal
     return fit
+
+
+def _misfit(fit: Calibration) -> tuple[float, int, float]:
+    """How badly labels fit: the smaller, the better."""
+    return fit.additive_noise, fit.outliers, float(fit.rms)
 
 
 def _next_sight(sight: Sight, labelled: Associations) -> Sight | None:
