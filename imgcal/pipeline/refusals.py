@@ -12,7 +12,7 @@ from torch import Tensor
 from imgcal.association import PipelineOptions
 from imgcal.errors import RefusedError
 from imgcal.estimation import Estimate
-from imgcal.messages import name_cameras, name_several
+from imgcal.messages import name_cameras, name_several, plural
 from imgcal.pipeline.label_counts import LabelCounts
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
@@ -20,8 +20,9 @@ LEAST_EXPLAINED = 0.5
 """Minimum share of a camera's view of the object that must be where the rest of the rig expects it."""
 SAME_PIXEL = 1e-3
 """Maximum difference (px) between two ways of projecting."""
-LEAST_SIGHT = 0.3
-"""Minimum number of possible fiducials, as a share of those in view, for a camera to see the object."""
+LEAST_SIGHT, LEAST_BLOBS = 0.3, 4
+"""Minimum number of possible fiducials, as a share of those in view, for a camera to see the object; and minimum number
+of blobs, if no label of the camera fits."""
 
 
 def require_cameras(seen: NDArray[np.bool_], rig: CameraRig, options: PipelineOptions) -> None:
@@ -47,14 +48,15 @@ def require_views(counts: LabelCounts, rig: CameraRig, least_share: float = LEAS
     """
     kept, unexplained, expected = (count.sum(0) for count in (counts.kept, counts.unexplained, counts.expected))
     bad = (kept <= least_share * (kept + unexplained)) & (unexplained >= LEAST_SIGHT * np.maximum(expected, 1))
+    bad &= (kept > 0) | (unexplained >= LEAST_BLOBS)  # a false blob or two show nothing
     if bad.any():
         camera = int(np.argmax(np.where(bad, unexplained, -1)))
         which = [rig.camera_names[i] for i in np.flatnonzero(bad)]
         raise RefusedError(
-            f"{name_cameras(which)}: the other cameras put {expected[camera]} fiducials into the image of "
-            f"{rig.camera_names[camera]}, found {kept[camera]} there, and {unexplained[camera]} blobs that belong to "
-            "nothing: the image may be mirrored or turned, its frames may be of another camera or moment, or its pose "
-            "or lens may differ from the rig file",
+            f"{name_cameras(which)}: the other cameras put {plural(int(expected[camera]), 'fiducial')} into the image "
+            f"of {rig.camera_names[camera]}, found {kept[camera]} there, and "
+            f"{plural(int(unexplained[camera]), 'blob')} that belong to nothing: the image may be mirrored or turned, "
+            "its frames may be of another camera or moment, or its pose or lens may differ from the rig file",
             python="correct this, or leave the camera out of the rig (rig.select) and of the detections",
             command=f"correct this, or leave out what is wrong: --without {' '.join(which)}",
         )

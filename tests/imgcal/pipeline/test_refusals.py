@@ -11,7 +11,7 @@ import imgcal
 from imgcal.association import PipelineOptions
 from imgcal.errors import RefusedError
 from imgcal.pipeline import recalibration
-from imgcal.pipeline.refusals import require_fit, require_most_labels, require_near_prior
+from imgcal.pipeline.refusals import require_fit, require_most_labels, require_near_prior, require_views
 from imgcal.synthesis import simulate_truth, true_detections
 from imgcal.types import RigPrior
 
@@ -47,6 +47,27 @@ def test_a_kind_of_values_too_far_from_the_factory_is_named(o10):
     require_near_prior(fit, prior, o10, {"rotation": 3.9}, OPTIONS)
     with pytest.raises(RefusedError, match=r"the focal length of all cameras .* 4\.2 times"):
         require_near_prior(fit, prior, o10, {"rotation": 2.0, "focal_length": 4.2}, OPTIONS)
+
+
+@pytest.mark.parametrize(("kept", "unexplained", "refused"), [(0, 1, False), (0, 3, False), (0, 4, True), (1, 2, True)])
+def test_a_false_blob_or_two_do_not_make_an_image_mirrored(kept, unexplained, refused, o10):
+    shape = (2, o10.num_cameras)
+
+    def only_one_camera(count):
+        counts = np.zeros(shape, dtype=np.int64)
+        counts[0, 3] = count
+        return counts
+
+    counts = SimpleNamespace(
+        kept=only_one_camera(kept), unexplained=only_one_camera(unexplained), expected=only_one_camera(unexplained)
+    )
+    if not refused:
+        require_views(counts, o10)
+        return
+    with pytest.raises(
+        RefusedError, match=f"^camera cam04: .* put {unexplained} fiducials into .*, found {kept} there"
+    ):
+        require_views(counts, o10)
 
 
 def test_residuals_and_outliers_are_told_with_what_to_do():
