@@ -231,9 +231,17 @@ class Calibration:
 
     @cached_property
     def tally(self) -> LabelCounts:
-        """What each camera saw in each snapshot, and how much of it is explained."""
-        seen = self.observations.seen.numpy()
-        return count_labels(self.labelled, seen, self.rig_from_object, self.factory, self.object, self.estimate.rig)
+        """What each camera saw in each snapshot, those of a rest included, and how much of it is explained."""
+        labelled, seen, poses = self.labelled, self.observations.seen.numpy(), self.rig_from_object
+        if labelled.rests_with:
+            row, detections = labelled.used_rows, labelled.detections
+            shown = np.zeros((len(row), *seen.shape[1:]), dtype=np.bool_)
+            named = np.flatnonzero(detections.fiducial >= 0)
+            shown[detections.snapshot[named], detections.camera[named], detections.fiducial[named]] = True
+            frames = row >= 0
+            seen, poses = shown[frames] & seen[row[frames]], poses[row[frames]]
+            labelled = replace(labelled, rests_with={})
+        return count_labels(labelled, seen, poses, self.factory, self.object, self.estimate.rig)
 
     @cached_property
     def doubtful(self) -> tuple[DoubtfulCamera, ...]:

@@ -18,14 +18,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imgcal.association import Associations, accepted_observations
-from imgcal.estimation import estimate
+from imgcal.estimation import Estimate, estimate
+from imgcal.geometry import RigidTransform
 from imgcal.medians import median
 from imgcal.types import CalibrationObject, CameraRig, Detections, Observations
 
-LEAST_VIEWS = 10
-"""Minimum number of images of each camera with a known motion."""
+LEAST_VIEWS = 30
+"""Minimum number of images with a known motion for a camera's delay to be known."""
 LARGEST = 0.15
 """Snapshots: with larger delays, labels that fit are few and biased."""
+MOST_SNAPSHOTS, STRETCH = 600, 60
+"""Maximum number of snapshots from which delays are estimated, and the length of the stretches that are taken then."""
 ROUNDS, CLOSE = 16, 1e-4
 """Most fits, and the change of a delay (snapshots) at which they end."""
 LEAST_NOISE = 1e-3
@@ -40,24 +43,31 @@ LEAST_EXPLAINED = 0.03
 """Share of some camera's squared residuals in the first fit that its delay must explain to be worth more fits."""
 MOST_LEFT = 0.9
 """Maximum ratio of some camera's usual residual with delays to that without."""
-MOST_APART = 0.2
-"""Maximum difference between the delays in the two halves of a capture, relative to the largest delay."""
+MOST_APART, LEAST_APART = 0.1, 0.002
+"""Maximum difference between the delays in the two halves of a capture, relative to the largest delay; and snapshots
+that are always allowed."""
+JUMP = 1.6
+"""Ratio of the usual motion from one snapshot to the next to the larger one beside it, above which some are missing in
+between."""
 
 
 @dataclass(frozen=True)
 class Delays:
     """Cameras that expose at other times than the median camera, by the same time in every snapshot."""
 
-    snapshots: tuple[float, ...]  # (C,) delay as a share of the interval between snapshots
+    snapshots: tuple[float | None, ...]  # (C,) delay as a share of the interval between snapshots; None = unknown
     cameras: tuple[str, ...]  # (C,)
 
     def __str__(self) -> str:
         """Describe them in words."""
-        delays = ", ".join(f"{name} {delay:+.3f}" for name, delay in zip(self.cameras, self.snapshots, strict=True))
+        words = [
+            f"{name} {'unknown' if delay is None else f'{delay:+.3f}'}"
+            for name, delay in zip(self.cameras, self.snapshots, strict=True)
+        ]
         return (
             "the cameras expose at different times, by the same difference in every snapshot, in intervals between "
-            f"snapshots after the median camera: {delays}; blobs were moved back along the object's motion: trigger "
-            "the cameras together for the full accuracy"
+            f"snapshots after the median camera: {', '.join(words)}; blobs were moved back along the object's motion: "
+            "trigger the cameras together for the full accuracy"
         )
 
     @property
@@ -72,11 +82,18 @@ class Motion:
 
     velocity: Tensor
     acceleration: Tensor
-    neighbours: Tensor  # (S,) snapshots in a row before and after that are known, the smaller number: 0, 1 or 2
+    neighbours: Tensor  # (S,) snapshots in a row that are known on both sides, 0 to 2; -1 = on neither side
 
     @classmethod
-    def of(cls, uv: Tensor, before: NDArray[np.int64]) -> Motion:
-        """Take differences of positions (S, C, N, 2); `before`: see `Associations.before_rows`."""
+    def of(cls, uv: Tensor, seen: Tensor, before: NDArray[np.int64]) -> Motion:
+        """Take differences of positions.
+
+        Args:
+            uv: (S, C, N, 2) px.
+            seen: (S, C, N) positions that define whether snapshots are missing.
+            before: see `Associations.before_rows`.
+        """
+        before = _without_jumps(uv, seen, before)
         count = len(before)
         after = np.full(count + 1, -1)
         after[before] = np.arange(count)
@@ -91,20 +108,29 @@ class Motion:
         velocity = torch.where(_wide(two), (8 * (u3 - u1) - (u4 - u0)) / 12, velocity)
         bend = torch.where(_wide(one), u3 - 2 * u2 + u1, 0.0)
         bend = torch.where(_wide(two), (16 * (u1 + u3) - 30 * u2 - u0 - u4) / 12, bend)
-        return cls(velocity, bend, one.long() + two.long())
+        return cls(velocity, bend, torch.where(has[1] | has[2], one.long() + two.long(), -1))
 
     def during(self, delay: Tensor) -> Tensor:
         """Motion (S, C, N, 2) px within delays (C,)."""
         time = delay[:, None, None]
         return self.velocity * time + self.acceleration * (time**2 / 2)
 
-    def variance(self, delay: Tensor) -> Tensor:
-        """Variance (S, C, N) px^2 of each axis of `during`, where too few neighbours are known."""
+    def variance(self, delay: Tensor, unknown: Tensor) -> Tensor:
+        """Variance (S, C, N) px^2 of each axis of `during`: what the differences leave out, if motion is periodic.
+
+        Args:
+            delay: (C,).
+            unknown: (C,) standard deviation of the delay.
+        """
         known = self.neighbours > 0
         speed, bend = (values[known].square().mean((0, 2, 3)) for values in (self.velocity, self.acceleration))
-        jerk = bend * bend / speed.clamp_min(1e-12)  # as if the motion were periodic
-        missing = torch.stack((bend * (delay / 2).square(), jerk * (delay / 6).square(), torch.zeros_like(delay)))
-        return missing[self.neighbours][:, :, None].expand(self.velocity.shape[:-1])
+        rate = bend / speed.clamp_min(1e-12)  # of the motion, squared: rad^2 per snapshot^2
+        nothing = speed * delay.square()
+        line = bend * (delay / 2).square()
+        three = speed * rate.square() * (delay / 6).square()
+        five = speed * ((rate.square() * delay / 30).square() + (rate * delay**3 / 6).square())
+        missing = torch.stack((line, three, five, nothing))[self.neighbours]  # (S, C); the last row has number -1
+        return missing[:, :, None] + self.velocity.square().mean(-1) * unknown.square()[:, None]
 
 
 def has_odd_camera(residual: Tensor, observations: Observations) -> bool:
@@ -131,26 +157,66 @@ def find_delays(labelled: Associations, rig: CameraRig, obj: CalibrationObject) 
     if rig.num_cameras < 2 or obj.unknown_markers:
         return None
     observations, poses = accepted_observations(labelled, rig, obj)
-    before, exact, rows = labelled.before_rows, obj.as_exact(), torch.arange(len(labelled.used))
+    before, rows = labelled.before_rows, _choose_stretches(len(observations.seen))
+    some = observations.of_snapshots(rows.tolist())
+    numbers = np.full(len(before) + 1, -1)
+    numbers[rows] = np.arange(len(rows))
+    found = _estimate_delays(some, None if poses is None else poses[rows], numbers[before[rows]], rig, obj)
+    if found is None:
+        return None
+    delay, known, fit, motion = found
+    if len(rows) < len(before):
+        even = replace(observations, sigma=torch.ones_like(observations.sigma))
+        fit = estimate(even, rig, obj.as_exact(), poses, initial_rig=fit.rig)
+        motion = _motion(fit, observations.seen, before, obj)
+    unknown = torch.where(known, 0.0, delay[known].square().mean().sqrt())
+    moved, variance = motion.during(delay).numpy(), motion.variance(delay, unknown).numpy()
+    after = delay - delay[known].median()
+    shares = (
+        round(share, 4) + 0.0 if is_known else None
+        for share, is_known in zip(after.tolist(), known.tolist(), strict=True)
+    )
+    return Delays(tuple(shares), rig.camera_names), _move_back(labelled, moved, variance)
+
+
+def _choose_stretches(count: int) -> NDArray[np.int64]:
+    """Choose snapshots of a long capture, in stretches evenly over it."""
+    if count <= MOST_SNAPSHOTS:
+        return np.arange(count)
+    first = np.linspace(0, count - STRETCH, MOST_SNAPSHOTS // STRETCH).astype(np.int64)
+    return np.unique(first[:, None] + np.arange(STRETCH))
+
+
+def _estimate_delays(
+    observations: Observations, poses: RigidTransform | None, before: NDArray[np.int64], rig: CameraRig,
+    obj: CalibrationObject,
+) -> tuple[Tensor, Tensor, Estimate, Motion] | None:  # fmt: skip
+    """Estimate delays (C,), in turn with the rig and the poses.
+
+    Returns:
+        The delays, which of them are known (C,), the latest fit and its motion; None if they do not explain residuals.
+    """
+    rows, exact = torch.arange(len(observations.seen)), obj.as_exact()
     halves = rows < len(rows) // 2, rows >= len(rows) // 2
     start, usual, last_step = rig, list[Tensor](), None
     delay, moved = torch.zeros(rig.num_cameras, dtype=torch.float64), torch.zeros_like(observations.uv)
     for _ in range(ROUNDS):
-        noise = max(float(usual[-1].median()), LEAST_NOISE) if usual else 1.0
+        noise = max(float(usual[-1].nanmedian()), LEAST_NOISE) if usual else 1.0
         even = replace(observations, sigma=torch.full_like(observations.sigma, noise))
         fit = estimate(replace(even, uv=even.uv - moved), rig, exact, poses, initial_rig=start)
         if not bool(fit.converged):
             return None
         start, poses = fit.rig, fit.rig_from_object
-        points = poses.apply(fit.points_object)
-        motion = Motion.of(start.expand(len(points)).project_values(points, obj.radius).uv, before)
+        motion = _motion(fit, observations.seen, before, obj)
         residuals = _Residuals.of(fit.residual, motion, observations.seen)
         usual.append(residuals.usual)
-        if bool((residuals.views < LEAST_VIEWS).any()) or not bool((residuals.power > 0).all()):
+        known = (residuals.views >= LEAST_VIEWS) & (residuals.power > 0)
+        if int(known.sum()) < 2:
             return None
-        if len(usual) == 1 and bool((residuals.explained < LEAST_EXPLAINED).all()):
+        if len(usual) == 1 and bool((residuals.explained[known] < LEAST_EXPLAINED).all()):
             return None
-        step = residuals.delay - residuals.delay.median()  # a delay of all cameras is no difference
+        step = residuals.delay
+        step = torch.where(known, step - step[known].median(), 0.0)  # a delay of all cameras is no difference
         # Cameras and poses adapt to a delay, so that each step shows a part of it only.
         remains = 0.0 if last_step is None else float(step @ last_step / last_step.square().sum())
         last_step = step
@@ -161,12 +227,32 @@ def find_delays(labelled: Associations, rig: CameraRig, obj: CalibrationObject) 
         moved = motion.during(delay)
         if bool(step.abs().max() < CLOSE):
             break
-    apart = (parts[0].delay - parts[1].delay).abs().max()
-    if bool((usual[-1] > MOST_LEFT * usual[0]).all()) or not bool(apart <= MOST_APART * delay.abs().max()):
+    else:
+        return None  # cameras adapt to nearly all of it
+    apart = (parts[0].delay - parts[1].delay)[known].abs().max()
+    left = (usual[-1] / usual[0])[known].min()
+    if float(left) > MOST_LEFT or float(apart) > max(MOST_APART * float(delay.abs().max()), LEAST_APART):
         return None
-    after = delay - delay.median()
-    delays = Delays(tuple(round(value, 4) for value in after.tolist()), rig.camera_names)
-    return delays, _move_back(labelled, moved.numpy(), motion.variance(delay).numpy())
+    return delay, known, fit, motion
+
+
+def _motion(fit: Estimate, seen: Tensor, before: NDArray[np.int64], obj: CalibrationObject) -> Motion:
+    """Motion of the object in the images of a fit."""
+    points = fit.rig_from_object.apply(fit.points_object)
+    return Motion.of(fit.rig.expand(len(points)).project_values(points, obj.radius).uv, seen, before)
+
+
+def _without_jumps(uv: Tensor, seen: Tensor, before: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Leave out neighbours (S,) from which the object has moved much farther than from the others to theirs."""
+    rows = np.flatnonzero(before >= 0)
+    both = seen[rows] & seen[before[rows]]
+    length = torch.where(both, (uv[rows] - uv[before[rows]]).norm(dim=-1), torch.nan)
+    step = np.full(len(before) + 1, np.nan)  # from the one before, px; the last one is none
+    step[rows] = length.flatten(1).nanmedian(1).values.numpy()
+    after = np.full(len(before) + 1, -1)
+    after[before[rows]] = rows
+    beside = np.fmax(step[before], step[after[: len(before)]])
+    return np.where(step[: len(before)] > JUMP * beside, -1, before)
 
 
 def _wide(rows: Tensor) -> Tensor:
@@ -205,8 +291,8 @@ class _Residuals:
 
     @property
     def delay(self) -> Tensor:
-        """Delay (C,) by regression."""
-        return -(self.velocity * self.residual).sum((0, 2, 3)) / self.power
+        """Delay (C,) by regression; zero where nothing moved."""
+        return -(self.velocity * self.residual).sum((0, 2, 3)) / self.power.clamp_min(1e-30)
 
     @property
     def explained(self) -> Tensor:

@@ -102,7 +102,7 @@ def count_labels(
     return LabelCounts(
         blobs=count(np.ones(len(detections), dtype=bool)),
         usable=usable,
-        labelled=count((detections.fiducial >= 0) & np.isin(detections.snapshot, used)),
+        labelled=count(detections.fiducial >= 0),
         kept=fitting,
         placed=np.zeros_like(fitting) if rig is None else _count_placed(labelled, poses, rig, obj),
         expected=expected,

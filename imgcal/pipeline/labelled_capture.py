@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from imgcal.association import Associations, accepted_observations, drop_merged, drop_snapshots
 from imgcal.estimation import UNPOSED, UndeterminedPosesError, initial_pose, require_poses
 from imgcal.geometry import RigidTransform
-from imgcal.pipeline.rests import average_rests
+from imgcal.pipeline.rests import average_rests, weaken_rests
 from imgcal.types import CalibrationObject, CameraRig, Observations
 
 
@@ -52,6 +52,12 @@ def arrange_labels(labelled: Associations, rig: CameraRig, obj: CalibrationObjec
     each = _arrange_each(replace(labelled, rests_with={}) if labelled.rests_with else labelled, rig, obj)
     labelled, observations, rows = average_rests(each.labelled, each.observations)
     return each if labelled is each.labelled else LabelledCapture(labelled, observations, each.poses[rows])
+
+
+def arrange_frames(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> LabelledCapture:
+    """Do what `arrange_labels` does, but keep the snapshots of a rest, with a larger sigma; see `weaken_rests`."""
+    each = _arrange_each(replace(labelled, rests_with={}) if labelled.rests_with else labelled, rig, obj)
+    return replace(each, observations=weaken_rests(each.labelled, each.observations))
 
 
 def _arrange_each(labelled: Associations, rig: CameraRig, obj: CalibrationObject) -> LabelledCapture:

@@ -12,7 +12,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.pipeline.clock_offset import LateCamera, find_late_camera, suspects
 from imgcal.pipeline.fitting import fit_labelled
 from imgcal.pipeline.label_counts import LabelCounts
-from imgcal.pipeline.labelled_capture import arrange_labels
+from imgcal.pipeline.labelled_capture import arrange_frames
 from imgcal.pipeline.motion_check import count_fitting_labels
 from imgcal.types import CalibrationObject, CameraRig, Detections, MovedError
 
@@ -35,7 +35,7 @@ def require_same_moments(
         obj: the calibration object.
         options: how certain a result must be.
     """
-    arranged = arrange_labels(labelled, rig, obj)
+    arranged = arrange_frames(labelled, rig, obj)
     counts = count_fitting_labels(arranged, rig, obj, options)
     moves = error.moved if isinstance(error, MovedError) else ()
     moved = tuple((move.camera, detections.snapshot_names.index(move.snapshot)) for move in moves)

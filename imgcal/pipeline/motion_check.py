@@ -28,7 +28,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.medians import MEDIAN_SQUARED
 from imgcal.pipeline.camera_places import CameraView
 from imgcal.pipeline.label_counts import LEAST_FOUND, LabelCounts, count_labels
-from imgcal.pipeline.labelled_capture import LabelledCapture, arrange_labels
+from imgcal.pipeline.labelled_capture import LabelledCapture, arrange_frames, arrange_labels
 from imgcal.types import CalibrationObject, CameraRig, Detections, MovedCamera, MovedError
 
 LEAST_AGREEMENT = 0.9
@@ -70,9 +70,10 @@ def steady_part(
         MovedError: a camera has moved, and the options do not say how to continue.
         RefusedError: no snapshot after the last move could be identified.
     """
-    found, fits = _moves(arranged, rig, obj, options)
+    frames = arrange_frames(arranged.labelled, rig, obj) if arranged.labelled.rests_with else arranged
+    found, fits = _moves(frames, rig, obj, options)
     if not found:
-        return SteadyPart(arranged, fits=fits)
+        return SteadyPart(arranged, fits=fits if frames is arranged else ())
     labelled, moved = arranged.labelled, list(found)
     total, first, names = len(detections.snapshot_names), 0, detections.snapshot_names
     for _ in range(MOST_MOVES):
@@ -116,7 +117,7 @@ def _are_explained(
     parts = (detections.of_snapshots(0, first), detections.of_snapshots(first, len(detections.snapshot_names)))
     for part, own in zip(parts, options, strict=True) if lost else ():
         try:
-            counts = count_fitting_labels(arrange_labels(associate(part, rig, obj, own), rig, obj), rig, obj, own)
+            counts = count_fitting_labels(arrange_frames(associate(part, rig, obj, own), rig, obj), rig, obj, own)
         except RefusedError:
             return False
         if (counts.unexplained > counts.kept)[:, lost].sum() > MOST_MIXED * (counts.usable > 0)[:, lost].sum():
@@ -150,7 +151,7 @@ def list_moves(
     labelled: Associations, rig: CameraRig, obj: CalibrationObject, options: PipelineOptions
 ) -> tuple[MovedCamera, ...]:
     """List the cameras that moved between two snapshots, in chronological order."""
-    return _moves(arrange_labels(labelled, rig, obj), rig, obj, options)[0]
+    return _moves(arrange_frames(labelled, rig, obj), rig, obj, options)[0]
 
 
 def _moves(
@@ -168,7 +169,7 @@ def _moves(
     fits, lost = fit.fits, _find_unlabelled(fit.tally)
     if (lost.sum(0) >= LEAST_SNAPSHOTS).any():
         again = _label_again(labelled, lost, rig, obj, options)
-        fit = _fit(arrange_labels(again, rig, obj), rig, obj, options)
+        fit = _fit(arrange_frames(again, rig, obj), rig, obj, options)
     names = tuple(labelled.snapshots[s].name for s in labelled.used)
     found = find_moves(fit.problem, fit.state, rig.camera_names, names, options.estimation)
     gone = _find_gone(fit, labelled, rig, obj, {move.camera for move in found})

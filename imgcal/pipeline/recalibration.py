@@ -37,6 +37,8 @@ from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior, che
 
 LEAST_USED, MOST_USED = 0.5, 0.75
 """Share of the snapshots below which images or rig may follow other conventions, and of those tried for one to fit."""
+MOST_ODD = 0.03
+"""Maximum share of the labels that may be outliers for constant delays to be believed."""
 FOUND = RigPrior(focal_length=5e-4, principal_point=0.5, distortion=0.01, rotation=5e-4, position=0.5)
 """Prior of a rig that was just found, for completing the labels of sticks: about a pixel."""
 
@@ -278,15 +280,16 @@ def fit_with_timing(
     if (constant := find_delays(labelled, rig, obj)) is not None:
         delays, together = constant
         with contextlib.suppress(RefusedError):
-            found = fit_other(together)
-            if fit is None or _misfit(found) < _misfit(fit):
-                return replace(found, delays=delays)
+            found = replace(fit_other(together), delays=delays)
+            few = found.outliers <= MOST_ODD * int((labelled.detections.fiducial >= 0).sum())
+            if few and (fit is None or _misfit(found) < _misfit(fit)):
+                fit, labelled = found, replace(labelled, detections=together)
     if fit is not None and fit.additive_noise < NOTICEABLE:
         return fit
     if (changing := find_unsynchronized(labelled, rig, obj)) is not None:
         unsynchronized, noisy = changing
         with contextlib.suppress(RefusedError):
-            return replace(fit_other(noisy), unsynchronized=unsynchronized)
+            return replace(fit_other(noisy), delays=None if fit is None else fit.delays, unsynchronized=unsynchronized)
     if fit is None:
         assert refusal is not None
         raise refusal

@@ -48,8 +48,10 @@ class Rests:
     @classmethod
     def of(cls, labelled: Associations) -> Rests:
         """List them."""
-        names = [snapshot.name for snapshot in labelled.snapshots]
-        return cls(tuple({names[row]: names[at] for row, at in labelled.rests_with.items()}.items()))
+        names, moments = [snapshot.name for snapshot in labelled.snapshots], labelled.moments
+        moving = set(moments[labelled.used].tolist())  # of several objects, some may rest
+        rests = {names[row]: names[at] for row, at in labelled.rests_with.items() if int(moments[row]) not in moving}
+        return cls(tuple(rests.items()))
 
     @property
     def values(self) -> dict[str, Any]:
@@ -79,13 +81,9 @@ def average_rests(labelled: Associations, observations: Observations) -> tuple[A
         The snapshots, in which one of each rest is used and the others refer to it; the observations of the R used
         ones; their indices (R,) among the S.
     """
-    count = len(labelled.used)
-    uv, sigma, seen = observations.uv.numpy(), observations.sigma.numpy(), observations.seen.numpy()
-    together = int(np.bincount(labelled.moments[labelled.used]).max()) if count else 1
-    first = find_rests(uv, sigma, seen, labelled.part_of_rows, together)
-    if (first == np.arange(count)).all():
-        return labelled, observations, np.arange(count)
-    groups = [np.flatnonzero(first == row) for row in np.unique(first)]
+    groups, uv, sigma, seen = _group(labelled, observations)
+    if len(groups) == len(uv):
+        return labelled, observations, np.arange(len(uv))
     share = _share_of_flicker(uv, sigma, seen, groups)
     shown = seen.sum((1, 2))
     kept = np.array([group[shown[group].argmax()] for group in groups])
@@ -99,6 +97,28 @@ def average_rests(labelled: Associations, observations: Observations) -> tuple[A
     rests = {used[other]: used[row] for row, group in zip(kept, groups, strict=True) for other in group if other != row}
     averaged = Observations(torch.from_numpy(uv[kept]), torch.from_numpy(sigma[kept]), observations.seen[kept])
     return replace(labelled, rests_with=dict(sorted(rests.items()))), averaged, kept
+
+
+def weaken_rests(labelled: Associations, observations: Observations) -> Observations:
+    """Increase sigma of the snapshots of each rest, so that all together count as much as their average.
+
+    For tests of the snapshots one by one: arguments as for `average_rests`.
+    """
+    groups, uv, sigma, seen = _group(labelled, observations)
+    if len(groups) == len(uv):
+        return observations
+    share, factor = _share_of_flicker(uv, sigma, seen, groups), np.ones(len(uv))
+    for group in groups:
+        factor[group] = len(group) * (1 - share) + share
+    return replace(observations, sigma=observations.sigma * torch.from_numpy(factor).sqrt()[:, None, None])
+
+
+def _group(labelled: Associations, observations: Observations) -> tuple[list[Rows], Floats, Floats, NDArray[np.bool_]]:
+    """Numbers of the snapshots of each rest, single ones included, and the observations as arrays."""
+    uv, sigma, seen = observations.uv.numpy(), observations.sigma.numpy(), observations.seen.numpy()
+    together = int(np.bincount(labelled.moments[labelled.used]).max()) if len(uv) else 1
+    first = find_rests(uv, sigma, seen, labelled.part_of_rows, together)
+    return [np.flatnonzero(first == row) for row in np.unique(first)], uv, sigma, seen
 
 
 def find_rests(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows, together: int = 1) -> Rows:
@@ -116,7 +136,10 @@ def find_rests(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows, t
     """
     count = len(uv)
     first, asked = np.arange(count), np.zeros(count, dtype=np.bool_)
-    for lag in range(1, min(together + 2, count)):  # a frame of another kind may come between
+    near, far = together + 2, REMEMBERED * together + 1
+    for lag in range(1, min(far, count)):  # somebody may pass between
+        if lag == near and not asked.any():
+            return first
         asked[lag:] |= _are_alike(slice(lag, None), slice(None, -lag), uv, sigma, seen)
     if not asked.any():
         return first

@@ -80,6 +80,26 @@ def test_large_delays_are_left_to_other_checks() -> None:
     assert found(capture((0.0, 0.0, 0.4, 0.0))) is None
 
 
+def test_lost_snapshots_are_noticed() -> None:
+    blobs = capture((0.0, 0.1, 0.0, 0.0))
+    left = np.array([s for s in range(COUNT) if s not in (13, 25, 37, 49)])
+    delays = found(blobs.choose_snapshots(left))
+    assert delays is not None and delays.snapshots == pytest.approx((0.0, 0.1, 0.0, 0.0), abs=0.006)
+
+
+def test_a_camera_that_sees_little_does_not_hide_the_others_delays() -> None:
+    blobs = capture((0.0, 0.1, 0.0, 0.0))
+    delays = found(blobs.select((blobs.camera != 3) | (blobs.snapshot < 12)))
+    assert delays is not None and delays.snapshots[3] is None and "cam04 unknown" in str(delays)
+    assert delays.snapshots[1] == pytest.approx(0.1, abs=0.006)
+
+
+def test_a_clock_that_runs_away_is_no_constant_delay() -> None:
+    late = np.zeros((COUNT, RIG.num_cameras))
+    late[:, 1] = np.linspace(0.05, 0.15, COUNT)
+    assert found(capture(late)) is None
+
+
 def test_few_snapshots_and_single_cameras_say_nothing() -> None:
     blobs = capture((0.0, 0.05, 0.0, -0.03))
     assert found(blobs.of_snapshots(0, 8)) is None
@@ -95,12 +115,12 @@ def test_motion_is_interpolated_from_the_neighbours_in_time() -> None:
         return torch.from_numpy(curve)[:, None, None]
 
     before = np.array([-1, 0, 1, 2, 3, -1, 5, 6, 7])  # a gap before row 5
-    motion = Motion.of(at(time), before)
+    motion = Motion.of(at(time), torch.ones(9, 1, 1, dtype=torch.bool), before)
     assert motion.neighbours.tolist() == [0, 1, 2, 1, 0, 0, 1, 1, 0]
     delay = torch.tensor([0.1], dtype=torch.float64)
     missed = (at(time + 0.1) - at(time) - motion.during(delay)).abs().amax((1, 2, 3))
     assert float(missed[2]) < 1e-4 and float(missed[[1, 3, 6, 7]].max()) < 1e-3
     assert float(missed[[0, 4, 5, 8]].max()) < 0.06
-    variance = motion.variance(delay)[:, 0, 0]
-    assert float(variance[2]) == 0 and float(variance[1]) < 0.1 * float(variance[0])
+    variance = motion.variance(delay, torch.zeros(1, dtype=torch.float64))[:, 0, 0]
+    assert float(variance[2]) < 0.1 * float(variance[1]) < 0.01 * float(variance[0])
     assert float(missed[[0, 4, 5, 8]].max()) < 3 * float(variance[0]) ** 0.5
