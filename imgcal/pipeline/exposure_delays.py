@@ -46,6 +46,8 @@ MOST_LEFT = 0.9
 MOST_APART, LEAST_APART = 0.1, 0.002
 """Maximum difference between the delays in the two halves of a capture, relative to the largest delay; and snapshots
 that are always allowed."""
+FASTEST = 0.3
+"""Largest squared angular frequency of a motion (rad^2 per snapshot^2) to interpolate: eleven snapshots in a period."""
 JUMP = 1.6
 """Ratio of the usual motion from one snapshot to the next to the larger one beside it, above which some are missing in
 between."""
@@ -115,6 +117,18 @@ class Motion:
         time = delay[:, None, None]
         return self.velocity * time + self.acceleration * (time**2 / 2)
 
+    def _powers(self) -> tuple[Tensor, Tensor]:
+        """Mean squared velocity and acceleration of each camera's image: (C,)."""
+        known = self.neighbours > 0
+        speed, bend = (values[known].square().mean((0, 2, 3)) for values in (self.velocity, self.acceleration))
+        return speed, bend
+
+    @property
+    def rate(self) -> Tensor:
+        """Squared angular frequency of the motion, if it is periodic: (C,) rad^2 per snapshot^2."""
+        speed, bend = self._powers()
+        return bend / speed.clamp_min(1e-12)
+
     def variance(self, delay: Tensor, unknown: Tensor) -> Tensor:
         """Variance (S, C, N) px^2 of each axis of `during`: what the differences leave out, if motion is periodic.
 
@@ -122,9 +136,8 @@ class Motion:
             delay: (C,).
             unknown: (C,) standard deviation of the delay.
         """
-        known = self.neighbours > 0
-        speed, bend = (values[known].square().mean((0, 2, 3)) for values in (self.velocity, self.acceleration))
-        rate = bend / speed.clamp_min(1e-12)  # of the motion, squared: rad^2 per snapshot^2
+        speed, bend = self._powers()
+        rate = self.rate
         nothing = speed * delay.square()
         line = bend * (delay / 2).square()
         three = speed * rate.square() * (delay / 6).square()
@@ -213,7 +226,8 @@ def _estimate_delays(
         known = (residuals.views >= LEAST_VIEWS) & (residuals.power > 0)
         if int(known.sum()) < 2:
             return None
-        if len(usual) == 1 and bool((residuals.explained[known] < LEAST_EXPLAINED).all()):
+        in_vain = bool((residuals.explained[known] < LEAST_EXPLAINED).all())
+        if len(usual) == 1 and (in_vain or float(motion.rate[known].median()) > FASTEST):
             return None
         step = residuals.delay
         step = torch.where(known, step - step[known].median(), 0.0)  # a delay of all cameras is no difference
