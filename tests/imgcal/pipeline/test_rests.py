@@ -12,7 +12,7 @@ import imgcal
 from imgcal.estimation import camera_covariance
 from imgcal.pipeline.rests import Rests, find_rests
 from imgcal.synthesis import PhysicalDrift, Truth, simulate_truth, true_detections
-from imgcal.types import Detections
+from imgcal.types import Detections, MovedError
 
 SIGMA = 0.1
 FRAMES = 12
@@ -74,6 +74,29 @@ def test_a_rest_is_one_snapshot_and_says_so() -> None:
     assert list(poses) == list(blobs.snapshot_names)
     assert torch.equal(poses["00000"].translation, poses["00011"].translation)
     assert not torch.equal(poses["00000"].translation, poses["00012"].translation)
+
+
+@pytest.mark.parametrize("frame", [FRAMES + FRAMES // 2, 2 * FRAMES])
+def test_a_camera_that_moves_between_or_within_rests_is_named(frame) -> None:
+    """Three rests are too few snapshots for a test of their averages; their frames are not."""
+    truth, blobs = capture(3, 0.0, 0.1)
+    turn = torch.zeros(RIG.num_cameras, 15, dtype=torch.float64)
+    turn[2, 1] = 0.003
+    points = truth.rig_from_object.apply(OBJECT.points.to(torch.float64))
+    before, after = (rig.expand(3).project(points).uv.numpy() for rig in (truth.rig, truth.rig.retract(turn)))
+    late = blobs.snapshot >= frame
+    where = blobs.snapshot[late] // FRAMES, blobs.camera[late], blobs.fiducial[late]
+    uv = blobs.uv.copy()
+    uv[late] += (after - before)[where]
+    with pytest.raises(MovedError, match=f"camera cam03 moved before snapshot {frame:05d}"):
+        imgcal.calibrate(replace(blobs, uv=uv), RIG, OBJECT)
+
+
+def test_all_frames_of_a_rest_are_counted() -> None:
+    _, blobs = capture(3, 0.1, 0.01)
+    result = imgcal.calibrate(blobs, RIG, OBJECT)
+    assert np.array_equal(result.tally.kept, result.tally.labelled)
+    assert int(result.tally.kept.sum()) == int((blobs.fiducial >= 0).sum())
 
 
 def test_blobs_without_labels_rest_as_well() -> None:
