@@ -30,8 +30,9 @@ LEAST_MOTION = 0.1
 """Pixels by which blobs may differ, beyond their noise, in snapshots of one rest."""
 RELATIVE_DEVIATION = 1.44
 """Standard deviation of the median of n squared lengths, relative to their median, times the root of n."""
-SIGMAS = 4.0
-"""Standard deviations by which this median may exceed its expectation in snapshots of one rest."""
+SIGMAS, JOINING_SIGMAS = 4.0, 8.0
+"""Standard deviations by which this median may exceed its expectation for two snapshots to show a rest; and the same for
+more to join, because among hundreds of frames some differ by more."""
 REMEMBERED = 8
 """Number of latest rests that a snapshot may belong to: those before it, if a frame of another kind came between."""
 
@@ -136,18 +137,16 @@ def find_rests(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows, t
     """
     count = len(uv)
     first, asked = np.arange(count), np.zeros(count, dtype=np.bool_)
-    near, far = together + 2, REMEMBERED * together + 1
-    for lag in range(1, min(far, count)):  # somebody may pass between
-        if lag == near and not asked.any():
-            return first
-        asked[lag:] |= _are_alike(slice(lag, None), slice(None, -lag), uv, sigma, seen)
-    if not asked.any():
+    near, far = min(together + 2, count), min(REMEMBERED * together + 1, count)
+    if not any(_are_alike(*_apart(lag), uv, sigma, seen, SIGMAS).any() for lag in range(1, near)):
         return first
+    for lag in range(1, far):  # somebody may pass between
+        asked[lag:] |= _are_alike(*_apart(lag), uv, sigma, seen, JOINING_SIGMAS)
     rests: deque[int] = deque(maxlen=REMEMBERED * together)
     for row in range(count):
         if asked[row]:
             earlier = np.array([rest for rest in rests if part[rest] == part[row]], dtype=np.int64)
-            alike = earlier[_are_alike(np.array([row]), earlier, uv, sigma, seen)]
+            alike = earlier[_are_alike(np.array([row]), earlier, uv, sigma, seen, JOINING_SIGMAS)]
             if len(alike):
                 first[row] = alike[-1]
                 continue
@@ -155,13 +154,18 @@ def find_rests(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows, t
     return first
 
 
+def _apart(lag: int) -> tuple[slice, slice]:
+    """All snapshots with one that many before, and those."""
+    return slice(lag, None), slice(None, -lag)
+
+
 def _are_alike(
-    some: slice | Rows, others: slice | Rows, uv: Floats, sigma: Floats, seen: NDArray[np.bool_]
+    some: slice | Rows, others: slice | Rows, uv: Floats, sigma: Floats, seen: NDArray[np.bool_], sigmas: float
 ) -> NDArray[np.bool_]:
     """Tell which pairs of snapshots show the same within the noise: half of the labels of every camera, at least."""
     both = seen[some] & seen[others]
     count = both.sum(-1)
-    allowed = MEDIAN_SQUARED * (1 + SIGMAS * RELATIVE_DEVIATION / np.sqrt(np.maximum(count, 1)))
+    allowed = MEDIAN_SQUARED * (1 + sigmas * RELATIVE_DEVIATION / np.sqrt(np.maximum(count, 1)))
     apart = np.square(uv[some] - uv[others]).sum(-1)
     near = both & (apart <= allowed[..., None] * (sigma[some] ** 2 + sigma[others] ** 2) + LEAST_MOTION**2)
     most = np.maximum(seen[some].sum((1, 2)), seen[others].sum((1, 2)))
