@@ -31,8 +31,8 @@ LEAST_MOTION = 0.1
 RELATIVE_DEVIATION = 1.44
 """Standard deviation of the median of n squared lengths, relative to their median, times the root of n."""
 SIGMAS, JOINING_SIGMAS = 4.0, 8.0
-"""Standard deviations by which this median may exceed its expectation for two snapshots to show a rest; and the same for
-more to join, because among hundreds of frames some differ by more."""
+"""Standard deviations by which this median may exceed its expectation in two snapshots of a rest; and the same where
+more join: among hundreds of frames, some differ by more."""
 REMEMBERED = 8
 """Number of latest rests that a snapshot may belong to: those before it, if a frame of another kind came between."""
 
@@ -138,8 +138,11 @@ def find_rests(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows, t
     count = len(uv)
     first, asked = np.arange(count), np.zeros(count, dtype=np.bool_)
     near, far = min(together + 2, count), min(REMEMBERED * together + 1, count)
-    if not any(_are_alike(*_apart(lag), uv, sigma, seen, SIGMAS).any() for lag in range(1, near)):
-        return first
+    most = int(seen.sum((0, 2)).argmax())
+    for cameras in (slice(most, most + 1), slice(None)):  # one camera first: most captures have no rest
+        shown = uv[:, cameras], sigma[:, cameras], seen[:, cameras]
+        if not any(_are_alike(*_apart(lag), *shown, SIGMAS).any() for lag in range(1, near)):
+            return first
     for lag in range(1, far):  # somebody may pass between
         asked[lag:] |= _are_alike(*_apart(lag), uv, sigma, seen, JOINING_SIGMAS)
     rests: deque[int] = deque(maxlen=REMEMBERED * together)
