@@ -140,8 +140,9 @@ def find_rests(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows, t
     near, far = min(together + 2, count), min(REMEMBERED * together + 1, count)
     most = int(seen.sum((0, 2)).argmax())
     for cameras in (slice(most, most + 1), slice(None)):  # one camera first: most captures have no rest
-        shown = uv[:, cameras], sigma[:, cameras], seen[:, cameras]
-        if not any(_are_alike(*_apart(lag), *shown, SIGMAS).any() for lag in range(1, near)):
+        own = uv[:, cameras], sigma[:, cameras], seen[:, cameras]
+        pairs = (_are_alike(*_apart(lag), own[0], own[1], own[2], SIGMAS) for lag in range(1, near))
+        if not any(alike.any() for alike in pairs):
             return first
     for lag in range(1, far):  # somebody may pass between
         asked[lag:] |= _are_alike(*_apart(lag), uv, sigma, seen, JOINING_SIGMAS)
