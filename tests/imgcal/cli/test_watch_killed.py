@@ -37,16 +37,16 @@ def passed():
 
 def before(owner, name, counts):
     whole = getattr(owner, name)
-    def dying(*given):
+    def dying(*given, **named):
         if counts(*given):
             passed()
-        return whole(*given)
+        return whole(*given, **named)
     setattr(owner, name, dying)
 
 def after(owner, name, counts):
     whole = getattr(owner, name)
-    def dying(*given):
-        result = whole(*given)
+    def dying(*given, **named):
+        result = whole(*given, **named)
         if counts(*given):
             passed()
         return result
@@ -58,7 +58,7 @@ def die_at(moment):
         loop.SAVED_EVERY = 0.3
         after(loop.Watch, "process", lambda self, snapshot: True)
     elif moment == "told":
-        after(event_log.EventLog, "append", lambda self, event: event.kind == "moved")
+        after(event_log.EventLog, "_append", lambda self, line: b'"moved"' in line)
     elif moment == "saving":  # the new state is written beside the old one, and has not taken its place
         # Each save is written before the next snapshot: the thread leaves out those that it has no time for.
         rig_files.RigFiles.write = lambda self, state, *, keep=False, also=None, then=None: self._write(
