@@ -317,8 +317,7 @@ class _Residuals:
 def _move_back(labelled: Associations, moved: NDArray[np.float64], variance: NDArray[np.float64]) -> Detections:
     """Move the labelled blobs of used snapshots by what happened during the delays."""
     detections = labelled.detections
-    row = np.full(len(labelled.snapshots), -1)
-    row[labelled.used] = np.arange(len(labelled.used))
+    row = labelled.used_rows
     mine = np.flatnonzero((row[detections.snapshot] >= 0) & (detections.fiducial >= 0))
     where = row[detections.snapshot[mine]], detections.camera[mine], detections.fiducial[mine]
     uv, sigma = detections.uv.copy(), detections.sigma.copy()

@@ -135,8 +135,6 @@ def _speed(uv: Tensor, seen: Tensor, before: NDArray[np.int64]) -> Tensor:
 def _add_variance(labelled: Associations, added: NDArray[np.float64]) -> Detections:
     """The detections with added variance (px^2 per axis) by image (S, C) of the used snapshots."""
     detections = labelled.detections
-    row = np.full(len(labelled.snapshots), -1)
-    row[labelled.used] = np.arange(len(labelled.used))
-    mine = row[detections.snapshot]
+    mine = labelled.used_rows[detections.snapshot]
     more = np.where(mine >= 0, added[mine, detections.camera], 0.0)
     return replace(detections, sigma=np.sqrt(np.square(detections.sigma) + more))
