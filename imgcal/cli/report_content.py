@@ -98,7 +98,7 @@ def describe(
         scale=str(calibration.scale),
         moves=tuple(map(str, calibration.moved)),
         late=tuple(map(str, calibration.late)),
-        timing=str(calibration.delays or calibration.unsynchronized or ""),
+        timing=tuple(str(one) for one in (calibration.delays, calibration.unsynchronized) if one is not None),
         rests=str(calibration.rests),
         doubtful=tuple(map(str, calibration.doubtful)),
         unknown=found.knowledge.sentences,

@@ -65,7 +65,7 @@ class ReportContent:
     scale: str = ""  # what the prediction leaves out, since no image shows it, in words
     moves: tuple[str, ...] = ()  # cameras that moved during the capture, in words; earlier snapshots are rejected
     late: tuple[str, ...] = ()  # cameras whose frames are of other moments, in words; these took no part
-    timing: str = ""  # cameras that do not expose together, in words
+    timing: tuple[str, ...] = ()  # how cameras do not expose together, in words
     rests: str = ""  # snapshots that were averaged because they show the object at rest, in words
     doubtful: tuple[str, ...] = ()  # cameras that stop fitting at the end of the capture, in words
     unknown: tuple[str, ...] = ()  # what the data do not say, in words

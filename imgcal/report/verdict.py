@@ -48,9 +48,13 @@ def unexplained_sentences(content: ReportContent) -> list[tuple[str, str]]:
         )
         for move in content.moves
     ]
-    if content.timing:
-        remedy = "Trigger the cameras together, or hold the object still for each snapshot."
-        notes.append((f"{content.timing[:1].upper()}{content.timing[1:]}.", remedy))
+    notes += [
+        (
+            f"{words[:1].upper()}{words[1:]}.",
+            "Trigger the cameras together, or hold the object still for each snapshot.",
+        )
+        for words in content.timing
+    ]
     notes += [
         (f"{words[:1].upper()}{words[1:]}; these took no part.", "Export all frames of that camera again.")
         for words in content.late
