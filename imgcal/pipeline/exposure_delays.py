@@ -63,13 +63,13 @@ class Delays:
     def __str__(self) -> str:
         """Describe them in words."""
         words = [
-            f"{name} {'unknown' if delay is None else f'{delay:+.3f}'}"
+            f"{name} {'unknown' if delay is None else f'{round(delay, 3) + 0.0:+.3f}'}"
             for name, delay in zip(self.cameras, self.snapshots, strict=True)
         ]
         return (
-            "the cameras expose at different times, by the same difference in every snapshot, in intervals between "
-            f"snapshots after the median camera: {', '.join(words)}; blobs were moved back along the object's motion: "
-            "trigger the cameras together for the full accuracy"
+            "the cameras expose at different times, each with the same delay in every snapshot (after the median "
+            f"camera, as a share of the interval between snapshots): {', '.join(words)}; blobs were moved back along "
+            "the object's motion; for the full accuracy, trigger the cameras together"
         )
 
     @property

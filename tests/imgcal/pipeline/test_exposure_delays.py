@@ -65,7 +65,7 @@ def test_delays_are_told() -> None:
     delays = found(capture((0.0, 0.05, 0.0, -0.03)))
     assert delays is not None
     assert delays.values["snapshots"].keys() == set(RIG.camera_names) and delays.values["note"] == str(delays)
-    assert "cam02 +0.0" in str(delays) and "cam04 -0.0" in str(delays)
+    assert "-0.000" not in str(delays) and "cam02 +0.0" in str(delays) and "cam04 -0.0" in str(delays)
 
 
 @pytest.mark.parametrize("seed", [2, 3, 4])
