@@ -1,7 +1,7 @@
 from .atomic import PREVIOUS, keep_previous, publishing, replacing, write_bytes, write_text
 from .cameras_yaml import drop_poses, load_cameras, save_cameras
 from .capture import Capture, check_times, open_capture, open_input, save_capture_settings
-from .detections_csv import DEFAULT_SIGMA, MARGIN, Fiducials, load_detections, save_detections
+from .detections_csv import DEFAULT_SIGMA, MARGIN, Fiducials, load_detections, require_pixels, save_detections
 from .folder_lock import holding
 from .frames import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Frame, Video, grey_frame, read_frame, write_frame, write_image
 from .json_text import read_json, read_metrics
@@ -95,6 +95,7 @@ __all__ = [
     "read_yaml",
     "read_yaml_mapping",
     "replacing",
+    "require_pixels",
     "rig_from_text",
     "rig_text",
     "sample_path",

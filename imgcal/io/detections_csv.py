@@ -39,6 +39,7 @@ DEFAULT_SIGMA = 0.1
 LEFT_OUT = -1
 """Number of a camera whose rows are left out."""
 
+NORMALIZED = (-1.0, 2.0)  # where coordinates lie that are divided by the image's size
 MARGIN = 5.0  # pixels outside the image that are still taken: centres of cut discs, rounding
 
 
@@ -113,6 +114,8 @@ def load_detections(
         snapshot_names=tuple(snapshots),
     )
     _check_unique(path, found)
+    if rig is not None:
+        require_pixels(found, path)
     return found
 
 
@@ -167,6 +170,24 @@ def save_detections(detections: Detections, path: str | Path, obj: CalibrationOb
         text.detach()
         if binary is not file:
             binary.close()
+
+
+def require_pixels(detections: Detections, where: Path | str = "detections") -> None:
+    """Refuse a whole capture whose centres all lie within a pixel or two of the images' corner.
+
+    Args:
+        detections: blobs of all snapshots.
+        where: the file.
+
+    Raises:
+        InputError: they are normalized by the images' sizes. Only this tells it: some rig fits even these.
+    """
+    uv = detections.uv
+    if len(uv) > 1 and uv.min() >= NORMALIZED[0] and uv.max() <= NORMALIZED[1]:
+        raise InputError(
+            f"{where}: found u and v between {uv.min():.3g} and {uv.max():.3g} in all rows (normalized by the images' "
+            "width and height?), expected pixels"
+        )
 
 
 def _label_columns(rows: Sequence[int], fiducials: Fiducials | None) -> dict[str, Iterable[str]]:

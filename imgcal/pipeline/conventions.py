@@ -154,9 +154,6 @@ def other_readings(detections: Detections, rig: CameraRig) -> Iterator[Reading]:
         if name != UPRIGHT:
             words = f"all images seem to be {WAYS[undo(way)]}{AS_IN_TABLES.get(way, '')}"
             yield Reading(words, replace(detections, uv=turn(detections.uv, size - 1, way)), rig)
-    if len(detections.uv) and detections.uv.min() >= -1 and detections.uv.max() <= 2:
-        words = "u and v seem to be normalized by the image's width and height, expected pixels"
-        yield Reading(words, replace(detections, uv=detections.uv * size - 0.5), rig)
     cam_from_rig = rig.cam_from_rig
     words = "the rig's poses seem to take a camera to the rig, expected the rig to the camera (cam_from_rig)"
     yield Reading(words, detections, replace(rig, cam_from_rig=cam_from_rig.inverse()))

@@ -14,7 +14,7 @@ import numpy as np
 from imgcal.association import Proposer, Sight, match_to_rig
 from imgcal.detection import DetectionOptions, Frame, detect
 from imgcal.errors import InputError
-from imgcal.io import MARGIN, grey_frame, model_file, nearest
+from imgcal.io import MARGIN, grey_frame, model_file, nearest, require_pixels
 from imgcal.matching import MatchedFilter
 from imgcal.messages import list_names
 from imgcal.pipeline.learned_measurer import LearnedMeasurer
@@ -66,7 +66,9 @@ def find_blobs(
     if isinstance(source, Detections):
         if measurer is not None:
             raise InputError(f"measurer {measurer.name}: found blobs without frames, expected frames to look at")
-        return check_detections(source, rig, obj)
+        detections = check_detections(source, rig, obj)
+        require_pixels(detections)
+        return detections
     frames = check_frames(source, rig)
     if not frames:
         raise InputError(f"frames: found no camera, expected frames of the cameras of rig {rig.name}")

@@ -124,6 +124,8 @@ HEAD = "snapshot,camera,u,v,sigma,fiducial\n0,cam01,1,2,0.1,0\n"
          "line 5: found fiducial 0 again for camera cam01 in snapshot 0"),
         (HEAD + "0,cam01,2060,2,0.1,1\n", r"line 3: found \(2060, 2\), expected a pixel of the 2048x1088 image"),
         (HEAD + "0,cam01,2,-7,0.1,1\n", r"line 3: found \(2, -7\)"),
+        ("snapshot,camera,u,v\n0,cam01,0.5,0.25\n0,cam02,0.75,1\n",
+         r"found u and v between 0.25 and 1 in all rows \(normalized by .*\), expected pixels"),
     ],
 )  # fmt: skip
 def test_bad_files_give_one_clear_line(content: str | bytes, message: str, tmp_path: Path) -> None:

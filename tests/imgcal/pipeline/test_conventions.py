@@ -61,10 +61,6 @@ MISTAKES = {
         "all images seem to be mirrored left to right .as if u were counted from the right.; read like that",
     ),
     "upside down": (with_images(lambda uv, size: size - 1 - uv), "all images seem to be turned by 180 degrees"),
-    "normalized": (
-        with_images(lambda uv, size: (uv + 0.5) / size),
-        "u and v seem to be normalized by the image's width and hei",
-    ),
     "inverse poses": (
         with_poses(RigidTransform.inverse),
         ".*the rig's poses seem to take a camera to the rig, expected",

@@ -10,7 +10,7 @@ from imgcal.association import Proposal
 from imgcal.errors import InputError, RefusedError
 from imgcal.io import load_object, read_rig
 from imgcal.online import RigKeeper
-from imgcal.pipeline import calibrate, check_detections, score
+from imgcal.pipeline import calibrate, calibrate_from_scratch, check_detections, score
 from imgcal.synthesis import FrameModel, PhysicalDrift, simulate_frames, simulate_truth, true_detections
 from imgcal.types import CalibrationObject
 
@@ -120,6 +120,15 @@ def test_numbers_that_are_not_whole(seen, job, column):
     wrong = replace(blobs, **{column: getattr(blobs, column).astype(float)})
     with pytest.raises(InputError, match=f"detections: {column}: found an array of float64, expected integers"):
         job(wrong, rig, obj)
+
+
+@pytest.mark.parametrize("job", [calibrate, score, calibrate_from_scratch])
+def test_centres_divided_by_the_size_of_the_image(seen, job):
+    """They are told before a fit: at some noise, a rig was accepted that fitted even these."""
+    rig, obj, _, blobs = seen
+    size = rig.image_size.double().numpy()[blobs.camera]
+    with pytest.raises(InputError, match=r"^detections: found u and v between 0.* expected pixels$"):
+        job(replace(blobs, uv=(blobs.uv + 0.5) / size), rig, obj)
 
 
 @EVERYWHERE
