@@ -9,7 +9,7 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 
-from imgcal.errors import RefusedError
+from imgcal.errors import InputError, RefusedError
 from imgcal.online import RigState
 from imgcal.pipeline import calibrate, choose_telling_snapshots
 from imgcal.types import CalibrationObject, CameraRig, Detections
@@ -78,6 +78,8 @@ class FirstRefusals:
         chosen = choose_telling_snapshots(seen, self._rig.num_cameras)
         try:
             calibrate(seen.choose_snapshots(chosen), self._rig, self._obj)
+        except InputError as error:  # such as normalized coordinates, which no snapshot alone shows
+            self._cause = str(error)
         except RefusedError as error:
             if isinstance(error.__cause__, RefusedError):
                 self._cause = error.reason

@@ -254,6 +254,14 @@ def test_the_cause_of_the_first_refusals_is_told_once_and_only_before_anything_i
     assert not any(learned.add(state, learned=True) for state in states) and learned.find_cause() is None
 
 
+def test_normalized_centres_are_told_as_such(blobs, stream):
+    refusals, size = FirstRefusals(stream.rig, stream.obj), stream.rig.image_size.double().numpy()[blobs.camera]
+    table = replace(blobs, uv=(blobs.uv + 0.5) / size)
+    for s in range(5):
+        refusals.add(SimpleNamespace(refused="no", detections=table.of_snapshots(s, s + 1)), learned=False)
+    assert "normalized by the images' width and height" in refusals.find_cause()
+
+
 def test_a_folder_that_has_been_read_to_its_end_is_said_to_be_known(stream, tmp_path, capsys):
     frames = tmp_path / "capture" / "frames"
     for camera, (width, height) in zip(stream.rig.camera_names, stream.rig.image_size.tolist(), strict=True):
