@@ -13,6 +13,7 @@ from .covariance import (
     scale_response,
     whitened_covariance,
 )
+from .delay_modes import delay_evidence
 from .fixed_rig import FixedRigFit, fit_pose
 from .gauge import align
 from .implicit import attach_gradient, map_cost
@@ -54,7 +55,7 @@ from .rig_from_points import PointStart, cold_start_from_points, move_to_pair_fr
 from .rig_initialization import K3, ColdStart, cold_start, ordinary_lens, robust_std, single_camera_poses
 from .rig_uncertainty import RigUncertainty, inverse_or_zero, pixel_jacobian, rigid_motion, uncertainty_over
 from .robust_losses import cauchy, squared
-from .shape_modes import evidence_by_snapshot
+from .shape_modes import ModeEvidence, evidence_by_snapshot
 from .snapshot_scatter import BlockScatter, block_scatter
 from .variance_components import BENT, ObjectQuestion, Start, estimate_variance_components
 
@@ -76,6 +77,7 @@ __all__ = [
     "FiducialOffset",
     "FixedRigFit",
     "Gauge",
+    "ModeEvidence",
     "NormalEquations",
     "ObjectQuestion",
     "PointStart",
@@ -99,6 +101,7 @@ __all__ = [
     "cold_start",
     "cold_start_from_points",
     "correlation_time",
+    "delay_evidence",
     "displace",
     "encode_options",
     "equations_at",

@@ -59,11 +59,12 @@ def camera_covariance(estimate: Estimate, curved: bool = True) -> Tensor:
 
 
 def _by_modes(estimate: Estimate) -> Tensor:
-    """Covariance that the uncertainty of the object's modes adds to the cameras' whitened offsets."""
-    if estimate.modes is None:
-        return estimate.problem.prior_std.new_zeros(())
-    follow = estimate.modes.follow.flatten(1)
-    return (follow.mT @ estimate.mode_covariance().to(follow) @ follow)[None]
+    """Covariance that the uncertainty of the object's modes and of delays adds to the cameras' whitened offsets."""
+    added = estimate.problem.prior_std.new_zeros(())
+    for modes in filter(None, (estimate.modes, estimate.delays)):
+        follow = modes.follow.flatten(1)
+        added = added + (follow.mT @ estimate.mode_covariance(modes).to(follow) @ follow)[None]
+    return added
 
 
 def _inflated_covariance(solution: Solution, inflation: Tensor) -> Tensor:
@@ -133,12 +134,12 @@ def joint_information(estimate: Estimate) -> Tensor:
         equations = _weakened_equations(estimate, estimate.inflation)
     reduced = _determined(factorize(equations, cameras_first=False))
     information = (reduced.kept @ reduced.kept.mT)[0]
-    if estimate.modes is not None:
+    for modes in filter(None, (estimate.modes, estimate.delays)):
         # Woodbury: the uncertainty of the modes reduces the information about the cameras that they affect.
-        follow = information.new_zeros(len(estimate.modes.offset), len(information))
-        of_cameras = estimate.modes.follow.flatten(1)
+        follow = information.new_zeros(len(modes.offset), len(information))
+        of_cameras = modes.follow.flatten(1)
         follow[:, : of_cameras.shape[1]] = of_cameras
-        precise = torch.linalg.inv(estimate.mode_covariance())
+        precise = torch.linalg.inv(estimate.mode_covariance(modes))
         across = follow @ information
         information = information - across.mT @ torch.linalg.solve(precise + across @ follow.mT, across)
     by_step = torch.linalg.inv(_unwhitening(_floor_prior_std(estimate, LEAST_STD))[0])  # whitened offsets by parameters

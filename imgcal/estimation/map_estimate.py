@@ -103,19 +103,20 @@ class Estimate:
     the noise: `block_scatter`; None = they do not."""
     modes: ModeEvidence | None = field(default=None, kw_only=True)
     """Uncertainty of the object's modes, and how the cameras depend on them; None = no modes."""
+    delays: ModeEvidence | None = field(default=None, kw_only=True)
+    """The same of the cameras' exposure delays; None = the cameras are taken to expose together."""
 
     @property
     def mean_inflation(self) -> float:
         """Root mean square of `inflation`, for the object, which all cameras see; 1 = no inflation."""
         return 1.0 if self.inflation is None else float(self.inflation.square().mean().sqrt())
 
-    def mode_covariance(self) -> Tensor:
-        """Covariance of the object's modes (M, M), in standard deviations of their prior, with the inflation.
+    def mode_covariance(self, modes: ModeEvidence) -> Tensor:
+        """Covariance of the modes (M, M), in standard deviations of their prior, with the inflation.
 
         The prior contributes the square of the covariance, which stays: images that scatter say nothing about it.
         """
-        assert self.modes is not None
-        plain = torch.from_numpy(self.modes.covariance)
+        plain = torch.from_numpy(modes.covariance)
         by_prior = plain @ plain
         return by_prior + self.mean_inflation**2 * (plain - by_prior)
 

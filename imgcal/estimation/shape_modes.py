@@ -60,8 +60,9 @@ def direction_evidence(
     own, pull = problem.uv.new_zeros(count, count), problem.uv.new_zeros(count)
     each, camera, poses = problem.uv.new_zeros(len(problem.points), 3), [], []
     border = problem.uv.new_zeros(count, 3 * len(problem.points) + 1)
-    for some, at, weight, along in _along(problem, state, loss, directions):
+    for _, some, at, weight in by_parts(problem, state, loss):
         assert at.by_fiducial is not None
+        along = _along(at, directions)
         heavy = along * weight
         own = own + torch.einsum("kscrn,lscrn->kl", heavy, along)
         pull = pull - (heavy * at.residual[0]).sum((1, 2, 3, 4))
@@ -72,17 +73,9 @@ def direction_evidence(
         if prior_std is not None:
             sums = torch.einsum("scirn,kscrn->kin", append_scale(some, at.by_fiducial)[0], heavy)
             border = border + object_columns(sums) * prior_std
-    camera_part, pose_part = torch.stack(camera).sum(0), torch.cat(poses, dim=1)
-    taken = [
-        _solve(factorization, Step(camera_part[k], pose_part[k], None if prior_std is None else border[k]))
-        for k in range(count)
-    ]
-    for k, step in enumerate(taken):
-        own[k] -= (camera_part * step.camera).flatten(1).sum(1) + (pose_part * step.pose).flatten(1).sum(1)
-        if step.object is not None:
-            own[k] -= border @ step.object
-    follow = -torch.stack([step.camera for step in taken])
-    return DirectionEvidence(0.5 * (own + own.mT), pull, follow, float(each.max()))
+    coupling = Coupling(torch.stack(camera).sum(0), torch.cat(poses, dim=1), None if prior_std is None else border)
+    taken, follow = coupling.marginalize(factorization)
+    return DirectionEvidence(own - taken, pull, follow, float(each.max()))
 
 
 def evidence_by_snapshot(
@@ -94,7 +87,8 @@ def evidence_by_snapshot(
         Information (S, K, K), with the pose marginalized, and pull (S, K); see `DirectionEvidence`.
     """
     information, pull = [], []
-    for _, at, weight, along in _along(problem, state, loss, directions):
+    for _, _, at, weight in by_parts(problem, state, loss):
+        along = _along(at, directions)
         pose, residual = at.by_rig[0, :, :, -POSE_PARAMETERS - 1 : -1], at.residual[0]  # (S, C, 6, 2, N)
         heavy, heavy_pose = along * weight, pose * weight.unsqueeze(-3)
         across = torch.einsum("scirn,kscrn->ski", pose, heavy)
@@ -106,14 +100,17 @@ def evidence_by_snapshot(
     return torch.cat(information).numpy(), torch.cat(pull).numpy()
 
 
-def _along(
-    problem: Problem, state: State, loss: NamedLoss, directions: Tensor
-) -> Iterator[tuple[Problem, Jacobian, Tensor, Tensor]]:
-    """Differentiate the pixels of a few snapshots at a time.
+def _along(at: Jacobian, directions: Tensor) -> Tensor:
+    """Derivatives of the pixels of S snapshots along directions (K, N, 3) mm: (K, S, C, 2, N)."""
+    assert at.by_fiducial is not None
+    return torch.einsum("scirn,kni->kscrn", at.by_fiducial[0], directions)
+
+
+def by_parts(problem: Problem, state: State, loss: NamedLoss) -> Iterator[tuple[slice, Problem, Jacobian, Tensor]]:
+    """Differentiate the pixels of a few snapshots at a time, by the fiducials as well.
 
     Yields:
-        The problem of S snapshots, the derivatives of its pixels, their weights (S, C, 1, N) px^-2, and the derivatives
-        along directions (K, N, 3) mm: (K, S, C, 2, N).
+        Which snapshots, their problem, the derivatives of its pixels, and their weights (S, C, 1, N) px^-2.
     """
     unit, prior_std = problem.uv.new_ones(1, 3 * len(problem.points) + 1), problem.object_prior_std
     together = max(1, POINTS_AT_ONCE // problem.uv[0, 0, :, 0].numel())
@@ -122,13 +119,32 @@ def _along(
         std = unit if prior_std is None else prior_std
         some = replace(problem, uv=problem.uv[:, rows], root_weight=problem.root_weight[:, rows], object_prior_std=std)
         at = jacobian_at(some, replace(state, rotation=state.rotation[:, rows], centre=state.centre[:, rows]))
-        assert at.by_fiducial is not None
-        along = torch.einsum("scirn,kni->kscrn", at.by_fiducial[0], directions)
-        yield some, at, robust_weight(some, at, loss)[0].unsqueeze(-2), along
+        yield rows, some, at, robust_weight(some, at, loss)[0].unsqueeze(-2)
 
 
-def _solve(factorization: Factorization, right: Step) -> Step:
-    return factorization.solve(right.map(lambda part: part[None])).map(lambda part: part[0])
+@dataclass(frozen=True)
+class Coupling:
+    """Products, by the weighted derivatives of the pixels, of K modes with the unknowns of a fit."""
+
+    camera: Tensor  # (K, C, K')
+    pose: Tensor  # (K, S, 6)
+    object: Tensor | None  # (K, M), of an object with tolerances
+
+    def marginalize(self, factorization: Factorization) -> tuple[Tensor, Tensor]:
+        """Let the unknowns follow the modes.
+
+        Returns:
+            The information that this takes from the modes (K, K), and the cameras' change by a unit of each (K, C, K').
+        """
+        steps = [
+            factorization.solve(Step(camera[None], pose[None], None if self.object is None else self.object[k, None]))
+            for k, (camera, pose) in enumerate(zip(self.camera, self.pose, strict=True))
+        ]
+        cameras, poses = torch.cat([step.camera for step in steps]), torch.cat([step.pose for step in steps])
+        taken = self.camera.flatten(1) @ cameras.flatten(1).mT + self.pose.flatten(1) @ poses.flatten(1).mT
+        if self.object is not None:
+            taken = taken + self.object @ torch.cat([step.object for step in steps if step.object is not None]).mT
+        return 0.5 * (taken + taken.mT), -cameras
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ class Calibration:
     moved: tuple[MovedCamera, ...] = ()  # during the capture; only snapshots after the moves are used
     from_scratch: bool = False  # no factory calibration: `factory` is a first rig from the same data
     late: tuple[LateCamera, ...] = ()  # whose frames, from some snapshot on, are of other moments; those are not used
-    delays: Delays | None = None  # constant differences of exposure times, corrected; None = no sign of them
+    delays: Delays | None = None  # constant or evenly changing differences of exposure times, corrected
     unsynchronized: Unsynchronized | None = None  # unsynchronized cameras; None = no sign of them
     repeats: Repeats = Repeats()  # exact copies of earlier images; not used
     distance: KnownDistance | None = None  # between two cameras: defines the scale if nothing else does
@@ -189,7 +189,7 @@ class Calibration:
         board, modes = self.obj.board, self.estimate.modes
         if board is None or modes is None:
             return None
-        std, known = board.warp_std, self.estimate.mode_covariance().diagonal().sqrt().numpy()
+        std, known = board.warp_std, self.estimate.mode_covariance(modes).diagonal().sqrt().numpy()
         (x, y), (dx, dy), (sx, sy) = board.bend, (std * modes.offset).tolist(), (std * known).tolist()
         return Bend(x + dx, y + dy, sx, sy)
 

@@ -20,7 +20,7 @@ from imgcal.errors import InputError, RefusedError
 from imgcal.pipeline.board_turns import settle_turns
 from imgcal.pipeline.calibration import Calibration
 from imgcal.pipeline.conventions import lines_of_sight_miss, require_conventions, require_meeting_rays
-from imgcal.pipeline.exposure_delays import find_delays, has_odd_camera
+from imgcal.pipeline.exposure_delays import Delays, add_uncertainty, find_delays, has_odd_camera
 from imgcal.pipeline.fitting import fit_lights, fit_since_last_move, fit_steady
 from imgcal.pipeline.initialization import Initializer
 from imgcal.pipeline.late_cameras import find_late_cameras, require_same_moments
@@ -38,7 +38,7 @@ from imgcal.types import CalibrationObject, CameraRig, Detections, RigPrior, che
 LEAST_USED, MOST_USED = 0.5, 0.75
 """Share of the snapshots below which images or rig may follow other conventions, and of those tried for one to fit."""
 MOST_ODD = 0.03
-"""Maximum share of the labels that may be outliers for constant delays to be believed."""
+"""Maximum share of the labels that may be outliers for delays to be believed."""
 FOUND = RigPrior(focal_length=5e-4, principal_point=0.5, distortion=0.01, rotation=5e-4, position=0.5)
 """Prior of a rig that was just found, for completing the labels of sticks: about a pixel."""
 
@@ -265,22 +265,23 @@ def fit_with_timing(
         RefusedError: the data are not sufficient.
     """
 
-    def fit_other(blobs: Detections) -> Calibration:
+    def fit_other(blobs: Detections, delays: Delays | None) -> Calibration:
         own = replace(given, uv=blobs.uv, sigma=blobs.sigma) if len(given) == len(blobs) else blobs
-        return fit_steady(replace(labelled, detections=blobs), own, rig, obj, options, initializer, prior_std)
+        fit = fit_steady(replace(labelled, detections=blobs), own, rig, obj, options, initializer, prior_std)
+        return fit if delays is None else with_delays(fit, delays)
 
     fit: Calibration | None = None
     refusal: RefusedError | None = None
     try:
         fit = fit_steady(labelled, given, rig, obj, options, initializer, prior_std)
-        if fit.additive_noise == 0 and not has_odd_camera(fit.residual, fit.observations):
+        if fit.additive_noise == 0 and not has_odd_camera(fit.residual, fit.observations, fit.labelled):
             return fit
     except RefusedError as error:
         refusal = error
     if (constant := find_delays(labelled, rig, obj)) is not None:
         delays, together = constant
         with contextlib.suppress(RefusedError):
-            found = replace(fit_other(together), delays=delays)
+            found = fit_other(together, delays)
             few = found.outliers <= MOST_ODD * int((labelled.detections.fiducial >= 0).sum())
             if few and (fit is None or _misfit(found) < _misfit(fit)):
                 fit, labelled = found, replace(labelled, detections=together)
@@ -289,11 +290,17 @@ def fit_with_timing(
     if (changing := find_unsynchronized(labelled, rig, obj)) is not None:
         unsynchronized, noisy = changing
         with contextlib.suppress(RefusedError):
-            return replace(fit_other(noisy), delays=None if fit is None else fit.delays, unsynchronized=unsynchronized)
+            found = fit_other(noisy, None if fit is None else fit.delays)
+            return replace(found, unsynchronized=unsynchronized)
     if fit is None:
         assert refusal is not None
         raise refusal
     return fit
+
+
+def with_delays(fit: Calibration, delays: Delays) -> Calibration:
+    """Add delays and their uncertainty to a fit of blobs that were moved back."""
+    return replace(fit, delays=delays, estimate=add_uncertainty(fit.estimate, delays, fit.labelled, fit.obj))
 
 
 def _misfit(fit: Calibration) -> tuple[float, int, float]:

@@ -1,10 +1,11 @@
-"""Snapshots that show the object at rest count as one: errors that stay as they are while nothing moves do not average.
+"""Snapshots that show the object at one place count as one: errors that are the same there do not average.
 
 The error of a blob has two parts. One differs from frame to frame, the other is the same as long as object and camera
 stay where they are: where the marker's image lies in the grid of pixels, half of it hidden, an uneven light. If twenty
 frames of one pose counted as independent, the second part would seem to be known twenty times as well as it is. The
-frames of a rest are therefore averaged into one snapshot, and only what differs between them is averaged away: with a
-blob's variance sigma^2 and the share q of it that the differences between frames show,
+frames of a rest are therefore averaged into one snapshot, also if the object comes back to that place later, as in the
+hand of a robot. Only what differs between the frames is averaged away: with a blob's variance sigma^2 and the share q
+of it that the differences show,
 
     sigma_mean^2 = sigma^2 (1 - q + q / frames).
 
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from imgcal.association import Associations
 from imgcal.medians import MEDIAN_SQUARED, median, median_of_known
@@ -35,6 +37,9 @@ SIGMAS, JOINING_SIGMAS = 4.0, 8.0
 more join: among hundreds of frames, some differ by more."""
 REMEMBERED = 8
 """Number of latest rests that a snapshot may belong to: those before it, if a frame of another kind came between."""
+
+PAIRS_AT_ONCE = 10_000
+"""Snapshots that are compared at a time."""
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -63,11 +68,11 @@ class Rests:
         """Summary for people; empty if there are none."""
         if not self.snapshots:
             return ""
-        count, rests = len(self.snapshots), len({of for _, of in self.snapshots})
-        verb = "shows" if count == 1 else "show"
+        count, places = len(self.snapshots), len({of for _, of in self.snapshots})
         return (
-            f"{plural(count, 'snapshot')} {verb} the object at rest, as {plural(rests, 'other snapshot')} "
-            f"{'does' if rests == 1 else 'do'}: each rest is averaged and counts as one snapshot"
+            f"{plural(count, 'snapshot')} {'shows' if count == 1 else 'show'} the object where {places} other"
+            f"{'s do' if places > 1 else ' does'}, at rest or back at that place: they are averaged, and each place "
+            "counts as one snapshot"
         )
 
 
@@ -143,11 +148,12 @@ def find_rests(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows, t
         own = uv[:, cameras], sigma[:, cameras], seen[:, cameras]
         pairs = (_are_alike(*_apart(lag), own[0], own[1], own[2], SIGMAS) for lag in range(1, near))
         if not any(alike.any() for alike in pairs):
-            return first
-    for lag in range(1, far):  # somebody may pass between
-        asked[lag:] |= _are_alike(*_apart(lag), uv, sigma, seen, JOINING_SIGMAS)
+            break
+    else:
+        for lag in range(1, far):  # somebody may pass between
+            asked[lag:] |= _are_alike(*_apart(lag), uv, sigma, seen, JOINING_SIGMAS)
     rests: deque[int] = deque(maxlen=REMEMBERED * together)
-    for row in range(count):
+    for row in range(count) if asked.any() else ():
         if asked[row]:
             earlier = np.array([rest for rest in rests if part[rest] == part[row]], dtype=np.int64)
             alike = earlier[_are_alike(np.array([row]), earlier, uv, sigma, seen, JOINING_SIGMAS)]
@@ -155,6 +161,32 @@ def find_rests(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows, t
                 first[row] = alike[-1]
                 continue
         rests.append(row)
+    places = np.flatnonzero(first == np.arange(count))
+    return places[_find_returns(uv[places], sigma[places], seen[places], part[places], most)][
+        np.searchsorted(places, first)
+    ]
+
+
+def _find_returns(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows, camera: int) -> Rows:
+    """Find rests at the place of an earlier one, however long before; arguments and result as for `find_rests`.
+
+    One label of a camera gives the candidates: the one that is seen most often.
+    """
+    first = np.arange(len(uv))
+    label = int(seen[:, camera].sum(0).argmax())
+    rows = np.flatnonzero(seen[:, camera, label])
+    if len(rows) < 2:
+        return first
+    reach = 2 * SIGMAS * float(median(sigma[rows, camera, label])) + LEAST_MOTION
+    pairs = rows[cKDTree(uv[rows, camera, label]).query_pairs(reach, output_type="ndarray")]
+    earlier, later = pairs.min(1), pairs.max(1)
+    order = np.lexsort((earlier, later))
+    for some in np.array_split(order, len(order) // PAIRS_AT_ONCE + 1):
+        before, after = earlier[some], later[some]
+        same = _are_alike(after, before, uv, sigma, seen, SIGMAS) & (part[before] == part[after])
+        for row, other in zip(after[same].tolist(), before[same].tolist(), strict=True):
+            if first[row] == row:
+                first[row] = first[other]
     return first
 
 

@@ -1,4 +1,4 @@
-"""Cameras that expose at other times: how good are calibrations with and without the correction of constant delays?
+"""Cameras that expose at other times: how good are calibrations with and without the correction of delays?
 
 Run as `python -m scripts.benchmarks.exposure_delays`: some minutes on one core. Ten simulated cameras see a moving body
 for three seconds, without labels. Other errors, which are no delays, must not be taken for some.
@@ -35,6 +35,7 @@ DELAYS = {
     "one camera late by 0.1": ("one", 0.1),
     "all differ, by 0.02 at most": ("all", 0.02),
     "all differ, by 0.1 at most": ("all", 0.1),
+    "one clock runs away, from 0.05 to 0.15": ("drift", 0.1),
     "random, 0.03 (standard deviation)": ("random", 0.03),
 }
 """How exposure times differ, and by what share of the interval between snapshots."""
@@ -44,6 +45,7 @@ OTHER = {
     "0.2 px of shaking": replace(CONDITIONS, shake=0.2),
 }
 """Errors of cameras that expose together."""
+FEW = "one camera late by 0.1, twelve snapshots"
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,10 @@ def delays_of(kind: str, size: float, cameras: int, rng: np.random.Generator) ->
     if kind == "random":
         return size * rng.standard_normal((COUNT, cameras))
     late = np.zeros(cameras)
-    if kind == "one":
+    if kind == "drift":
+        late = np.zeros((COUNT, cameras))
+        late[:, rng.integers(cameras)] = np.linspace(0.5 * size, 1.5 * size, COUNT)
+    elif kind == "one":
         late[rng.integers(cameras)] = size
     elif kind == "all":
         late = rng.permutation(np.linspace(0.0, size, cameras))
@@ -108,12 +113,14 @@ def calibrated(blobs: Detections, truth: CameraRig, corrects: bool) -> dict[str,
 def measure(seeds: int) -> dict[str, Any]:
     """Run all captures."""
     cases = {name: (CONDITIONS, *how) for name, how in DELAYS.items()}
+    cases |= {FEW: (CONDITIONS, "one", 0.1)}
     cases |= {name: (conditions, "none", 0.0) for name, conditions in OTHER.items()}
     found: dict[str, Any] = {"seeds": seeds, **surroundings(), "cases": {}}
     for name, (conditions, kind, size) in cases.items():
         runs = []
         for seed in range(seeds):
             blobs, truth = capture(conditions, kind, size, seed)
+            blobs = blobs.of_snapshots(0, 12) if name == FEW else blobs
             runs.append({"with": calibrated(blobs, truth, True), "without": calibrated(blobs, truth, False)})
         found["cases"][name] = runs
         print(name, *_cells(runs), sep=" | ", flush=True)
