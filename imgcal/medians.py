@@ -5,6 +5,8 @@ from numpy.typing import ArrayLike, NDArray
 
 MEDIAN_SQUARED = 1.386
 """Median of a squared length in two dimensions with unit variance on both axes."""
+RELATIVE_DEVIATION = 1.44
+"""Standard deviation of the median of n squared lengths, relative to their median, times the root of n."""
 
 
 def median(values: ArrayLike) -> float:

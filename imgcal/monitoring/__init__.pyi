@@ -7,6 +7,7 @@ from .object_motion import ObjectMotion
 from .pending_change import Change
 from .posterior import belief_from_posterior, calibration_posterior, make_posterior
 from .recent_snapshots import RecentSnapshots
+from .resting import LEAST_MOTION, REST_SIGMAS, show_the_same
 from .rig_belief import MeasurementUpdate, RigBelief, age_belief, widen
 from .rig_filter import RigFilter
 from .rig_monitor import MonitorUpdate, RigMonitor
@@ -15,6 +16,8 @@ from .snapshot_information import SnapshotInformation
 
 __all__ = [
     "CHANGES",
+    "LEAST_MOTION",
+    "REST_SIGMAS",
     "SHAPE",
     "Change",
     "ChangeTest",
@@ -42,5 +45,6 @@ __all__ = [
     "pixel_changes",
     "project_fiducials",
     "shared_shifts",
+    "show_the_same",
     "widen",
 ]

@@ -160,17 +160,21 @@ class NoiseCorrelation:
         """Minimum image shift (px) of each camera that counts as a change: less may be a persistent error."""
         return torch.where(self.time > 1, LEAST_SHIFT * self.model_error, 0.0).tolist()
 
-    def weigh(self, observations: Observations) -> Observations:
+    def weigh(self, observations: Observations, least: Tensor) -> Observations:
         """Scale the variance of observations (S, C, N) so that they count by their effective sample size.
 
         Images that were off in the last snapshot get a larger variance; each snapshot is used once for that.
+
+        Args:
+            observations: of a snapshot.
+            least: (N,) factors on the standard deviations because of an object at rest, see `Rest`.
         """
-        if not bool((self.time > 1).any()):
+        if not bool((self.time > 1).any() or (least > 1).any()):
             return observations
-        root = (self.time / self._weight).sqrt()
+        root = (self.time / self._weight).sqrt()[:, None]
         self.off = torch.full_like(self.off, math.nan)
-        shake = None if observations.shake is None else observations.shake * root
-        return replace(observations, sigma=observations.sigma * root[:, None], shake=shake)
+        shake = None if observations.shake is None else observations.shake * root.maximum(least.min())[:, 0]
+        return replace(observations, sigma=observations.sigma * root.maximum(least), shake=shake)
 
     @property
     def _weight(self) -> Tensor:

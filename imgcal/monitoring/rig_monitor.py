@@ -46,6 +46,7 @@ from imgcal.monitoring.object_change import MISFIT_LEAD, Misfit, ObjectChanged, 
 from imgcal.monitoring.pending_change import Change, PendingChange, free_cameras
 from imgcal.monitoring.quarantine import Quarantine
 from imgcal.monitoring.recent_snapshots import RecentSnapshots
+from imgcal.monitoring.resting import Rest
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belief
 from imgcal.monitoring.rig_filter import RigFilter
 from imgcal.monitoring.shaking import ShakeLevel
@@ -83,6 +84,7 @@ class MonitorUpdate:
     unsynchronized: tuple[int, ...] = ()  # unsynchronized cameras
     object_change: ObjectChange | None = None
     restarted: bool = False  # the knowledge before a change was discarded
+    learnt: bool = True  # False: the object has rested for so long that the snapshot says nothing new
 
 
 class RigMonitor:
@@ -105,6 +107,7 @@ class RigMonitor:
         "diagnosis": ("_diagnosis", Diagnosis),
         "misfit": ("_misfit", Misfit),
         "noise": ("noise", NoiseCorrelation),
+        "rest": ("rest", Rest),
         "recent": ("_recent", RecentSnapshots),
         "drifting": ("_drifting", DriftLearning),
         "pending": ("_pending", PendingChange | None),
@@ -125,6 +128,7 @@ class RigMonitor:
         self._diagnosis = Diagnosis()
         self._misfit = Misfit()
         self.noise = NoiseCorrelation(rig_filter.belief.rig.num_cameras)
+        self.rest = Rest()
         self._recent = RecentSnapshots(rig_filter.belief, rig_filter.walk)
         self._drifting = DriftLearning(DriftPaces(rig_filter.belief.rig.num_cameras))
         self._pending: PendingChange | None = None
@@ -158,9 +162,15 @@ class RigMonitor:
         self.undecided = {camera: left - 1 for camera, left in self.undecided.items() if left > 1}
         given = observations
         self.noise.pass_time(seconds)
+        horizon = None if self.filter.horizon is None else self.filter.horizon.snapshots
+        least = self.rest.widen(observations, self.filter.belief.pose_freedom <= 6, horizon)
+        if self.rest.says_nothing(seconds, horizon) and not (moved or self.quarantine.cameras):
+            result = absorb(self.filter.belief, observations, rig_from_object, self.filter.options)
+            return MonitorUpdate(replace(result, belief=self.filter.belief), learnt=False)
+        seconds = self.rest.pause()
         if self.filter.calibrated:
             self.noise.expect_usual()
-        observations = self.noise.weigh(self.shaking.apply_to(observations))
+        observations = self.noise.weigh(self.shaking.apply_to(observations), least)
         new = [camera for camera in moved if camera not in self.quarantine.cameras]
         if new:
             self.quarantine.add(new, self._is_new())
@@ -175,6 +185,8 @@ class RigMonitor:
 
     def _follow_noise(self, observations: Observations, residual: Tensor) -> None:
         """Update shake levels and error correlation times from a snapshot without suspicion."""
+        if not self.rest.began:  # the errors of a rest are not those of other snapshots
+            return
         self.shaking.observe(observations, residual)
         before = self.noise.time
         self.noise.add(observations, residual)

@@ -15,7 +15,7 @@ from imgcal.online.events import iso_time, snapshot_name
 from imgcal.online.state_document import StateReader, StateWriter
 from imgcal.types import CalibrationObject, CameraRig
 
-FORMAT = "imgcal-keeper/9"
+FORMAT = "imgcal-keeper/10"
 """Raise the number when a key or type of `state_document` changes; a state of another version is not read."""
 MOST_BYTES = 2**28
 

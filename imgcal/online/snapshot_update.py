@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from torch import Tensor
 
 from imgcal.monitoring import MonitorUpdate, RigFilter, RigMonitor
 from imgcal.online.drift_watch import DriftWatch
@@ -12,6 +13,7 @@ from imgcal.online.events import Event
 from imgcal.online.keeper_memory import LEAST_LOOKS, KeeperMemory
 from imgcal.online.label_consistency import Checked
 from imgcal.online.object_checks import ObjectChecks
+from imgcal.types import Detections
 
 
 def learn_snapshot(memory: KeeperMemory, checked: Checked) -> MonitorUpdate:
@@ -44,18 +46,8 @@ def learn_snapshot(memory: KeeperMemory, checked: Checked) -> MonitorUpdate:
     if found.restarted:
         memory.drift_watch = DriftWatch(memory.prior.camera_names)
         memory.looks[:] = 0
-    memory.times.append((monitor.filter.count - 1, time))
-    if found.changes or monitor.open or found.object_change is not None:
-        memory.doubts = ObjectChecks(memory.obj.num_fiducials)
-    elif memory.doubts.observe(checked, blobs, seconds, time):
-        of_object = test_object(memory, learnt=True)
-        if of_object is not None:
-            found = replace(found, update=of_object.update, object_change=of_object.object_change)
-    memory.looks += observations.seen[0].any(-1).numpy()
-    memory.looks[[change.camera for change in found.changes]] = 0
-    if (horizon := monitor.filter.horizon) is not None:
-        memory.looks[list(horizon.away)] = 0
-        np.minimum(memory.looks, horizon.snapshots, out=memory.looks)
+    if found.learnt:
+        found = _conclude(memory, checked, blobs, observations.seen, found, seconds)
     seen = np.unique(checked.given.camera[checked.given.fiducial >= 0])
     waits = {camera: since for camera, since in memory.off.items() if camera not in seen}  # until seen again
     memory.off, memory.learnt, memory.in_vain = waits | off, time, 0
@@ -66,8 +58,28 @@ def learn_snapshot(memory: KeeperMemory, checked: Checked) -> MonitorUpdate:
     memory.search.observe(checked.blobs, memory.count - 1)
     memory.usual.append(checked.usual)
     steady = not (off or found.changes or monitor.open or found.slips)
-    if memory.noise.observe(blobs, observations, found.update, steady, monitor.filter.count):
+    if found.learnt and memory.noise.observe(blobs, observations, found.update, steady, monitor.filter.count):
         found = replace(_relearn(memory, found), changes=found.changes)
+    return found
+
+
+def _conclude(
+    memory: KeeperMemory, checked: Checked, blobs: Detections, seen: Tensor, found: MonitorUpdate, seconds: float
+) -> MonitorUpdate:
+    """Follow what has been learned from a snapshot, which the cameras saw as (1, C, N); returns the update."""
+    monitor, time = memory.monitor, memory.time
+    memory.times.append((monitor.filter.count - 1, time))
+    if found.changes or monitor.open or found.object_change is not None:
+        memory.doubts = ObjectChecks(memory.obj.num_fiducials)
+    elif memory.doubts.observe(checked, blobs, seconds, time):
+        of_object = test_object(memory, learnt=True)
+        if of_object is not None:
+            found = replace(found, update=of_object.update, object_change=of_object.object_change)
+    memory.looks += seen[0].any(-1).numpy()
+    memory.looks[[change.camera for change in found.changes]] = 0
+    if (horizon := monitor.filter.horizon) is not None:
+        memory.looks[list(horizon.away)] = 0
+        np.minimum(memory.looks, horizon.snapshots, out=memory.looks)
     return found
 
 

@@ -24,17 +24,14 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from imgcal.association import Associations
-from imgcal.medians import MEDIAN_SQUARED, median, median_of_known
+from imgcal.medians import MEDIAN_SQUARED, RELATIVE_DEVIATION, median, median_of_known
 from imgcal.messages import plural
+from imgcal.monitoring import LEAST_MOTION, REST_SIGMAS, show_the_same
 from imgcal.types import Observations
 
-LEAST_MOTION = 0.1
-"""Pixels by which blobs may differ, beyond their noise, in snapshots of one rest."""
-RELATIVE_DEVIATION = 1.44
-"""Standard deviation of the median of n squared lengths, relative to their median, times the root of n."""
-SIGMAS, JOINING_SIGMAS = 4.0, 8.0
-"""Standard deviations by which this median may exceed its expectation in two snapshots of a rest; and the same where
-more join: among hundreds of frames, some differ by more."""
+JOINING_SIGMAS = 8.0
+"""Standard deviations by which the median distance of blobs may exceed its expectation in snapshots that join a rest:
+among hundreds of frames, some differ by more."""
 REMEMBERED = 8
 """Number of latest rests that a snapshot may belong to: those before it, if a frame of another kind came between."""
 
@@ -146,7 +143,7 @@ def find_rests(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows, t
     most = int(seen.sum((0, 2)).argmax())
     for cameras in (slice(most, most + 1), slice(None)):  # one camera first: most captures have no rest
         own = uv[:, cameras], sigma[:, cameras], seen[:, cameras]
-        pairs = (_are_alike(*_apart(lag), own[0], own[1], own[2], SIGMAS) for lag in range(1, near))
+        pairs = (_are_alike(*_apart(lag), own[0], own[1], own[2], REST_SIGMAS) for lag in range(1, near))
         if not any(alike.any() for alike in pairs):
             break
     else:
@@ -177,13 +174,13 @@ def _find_returns(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows
     rows = np.flatnonzero(seen[:, camera, label])
     if len(rows) < 2:
         return first
-    reach = 2 * SIGMAS * float(median(sigma[rows, camera, label])) + LEAST_MOTION
+    reach = 2 * REST_SIGMAS * float(median(sigma[rows, camera, label])) + LEAST_MOTION
     pairs = rows[cKDTree(uv[rows, camera, label]).query_pairs(reach, output_type="ndarray")]
     earlier, later = pairs.min(1), pairs.max(1)
     order = np.lexsort((earlier, later))
     for some in np.array_split(order, len(order) // PAIRS_AT_ONCE + 1):
         before, after = earlier[some], later[some]
-        same = _are_alike(after, before, uv, sigma, seen, SIGMAS) & (part[before] == part[after])
+        same = _are_alike(after, before, uv, sigma, seen, REST_SIGMAS) & (part[before] == part[after])
         for row, other in zip(after[same].tolist(), before[same].tolist(), strict=True):
             if first[row] == row:
                 first[row] = first[other]
@@ -199,14 +196,9 @@ def _are_alike(
     some: slice | Rows, others: slice | Rows, uv: Floats, sigma: Floats, seen: NDArray[np.bool_], sigmas: float
 ) -> NDArray[np.bool_]:
     """Tell which pairs of snapshots show the same within the noise: half of the labels of every camera, at least."""
-    both = seen[some] & seen[others]
-    count = both.sum(-1)
-    allowed = MEDIAN_SQUARED * (1 + sigmas * RELATIVE_DEVIATION / np.sqrt(np.maximum(count, 1)))
-    apart = np.square(uv[some] - uv[others]).sum(-1)
-    near = both & (apart <= allowed[..., None] * (sigma[some] ** 2 + sigma[others] ** 2) + LEAST_MOTION**2)
+    apart, variance = np.square(uv[some] - uv[others]).sum(-1), sigma[some] ** 2 + sigma[others] ** 2
     most = np.maximum(seen[some].sum((1, 2)), seen[others].sum((1, 2)))
-    enough = 2 * count.sum(-1) >= np.maximum(most, 1)
-    return np.asarray(enough & (2 * near.sum(-1) >= count).all(-1))
+    return show_the_same(apart, variance, seen[some] & seen[others], most, sigmas)
 
 
 def _share_of_flicker(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], groups: list[Rows]) -> float:
@@ -233,7 +225,7 @@ def _average(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], share: float) -
     where = np.where(seen[..., None], uv, np.nan)
     middle = np.nan_to_num(median_of_known(where))
     variance = np.where(seen, sigma**2, 0.0)
-    far = np.square(uv - middle).sum(-1) > SIGMAS**2 * MEDIAN_SQUARED * variance + LEAST_MOTION**2
+    far = np.square(uv - middle).sum(-1) > REST_SIGMAS**2 * MEDIAN_SQUARED * variance + LEAST_MOTION**2
     taken = seen & ~far
     taken |= seen & ~taken.any(0)
     count = np.maximum(taken.sum(0), 1)

@@ -363,7 +363,7 @@ def test_the_state_of_another_version_is_told_and_nothing_is_lost(blobs, tmp_pat
     out = tmp_path / "out"
     assert watch(tmp_path / "blobs.csv", out) == 0
     state = out / "state.json"
-    state.write_text(state.read_text().replace("imgcal-keeper/9", "imgcal-keeper/8", 1))
+    state.write_text(state.read_text().replace("imgcal-keeper/10", "imgcal-keeper/9", 1))
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     capsys.readouterr()
     assert watch(tmp_path / "blobs.csv", out) == 2

@@ -17,6 +17,7 @@ from imgcal.monitoring.noise_correlation import (
 from imgcal.types import Observations
 
 SIGMA = 0.1
+ALONE = torch.ones(1, dtype=torch.float64)  # no snapshot repeats another
 
 
 def observations(cameras: int = 2, fiducials: int = 5) -> Observations:
@@ -43,7 +44,7 @@ def test_white_noise_counts_as_it_is() -> None:
     noise = follow([0.0, 0.0, 0.0])
     assert noise.time.tolist() == [1.0, 1.0, 1.0]
     seen = observations(3)
-    assert noise.weigh(seen) is seen
+    assert noise.weigh(seen, ALONE) is seen
     assert noise.episodes == [1, 1, 1]
     assert float(noise.lasting.max()) == 0.0
 
@@ -53,8 +54,8 @@ def test_errors_that_last_count_by_their_effective_number() -> None:
     # The shift has 5/6 of the variance of the mean of five points; its correlation time is (1 + r) / (1 - r).
     expected = 1 + 2 * (5 / 6) * 0.9 / 0.1
     assert 0.5 * expected < float(noise.time[0]) < 1.6 * expected
-    noise.weigh(observations())  # the next one knows nothing of a snapshot before
-    weighed = noise.weigh(observations())
+    noise.weigh(observations(), ALONE)  # the next one knows nothing of a snapshot before
+    weighed = noise.weigh(observations(), ALONE)
     assert torch.allclose(weighed.sigma[0, 0], SIGMA * noise.time[0].sqrt())
     assert 0.7 * SIGMA < float(noise.lasting[0]) < 1.3 * SIGMA
     assert noise.episodes[0] == max(math.ceil(2 * float(noise.time[0])), 60)  # 1 s at 60 Hz
@@ -126,7 +127,7 @@ def test_an_image_that_was_off_a_moment_ago_counts_less() -> None:
     usual = SIGMA * noise.time.sqrt()
 
     def weights() -> list[float]:
-        return (noise.weigh(seen).sigma[0, :, 0] / usual).pow(-2).tolist()
+        return (noise.weigh(seen, ALONE).sigma[0, :, 0] / usual).pow(-2).tolist()
 
     noise.pass_time(FASTEST)
     noise.add(seen, off)
@@ -147,5 +148,5 @@ def test_the_mean_weight_of_usual_shifts_is_one() -> None:
         shift = 0.9 * shift + np.sqrt(1 - 0.81) * rng.normal(0, SIGMA, 2)
         residual = shift + rng.normal(0, SIGMA, (1, 1, 5, 2))
         noise.add(observations(1), torch.from_numpy(residual))
-        weights.append(SIGMA**2 * float(noise.time[0]) / float(noise.weigh(observations(1)).sigma[0, 0, 0]) ** 2)
+        weights.append(SIGMA**2 * float(noise.time[0]) / float(noise.weigh(observations(1), ALONE).sigma[0, 0, 0]) ** 2)
     assert 0.9 < np.mean(weights) < 1.1

@@ -97,7 +97,7 @@ def test_what_a_rig_file_may_hold_beside_its_cameras_is_gone_on_with(tmp_path: P
 
 def test_people_can_read_it(saved) -> None:
     content = json.loads(saved[0].read_text())
-    assert content["format"] == "imgcal-keeper/9"
+    assert content["format"] == "imgcal-keeper/10"
     assert content["sentence"].startswith("cam02 moved")
     assert content["snapshot"] == "00015"
     assert content["cameras"]["cam01"] == "ok"
@@ -150,7 +150,7 @@ def test_files_that_were_changed_are_refused_in_one_line(saved, tmp_path: Path, 
     assert "\n" not in str(told.value)
 
 
-@pytest.mark.parametrize(("version", "age"), [(1, "earlier"), (8, "earlier"), (10, "later")])
+@pytest.mark.parametrize(("version", "age"), [(1, "earlier"), (9, "earlier"), (11, "later")])
 def test_the_state_of_another_version_is_refused_with_what_can_be_done(saved, tmp_path, version, age) -> None:
     path, content = tmp_path / "state.json", json.loads(saved[0].read_text())
     content["format"] = f"imgcal-keeper/{version}"

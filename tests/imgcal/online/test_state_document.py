@@ -227,7 +227,7 @@ def test_the_keys_of_a_state_file_are_those_of_its_version() -> None:
     """A name in the code may change, a key may not: files of users hold it.
 
     Where something else is remembered, raise the number of `keeper_file.FORMAT` and write these keys anew, by
-    `python -m tests.imgcal.online.test_state_document > tests/imgcal/online/state_keys_10.txt`; delete the old ones.
+    `python -m tests.imgcal.online.test_state_document > tests/imgcal/online/state_keys_11.txt`; delete the old ones.
     """
     assert state_keys() == KEYS.read_text()
 
