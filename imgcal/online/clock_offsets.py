@@ -80,6 +80,10 @@ class ClockOffsets:
         self, state: RigState, frames: Mapping[str, Frame | None] | None, absorbed: MeasurementUpdate | None
     ) -> Iterable[Event]:
         """See `SequentialTest`."""
+        lost = np.array([state.cameras.get(name) == "lost" for name in state.factory.camera_names])
+        if self.late[lost].any():  # what is wrong with such a camera may have passed for a delay
+            self.late[lost] = self._told[lost] = 0.0
+            self._begin(lost)
         pose, last = state.rig_from_object, self._last
         places = self._places(state)
         self._last = None if pose is None else (state.time, pose, places)

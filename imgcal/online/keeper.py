@@ -156,7 +156,7 @@ class RigKeeper:
             raise InputError(f"time: found {time!r}, expected seconds since the epoch")
         memory = self._memory
         source = source if isinstance(source, Detections) else check_frames(source, self._labelling.rig)
-        detections = self._labelling.blobs(source, snapshot_name(memory.count))
+        detections = memory.copies.leave_out(self._labelling.blobs(source, snapshot_name(memory.count)))
         frames = None if isinstance(source, Detections) else source
         memory.count, memory.time = memory.count + 1, time
         labelled, found, refused = None, None, None

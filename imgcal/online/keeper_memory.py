@@ -18,6 +18,7 @@ from imgcal.monitoring import RigBelief, RigFilter, RigMonitor, belief_from_post
 from imgcal.online.camera_search import Search, Surroundings
 from imgcal.online.camera_visibility import CameraVisibility
 from imgcal.online.clock_correction import POSES
+from imgcal.online.copied_images import CopiedImages
 from imgcal.online.drift_watch import DriftWatch
 from imgcal.online.events import Event
 from imgcal.online.light_tracks import LightTracks
@@ -67,6 +68,7 @@ class KeeperMemory:
     search: Search
     looks: NDArray[np.int64]  # (C,) snapshots learned of each camera in its current pose
     before: RigBelief  # before the pending changes
+    copies: CopiedImages = field(default_factory=CopiedImages)
     lights: LightTracks | None = None  # None = an object is known
     count: int = 0
     learnt: float | None = None  # s, time of the last absorbed snapshot
