@@ -21,6 +21,8 @@ from imgcal.watch.timing import LEAP
 TICK = 0.05  # s between two scans
 GIVEN_UP = 2.0  # s for which an unreadable file may still be incomplete
 REMEMBERED = 4096  # names of read files kept per camera; earlier names count as read
+ASKED_AGAIN = 8  # read files per scan that are asked whether they have been written again ...
+LATER = 0.5  # ... which they have if they are younger by these seconds: a copy may get its time last
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,13 @@ class Folder:
                 if item is not None:
                     yield item
                     heard = time.monotonic()
+            for name, camera in cameras.items():
+                if (path := camera.find_rewritten()) is not None:
+                    yield Unreadable(
+                        f"{path}: was read before and has been written again, expected a new name for each snapshot; "
+                        "what comes under names that were read before is left out",
+                        name,
+                    )
             looks += 1
             if ready or looks > 1:  # no file is stable in the first scan
                 self._caught_up.set()
@@ -154,7 +163,8 @@ class _Camera:
     def __init__(self, folder: Path, after: str | None) -> None:
         self._folder = folder
         self._floor = None if after is None else natural_key(after)
-        self._read: OrderedDict[str, None] = OrderedDict()
+        self._read: OrderedDict[str, int] = OrderedDict()  # modification time then, ns
+        self._asked, self._told = 0, False  # read files asked whether they have changed; one has
         self._growing: dict[str, tuple[int, int]] = {}  # size and modification time in the last scan
         self._since: dict[str, float] = {}  # when a file was first found stable but unreadable
 
@@ -180,13 +190,24 @@ class _Camera:
 
     def mark_done(self, path: Path) -> None:
         """Mark a file as processed, in bounded memory."""
-        self._growing.pop(path.name, None)
         self._since.pop(path.name, None)
-        self._read[path.name] = None
+        self._read[path.name] = self._growing.pop(path.name, (0, 0))[1]
         if len(self._read) > REMEMBERED:
             first, _ = self._read.popitem(last=False)
             key = natural_key(_snapshot(self._folder / first))
             self._floor = key if self._floor is None else max(self._floor, key)
+
+    def find_rewritten(self) -> Path | None:
+        """Find a read file that has been written again, as in a ring of names; only once."""
+        names = list(self._read) if not self._told else []
+        for number in range(self._asked, self._asked + min(ASKED_AGAIN, len(names))):
+            name = names[number % len(names)]
+            with contextlib.suppress(OSError):  # deleted meanwhile
+                if (self._folder / name).stat().st_mtime_ns > self._read[name] + LATER * 1e9:
+                    self._told = True
+                    return self._folder / name
+        self._asked = (self._asked + ASKED_AGAIN) % max(len(names), 1)
+        return None
 
     def gives_up(self, path: Path, now: float) -> bool:
         """Tell whether a stable file has been unreadable for too long."""

@@ -14,7 +14,8 @@ class LineFile:
     """Appends lines of text to a file.
 
     Each line is written by one system call, so all but the last are whole whatever happens to the process. A last line
-    that is incomplete because of a kill or a power failure is removed when the file is opened again.
+    that is incomplete because of a kill or a power failure is removed when the file is opened again. A file that has
+    been deleted meanwhile is created again.
     """
 
     def __init__(self, path: Path) -> None:
@@ -25,9 +26,7 @@ class LineFile:
         """
         self.path = path
         _cut(path)
-        # Without it, Windows would convert line ends.
-        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0)
-        self._descriptor: int | None = os.open(path, flags, 0o644)  # None = closed
+        self._descriptor: int | None = _open(path)  # None = closed
 
     @property
     def size(self) -> int | None:
@@ -42,6 +41,10 @@ class LineFile:
         """
         if self._descriptor is None:
             raise OSError(f"{self.path}: closed")
+        if not os.fstat(self._descriptor).st_nlink:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            deleted, self._descriptor = self._descriptor, _open(self.path)
+            os.close(deleted)
         write_whole(self._descriptor, line, self.path)
 
     def close(self) -> None:
@@ -49,6 +52,11 @@ class LineFile:
         if self._descriptor is not None:
             descriptor, self._descriptor = self._descriptor, None
             os.close(descriptor)
+
+
+def _open(path: Path) -> int:
+    # Without O_BINARY, Windows would convert line ends.
+    return os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o644)
 
 
 def write_whole(descriptor: int, content: bytes, path: Path) -> None:

@@ -1,6 +1,7 @@
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -31,6 +32,18 @@ def test_events_are_appended_over_restarts(tmp_path):
         log.close()
     assert [line["snapshot"] for line in lines(path)] == ["00000", "00001", "00002"]
     assert path.read_bytes().count(b"\n") == 3
+
+
+def test_a_deleted_folder_is_made_again(tmp_path):
+    """Later events went to a file that nobody could find."""
+    (tmp_path / "out").mkdir()
+    log = EventLog(tmp_path / "out" / "events.jsonl")
+    append(log, event(1))
+    shutil.rmtree(tmp_path / "out")
+    append(log, event(2))
+    append(log, event(3))
+    log.close()
+    assert [line["snapshot"] for line in lines(tmp_path / "out" / "events.jsonl")] == ["00002", "00003"]
 
 
 @pytest.mark.parametrize("left", [b'{"event": "mov', b"\x00" * 5000])

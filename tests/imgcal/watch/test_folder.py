@@ -177,6 +177,24 @@ def test_a_frame_that_cannot_be_deleted_keeps_no_other_and_is_tried_again(tmp_pa
     assert [path.name for path in cam01.iterdir()] == ["3.png"]
 
 
+def test_names_that_are_used_again_are_told_once(tmp_path, rig):
+    """A ring of names was read once, and then ignored without a word."""
+    for name in range(12):
+        put(tmp_path, "cam01", str(name))
+    items = Folder(tmp_path, rig).items()
+    assert all(isinstance(item, Exposure) for item in until(items, 12))
+    for name in (9, 10):
+        put(tmp_path, "cam01", str(name), level=50)
+        path = tmp_path / "frames" / "cam01" / f"{name}.png"
+        os.utime(path, (time.time() + 60, time.time() + 60))
+    (told,) = until(items, 1)
+    assert isinstance(told, Unreadable) and told.camera == "cam01"
+    assert told.reason.startswith(f"{tmp_path / 'frames' / 'cam01'}") and "has been written again" in told.reason
+    put(tmp_path, "cam01", "12")
+    (exposure,) = until(items, 1)
+    assert exposure.snapshot == "12"
+
+
 def test_what_is_remembered_is_bounded_and_nothing_is_read_twice(tmp_path, rig, monkeypatch):
     monkeypatch.setattr(module, "REMEMBERED", 4)
     items = Folder(tmp_path, rig).items()
