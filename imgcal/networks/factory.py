@@ -21,6 +21,9 @@ from imgcal.networks.randomness import use_generators
 from imgcal.synthesis import ImageOptions
 from imgcal.types import CalibrationObject, CameraRig
 
+LEAST_SIZE = 20
+"""Pixels: smallest images for encoders, whose maps must have at least 5 x 5 cells."""
+
 
 def build(
     config: NetworkConfig,
@@ -69,6 +72,10 @@ def _make(config: NetworkConfig, parameterization: Parameterization, images: Ima
     from imgcal.networks.points import PaperPointNetwork, PointNetwork
 
     variant = config.variant()
+    encodes = isinstance(variant, PaperImages | PooledImages | Images)
+    if encodes and images is not None and images.size < LEAST_SIZE:
+        expected = f"{LEAST_SIZE} or more for network {config.preset}"
+        raise InputError(f"images: size: found {images.size}, expected {expected}")
     if isinstance(variant, PaperImages | PooledImages):
         from imgcal.networks.pooled_images import PaperImageNetwork, PooledImageNetwork
 

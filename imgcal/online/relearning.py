@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-import torch
 from torch import Tensor
 
 from imgcal.estimation import Gauge
@@ -106,10 +105,12 @@ def _describe(kind: str, size: float, sigma: float) -> str:
 
 
 def relative_std(belief: RigBelief) -> Tensor:
-    """One standard deviation of every parameter relative to the mean of all cameras: (C, K)."""
-    count = belief.rig.num_cameras
-    jacobian = Gauge(torch.full((count,), 1 / count, dtype=torch.float64)).jacobian(belief.rig)
-    spread = (jacobian @ belief.covariance() * jacobian).sum(1)
+    """One standard deviation of every parameter relative to the mean of the cameras that are known well: (C, K)."""
+    covariance = belief.covariance()
+    turned = covariance.diagonal().view(belief.unit.shape)[:, :3].sum(1)
+    weight = turned.clamp_min(1e-30).reciprocal()  # one that may be anywhere says nothing about the others
+    jacobian = Gauge(weight / weight.sum()).jacobian(belief.rig)
+    spread = (jacobian @ covariance * jacobian).sum(1)
     return spread.clamp_min(0).sqrt().view(belief.unit.shape)
 
 

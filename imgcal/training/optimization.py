@@ -47,13 +47,16 @@ def make_optimizer(network: nn.Module, config: OptimizerConfig) -> torch.optim.O
 
 
 def group_parameters(network: nn.Module) -> dict[str, list[nn.Parameter]]:
-    """Group the trainable parameters of a network; those that `parameter_groups()` omits are the group `rest`."""
+    """Group the trainable parameters of a network; those that `parameter_groups()` omits are the group `rest`.
+
+    The list of a frozen group is empty.
+    """
     given: Callable[[], Mapping[str, Iterable[nn.Parameter]]] | None = getattr(network, "parameter_groups", None)
     groups = {"network": network.parameters()} if given is None else given()
-    named = {name: [p for p in parameters if p.requires_grad] for name, parameters in groups.items()}
+    named = {name: list(parameters) for name, parameters in groups.items()}
     known = {id(p) for parameters in named.values() for p in parameters}
-    rest = [p for p in network.parameters() if p.requires_grad and id(p) not in known]
-    return {name: parameters for name, parameters in {**named, "rest": rest}.items() if parameters}
+    named["rest"] = [p for p in network.parameters() if id(p) not in known]
+    return {name: [p for p in parameters if p.requires_grad] for name, parameters in named.items() if parameters}
 
 
 def freeze(network: nn.Module, names: Iterable[str]) -> None:

@@ -6,6 +6,7 @@ import torch
 from imgcal.errors import InputError
 from imgcal.io import load_object, read_rig
 from imgcal.networks import NetworkConfig, build
+from imgcal.synthesis import ImageOptions
 from tests.imgcal.networks.making import DRIFT, make
 
 
@@ -26,3 +27,10 @@ def test_weights_come_from_the_generator_alone():
     first = one.trunk.first.embed[0]
     torch.manual_seed(0)  # as torch would draw them after a seed of its own
     assert torch.equal(first.weight, torch.nn.Linear(first.in_features, first.out_features).weight)
+
+
+@pytest.mark.parametrize("preset", ["cnn", "vit", "cnn-pooled"])
+def test_images_that_are_too_small_for_an_encoder_are_refused(preset):
+    rig, obj = read_rig("T4").to(torch.float32), load_object("cube8")
+    with pytest.raises(InputError, match=f"^images: size: found 16, expected 20 or more for network {preset}$"):
+        build(NetworkConfig(preset=preset), rig, obj, DRIFT.std(rig), torch.Generator(), ImageOptions(size=16))

@@ -48,3 +48,13 @@ def test_a_shift_beside_a_turn_is_reported_in_the_message() -> None:
     told = Relearning(rig.camera_names).report_change(change, 1.0, 1.1, 4, RigBelief.of_prior(rig, obj))
     assert told.message == "cam02 turned 5 +- 0.02 deg and was shifted by 12.3 +- 0.5 mm"
     assert (told.change, told.unit) == ("rotation", "deg")
+
+
+def test_a_camera_that_may_be_anywhere_makes_no_other_one_uncertain() -> None:
+    """Others were "known again" to seven degrees, as well as before."""
+    rig, obj = imgcal.load_rig("T4").to(torch.float64), imgcal.load_object("asymmetric8")
+    belief, variance = RigBelief.of_prior(rig, obj), torch.zeros(4, 15, dtype=torch.float64)
+    variance[2, :6] = 1.0
+    free, usual = (relative_std(one)[:, 0] for one in (widen(belief, variance), belief))
+    others = [0, 1, 3]
+    assert torch.allclose(free[others], usual[others], rtol=0.2) and float(free[2]) > 0.9

@@ -211,7 +211,7 @@ def test_frozen_groups_stay(line, monkeypatch):
         nn.Linear, "parameter_groups", lambda self: {"slope": [self.weight], "offset": [self.bias]}, False
     )
     told = Watching()
-    engine.train(line("optimizer.freeze=[offset]"), told)
+    engine.train(line("optimizer.freeze=[offset]", "optimizer.learning_rates={offset: 0.1}"), told)
     assert told.result["bias"] == 0 and told.result["weight"] != 0
     for frozen, message in (
         ("[ofset]", "unknown group ofset, nearest: offset"),
