@@ -114,9 +114,9 @@ class Folder:
                     yield item
                     heard = time.monotonic()
             for name, camera in cameras.items():
-                if (path := camera.find_rewritten()) is not None:
+                if (again := camera.find_rewritten()) is not None:
                     yield Unreadable(
-                        f"{path}: was read before and has been written again, expected a new name for each snapshot; "
+                        f"{again}: was read before and has been written again, expected a new name for each snapshot; "
                         "what comes under names that were read before is left out",
                         name,
                     )
