@@ -26,6 +26,8 @@ LEAST_MOTION = 0.1
 """Pixels by which blobs may differ, beyond their noise, in snapshots of one rest."""
 REST_SIGMAS = 4.0
 """Standard deviations by which this median may exceed its expectation."""
+MOST_ALLOWED = MEDIAN_SQUARED * (1 + REST_SIGMAS * RELATIVE_DEVIATION)
+"""Largest squared distance, in units of the variance, that any number of blobs allows."""
 MOST_FLICKER = 0.9
 """Maximum share of the variance that may average out: a rest is worth ten snapshots at most, and six if
 `MOST_LEARNT` count."""
@@ -106,19 +108,22 @@ class Rest:
             (N,) factors of 1 or more.
         """
         first, latest, count = self.first, self.latest, observations.seen.shape[-1]
-        self.latest = replace(observations, shake=None)
-        if first is None or latest is None or first.seen.shape != observations.seen.shape:
-            self.first, self.frames = _copy(observations), count * [1]
-            return torch.ones(count, dtype=observations.uv.dtype)
-        still = _are_still(first, observations, single) & _are_still(latest, observations, single)
+        now = self.latest = replace(observations, shake=None)
+        still = np.zeros(count, dtype=np.bool_)
+        if first is not None and latest is not None and latest.seen.shape == now.seen.shape:
+            still = _are_still(latest, now, single)
+            if still.any():
+                still &= _are_still(first, now, single)
+        if first is None or latest is None or not still.any():
+            self.first, self.frames = now, count * [1]
+            return torch.ones(count, dtype=now.uv.dtype)
+        self._measure(latest, now, still)
         frames = np.where(still, np.add(self.frames, 1), 1)
-        if still.any():
-            self._measure(latest, observations, still)
-        news = torch.from_numpy(~still) | ~first.seen
-        for own, new in zip(_parts(first), _parts(observations), strict=True):
+        news, self.first = torch.from_numpy(~still) | ~first.seen, _copy(first)
+        for own, new in zip(_parts(self.first), _parts(now), strict=True):
             own[news] = new[news]
         self.frames = frames.tolist()
-        return torch.from_numpy(self._weight(frames.astype(np.float64), horizon) ** -0.5).to(observations.uv.dtype)
+        return torch.from_numpy(self._weight(frames.astype(np.float64), horizon) ** -0.5).to(now.uv.dtype)
 
     def _measure(self, before: Observations, now: Observations, still: Flags) -> None:
         """Follow the share of the variance that differs between two snapshots of a rest."""
@@ -147,6 +152,9 @@ class Rest:
 def _are_still(before: Observations, now: Observations, single: bool) -> Flags:
     """Tell which fiducials (N,) are where they were."""
     apart, variance, both = _compare(before, now)
+    near = both & (apart <= variance * MOST_ALLOWED + LEAST_MOTION**2)
+    if not near.any() or (single and 2 * np.count_nonzero(near) < np.count_nonzero(both)):
+        return np.zeros(both.shape[1], dtype=np.bool_)  # soon said of what moves
     most = np.maximum(now.seen[0].sum(0).numpy(), before.seen[0].sum(0).numpy())
     if single:
         return np.full(both.shape[1], show_the_same(apart, variance, both, most.sum()))

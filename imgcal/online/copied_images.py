@@ -9,8 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imgcal.types import Detections
+
+ROUNDING = 1e-6
+"""Pixels by which sums of equal coordinates may differ."""
 
 
 @dataclass
@@ -29,21 +33,32 @@ class CopiedImages:
         [[0, 1, 2, 3], [1, 2, 3]]
     """
 
-    before: Detections | None = None  # the latest blobs, sorted by camera and place
+    before: Detections | None = None
 
     def leave_out(self, blobs: Detections) -> Detections:
         """Leave out cameras whose blobs are exactly those of the snapshot before, if as many others show new ones."""
-        now = blobs.select(np.lexsort((blobs.uv[:, 1], blobs.uv[:, 0], blobs.camera)))
-        before, self.before = self.before, now
-        if before is None or not len(now):
+        before, self.before = self.before, blobs
+        if before is None or not len(blobs):
             return blobs
-        count = len(now.camera_names)
-        ends = [np.searchsorted(one.camera, np.arange(count + 1)) for one in (before, now)]
-        shown = np.diff(ends[1]) > 0
-        same = shown & (np.diff(ends[0]) == np.diff(ends[1]))
+        (count, *sums), (count_before, *sums_before) = _summarize(blobs), _summarize(before)
+        shown = count > 0
+        same = shown & (count == count_before)
+        for own, was in zip(sums, sums_before, strict=True):
+            same &= np.abs(own - was) < ROUNDING
         for camera in np.flatnonzero(same):
-            was, own = (one.uv[end[camera] : end[camera + 1]] for one, end in zip((before, now), ends, strict=True))
-            same[camera] = np.array_equal(was, own)
+            same[camera] = np.array_equal(_places(before, camera), _places(blobs, camera))
         if not same.any() or same.sum() > (shown & ~same).sum():
             return blobs  # nothing moves
         return blobs.select(~same[blobs.camera])
+
+
+def _summarize(blobs: Detections) -> list[NDArray[np.float64]]:
+    """Number of blobs and sums of their coordinates, by camera, in whatever order they come: (C,) each."""
+    one = np.ones(len(blobs))
+    return [np.bincount(blobs.camera, of, len(blobs.camera_names)) for of in (one, blobs.uv[:, 0], blobs.uv[:, 1])]
+
+
+def _places(blobs: Detections, camera: int) -> NDArray[np.float64]:
+    """Blobs of a camera in order: (M, 2)."""
+    own = blobs.uv[blobs.camera == camera]
+    return own[np.lexsort(own.T)]
