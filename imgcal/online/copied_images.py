@@ -45,7 +45,7 @@ class CopiedImages:
         same = shown & (count == count_before)
         for own, was in zip(sums, sums_before, strict=True):
             same &= np.abs(own - was) < ROUNDING
-        for camera in np.flatnonzero(same):
+        for camera in np.flatnonzero(same).tolist():
             same[camera] = np.array_equal(_places(before, camera), _places(blobs, camera))
         if not same.any() or same.sum() > (shown & ~same).sum():
             return blobs  # nothing moves
@@ -54,8 +54,8 @@ class CopiedImages:
 
 def _summarize(blobs: Detections) -> list[NDArray[np.float64]]:
     """Number of blobs and sums of their coordinates, by camera, in whatever order they come: (C,) each."""
-    one = np.ones(len(blobs))
-    return [np.bincount(blobs.camera, of, len(blobs.camera_names)) for of in (one, blobs.uv[:, 0], blobs.uv[:, 1])]
+    values = (np.ones(len(blobs)), blobs.uv[:, 0], blobs.uv[:, 1])
+    return [np.bincount(blobs.camera, of, len(blobs.camera_names)).astype(np.float64) for of in values]
 
 
 def _places(blobs: Detections, camera: int) -> NDArray[np.float64]:
