@@ -32,10 +32,10 @@ RATE, SECONDS, REST, MOVE = 20.0, 40.0, 4.0, 0.5
 CONDITIONS = Conditions(rate=RATE, clutter=0.2, hidden=0.05, labelled=True)
 SHARES = {
     "the object always moves": 0.0,
-    "rests, independent errors": 0.0,
-    "a tenth": 0.1,
+    "it rests; none of the variance": 0.0,
+    "a tenth of it": 0.1,
     "a third": 0.33,
-    "all but a tenth": 0.9,
+    "nine tenths": 0.9,
 }
 """Share of the blobs' variance that is the same during a rest."""
 BUMP, BUMPED_AT = np.radians(0.3), 22.0
