@@ -14,7 +14,7 @@ from rich.text import Text
 
 from imgcal.messages import list_names, one_line, plural
 from imgcal.online import Event
-from imgcal.watch import EVENTS, Hook, SourceReader, Tally
+from imgcal.watch import Hook, SourceReader, Tally
 
 SAID_EVERY = 10.0  # s between two lines without a terminal
 DRAWN_EVERY = 0.25  # s
@@ -92,7 +92,7 @@ class Display:
         counts = {"refused": tally.refused, "dropped": intake.dropped, "unreadable": intake.unreadable.total()}
         counts |= {kind: intake.synchronizer.counts[kind].total() for kind in SHOWN}
         counts |= {"jumps of all clocks": intake.synchronizer.leaps}
-        counts["events not written"] = tally.problems[EVENTS]
+        counts["events not written"] = tally.unwritten
         if self._hook is not None:
             counts |= {"hooks failed": self._hook.failed, "events without a hook": self._hook.dropped}
         return [f"{count:,} {kind}" for kind, count in counts.items() if count]

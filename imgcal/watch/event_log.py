@@ -31,7 +31,13 @@ class EventLog:
             self._file = LineFile(path)
         except OSError as error:
             raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
-        self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)
+        self._waiting: deque[bytes] = deque()
+        self._lost = 0  # events that waited until there were too many
+
+    @property
+    def unwritten(self) -> int:
+        """Number of events that are not in the file."""
+        return self._lost + len(self._waiting)
 
     @property
     def size(self) -> int | None:
@@ -41,6 +47,9 @@ class EventLog:
     def add(self, event: Event) -> None:
         """Take an event, for the next `write`."""
         self._waiting.append(event.to_json().encode(errors="replace") + b"\n")
+        if len(self._waiting) > MOST_WAITING:
+            self._waiting.popleft()
+            self._lost += 1
 
     def write(self) -> None:
         """Write the events that wait.

@@ -224,6 +224,7 @@ class Watch:
             self._log.write()
         except OSError as error:
             self._fail(EVENTS, f"{self._log.path}: {error.strerror}" if error.strerror else str(error))
+        self.tally.unwritten = self._log.unwritten
         if self._hook is not None:
             self._hook.notify(event)
         if self.tally.latest is not None and event.kind in IN_HISTORY:
@@ -236,6 +237,7 @@ class Watch:
         """Write the state from which the next start resumes."""
         with contextlib.suppress(OSError):  # said when the event came
             self._log.write()
+        self.tally.unwritten = self._log.unwritten
         state = self.tally.latest
         unsaved = self._unsaved or bool(self._files.problems)
         if state is None or self._progress is None or not unsaved:

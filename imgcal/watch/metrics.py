@@ -36,6 +36,8 @@ class Tally:
         self.events: Counter[str] = Counter()
         self.problems: Counter[str] = Counter()
         """Write failures, by output."""
+        self.unwritten = 0
+        """Events that could not be written yet."""
         self.latest: RigState | None = None
         self.stamps: dict[str, float] = {}
         """By camera: mean delay of its latest time stamps after those of their snapshots; seconds."""

@@ -42,6 +42,7 @@ def test_a_deleted_folder_is_made_again(tmp_path):
     shutil.rmtree(tmp_path / "out")
     append(log, event(2))
     append(log, event(3))
+    assert log.unwritten == 0
     log.close()
     assert [line["snapshot"] for line in lines(tmp_path / "out" / "events.jsonl")] == ["00002", "00003"]
 
@@ -105,6 +106,7 @@ def test_a_full_disk_leaves_whole_lines_and_loses_no_event(tmp_path):
     try:
         with pytest.raises(OSError, match=r"20 of|too large"):
             append(log, event(2))
+        assert log.unwritten == 1
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     append(log, event(3))
