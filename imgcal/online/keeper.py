@@ -173,7 +173,7 @@ class RigKeeper:
             events += self._report_findings(found)
         state = self._state(shown, lag, None if found is None else found.update, refused)
         out = silent if frames is None else [name for name in memory.prior.camera_names if frames.get(name) is None]
-        return self._conclude(state, frames, frozenset(out), labelled, found, events)
+        return self._conclude(state, frames, memory.copies.stuck.union(out), labelled, found, events)
 
     def _label(
         self, detections: Detections, lag: NDArray[np.float64], frames: Mapping[str, Frame | None] | None

@@ -34,6 +34,24 @@ def test_a_camera_that_is_stuck_for_a_while_is_neither_late_nor_moved() -> None:
     assert not events and set(state.cameras.values()) == {"ok"}
 
 
+def test_a_camera_that_stays_stuck_is_told_to_send_nothing_new() -> None:
+    rig = imgcal.load_rig("T4")
+    made, events, kept = Stream(rig, imgcal.load_object("asymmetric8"), 1, Conditions(rate=RATE)), [], None
+    with RigKeeper(rig, made.obj) as keeper:
+        for number in range(200):
+            blobs = made.snapshot(number)
+            if 80 < number < 150 and kept is not None:
+                blobs = Detections.join([blobs.select(blobs.camera != STUCK), kept])
+                blobs = replace(blobs, snapshot=np.zeros_like(blobs.snapshot), snapshot_names=blobs.snapshot_names[:1])
+            else:
+                kept = blobs.select(blobs.camera == STUCK)
+            state = keeper.update(blobs, number / RATE)
+            events += state.events
+    assert [(event.kind, event.camera) for event in events] == [("camera_lost", "cam03"), ("camera_back", "cam03")]
+    assert events[0].message == "cam03 sends nothing new when the other cameras do"
+    assert set(state.cameras.values()) == {"ok"}
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.1])
 def test_an_object_at_rest_before_noiseless_cameras_is_seen(noise: float) -> None:
     rng = np.random.default_rng(0)
