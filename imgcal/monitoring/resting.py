@@ -80,9 +80,15 @@ class Rest:
     measured: int = 0  # snapshots that have shown it
     unused: float = 0.0  # s since a snapshot was learned from
 
+    @property
+    def _shortest(self) -> int:
+        """Snapshots of the shortest rest among the fiducials that the latest one shows."""
+        shown = [] if self.latest is None else self.latest.seen[0].any(0).tolist()
+        return min((count for count, seen in zip(self.frames, shown, strict=True) if seen), default=1)
+
     def says_nothing(self, seconds: float, horizon: int | None) -> bool:
         """Tell whether to learn nothing from the latest snapshot, `seconds` after the one before; others as `widen`."""
-        rested = min(self.frames, default=0) > MOST_LEARNT and (horizon is None or horizon > MOST_LEARNT)
+        rested = self._shortest > MOST_LEARNT and (horizon is None or horizon > MOST_LEARNT)
         self.unused += seconds
         return rested and self.unused < LONGEST
 
@@ -94,7 +100,7 @@ class Rest:
     @property
     def began(self) -> bool:
         """Tell whether the latest snapshot shows something of the object elsewhere than the one before."""
-        return min(self.frames, default=1) == 1
+        return self._shortest == 1
 
     def widen(self, observations: Observations, single: bool = True, horizon: int | None = None) -> Tensor:
         """Take a snapshot, and tell by what factor its standard deviations grow because it repeats what was known.
