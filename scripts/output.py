@@ -144,6 +144,14 @@ def fill(page: Path, sections: Mapping[str, str]) -> None:
     write_text(page, replaced(page.read_text("utf-8"), sections, page))
 
 
+def publish(result: dict[str, Any], out: Path, official: Path, page: Path, name: str, table: str) -> None:
+    """Write a result and print its table; write the official one's into its page as well, where `name` marks it."""
+    write_json(out, result)
+    if out == official:
+        fill(page, {name: table})
+    print(table)
+
+
 def command(main: Callable[[], object]) -> None:
     """Run as a command: bad input is one line on standard error and exit code 2, a refusal exit code 3."""
     try:

@@ -1,4 +1,4 @@
-"""Delays of cameras, constant over the snapshots, as modes of a fit.
+"""Delays of cameras, which take given courses over the snapshots, as modes of a fit.
 
 A camera that exposes later shows everything where it will be by then. Delays are few and affect every pixel, like
 the modes of an object's shape: a fit gives their gradient and information, with all other unknowns marginalized.

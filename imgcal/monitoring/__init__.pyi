@@ -7,7 +7,7 @@ from .object_motion import ObjectMotion
 from .pending_change import Change
 from .posterior import belief_from_posterior, calibration_posterior, make_posterior
 from .recent_snapshots import RecentSnapshots
-from .resting import LEAST_MOTION, REST_SIGMAS, show_the_same
+from .resting import LEAST_MOTION, REST_SIGMAS, count_independent, show_the_same
 from .rig_belief import MeasurementUpdate, RigBelief, age_belief, widen
 from .rig_filter import RigFilter
 from .rig_monitor import MonitorUpdate, RigMonitor
@@ -40,6 +40,7 @@ __all__ = [
     "calibration_posterior",
     "camera_change_errors",
     "change_std",
+    "count_independent",
     "cusum_threshold",
     "make_posterior",
     "pixel_changes",

@@ -28,8 +28,8 @@ REST_SIGMAS = 4.0
 """Standard deviations by which this median may exceed its expectation."""
 MOST_ALLOWED = MEDIAN_SQUARED * (1 + REST_SIGMAS * RELATIVE_DEVIATION)
 """Largest squared distance, in units of the variance, that any number of blobs allows."""
-MOST_FLICKER = 0.9
-"""Maximum share of the variance that may average out: a rest is worth ten snapshots at most, and six if
+LEAST_FLICKER, MOST_FLICKER = 1e-9, 0.9
+"""Least and largest share of the variance that may average out: a rest is worth ten snapshots at most, and six if
 `MOST_LEARNT` count."""
 SMOOTHING = 0.05
 """Weight of the latest snapshot in the running mean of this share."""
@@ -61,6 +61,11 @@ def show_the_same(
     return np.asarray(enough & (2 * near.sum(-1) >= count).all(-1))
 
 
+def count_independent(frames: Floats, share: float) -> Floats:
+    """Count the independent snapshots that those of a rest are worth, if `share` of the variance differs in it."""
+    return np.asarray(frames / (frames * (1 - share) + share))
+
+
 @dataclass
 class Rest:
     """Where the object was in the latest snapshots, and for how many of them.
@@ -87,7 +92,7 @@ class Rest:
         return min((count for count, seen in zip(self.frames, shown, strict=True) if seen), default=1)
 
     def says_nothing(self, seconds: float, horizon: int | None) -> bool:
-        """Tell whether to learn nothing from the latest snapshot, `seconds` after the one before; others as `widen`."""
+        """Count the seconds since the snapshot before, and tell whether to learn nothing; `horizon` as for `widen`."""
         rested = self._shortest > MOST_LEARNT and (horizon is None or horizon > MOST_LEARNT)
         self.unused += seconds
         return rested and self.unused < LONGEST
@@ -143,15 +148,11 @@ class Rest:
 
     def _weight(self, frames: Floats, horizon: int | None) -> Floats:
         """How many independent snapshots the latest one of a rest is worth, by its number in the rest: (N,)."""
-        share = min(self.flicker, MOST_FLICKER)
-
-        def worth(frames: Floats) -> Floats:
-            return frames / (frames * (1 - share) + share)
-
+        share = min(max(self.flicker, LEAST_FLICKER), MOST_FLICKER)
         if horizon is not None:  # none is older than the horizon, so that they share what they are worth
             frames = np.minimum(frames, horizon)
-            return worth(frames) / frames
-        added = worth(frames) - np.where(frames > 1, worth(np.maximum(frames - 1, 1.0)), 0.0)
+            return count_independent(frames, share) / frames
+        added = count_independent(frames, share) - count_independent(frames - 1, share)
         return np.where(frames > MOST_LEARNT, LEAST_WEIGHT, np.maximum(added, LEAST_WEIGHT))
 
 

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from imgcal.errors import RefusedError
+from imgcal.estimation import POSE_PARAMETERS
 from imgcal.geometry import RigidTransform
 from imgcal.monitoring.case import Case, ClockSlip, ObjectChange, Snapshot
 from imgcal.monitoring.change_search import (
@@ -163,7 +164,7 @@ class RigMonitor:
         given = observations
         self.noise.pass_time(seconds)
         horizon = None if self.filter.horizon is None else self.filter.horizon.snapshots
-        least = self.rest.widen(observations, self.filter.belief.pose_freedom <= 6, horizon)
+        least = self.rest.widen(observations, self.filter.belief.pose_freedom <= POSE_PARAMETERS, horizon)
         if self.rest.says_nothing(seconds, horizon) and not (moved or self.quarantine.cameras):
             result = absorb(self.filter.belief, observations, rig_from_object, self.filter.options)
             return MonitorUpdate(replace(result, belief=self.filter.belief), learnt=False)

@@ -34,11 +34,10 @@ class CopiedImages:
     """
 
     before: Detections | None = None
-    stuck: frozenset[str] = frozenset()  # cameras that the latest snapshot showed as before
 
     def leave_out(self, blobs: Detections) -> Detections:
         """Leave out cameras whose blobs are exactly those of the snapshot before, if as many others show new ones."""
-        before, self.before, self.stuck = self.before, blobs, frozenset()
+        before, self.before = self.before, blobs
         if before is None or not len(blobs):
             return blobs
         (count, *sums), (count_before, *sums_before) = _summarize(blobs), _summarize(before)
@@ -50,7 +49,6 @@ class CopiedImages:
             same[camera] = np.array_equal(_places(before, camera), _places(blobs, camera))
         if not same.any() or same.sum() > (shown & ~same).sum():
             return blobs  # nothing moves
-        self.stuck = frozenset(name for name, copied in zip(blobs.camera_names, same.tolist(), strict=True) if copied)
         return blobs.select(~same[blobs.camera])
 
 

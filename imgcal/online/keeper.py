@@ -156,7 +156,8 @@ class RigKeeper:
             raise InputError(f"time: found {time!r}, expected seconds since the epoch")
         memory = self._memory
         source = source if isinstance(source, Detections) else check_frames(source, self._labelling.rig)
-        detections = memory.copies.leave_out(self._labelling.blobs(source, snapshot_name(memory.count)))
+        given = self._labelling.blobs(source, snapshot_name(memory.count))
+        detections = memory.copies.leave_out(given)
         frames = None if isinstance(source, Detections) else source
         memory.count, memory.time = memory.count + 1, time
         labelled, found, refused = None, None, None
@@ -173,7 +174,9 @@ class RigKeeper:
             events += self._report_findings(found)
         state = self._state(shown, lag, None if found is None else found.update, refused)
         out = silent if frames is None else [name for name in memory.prior.camera_names if frames.get(name) is None]
-        return self._conclude(state, frames, memory.copies.stuck.union(out), labelled, found, events)
+        stuck = [] if detections is given else np.setdiff1d(given.camera, detections.camera).tolist()
+        out = frozenset(out).union(memory.prior.camera_names[camera] for camera in stuck)
+        return self._conclude(state, frames, out, labelled, found, events)
 
     def _label(
         self, detections: Detections, lag: NDArray[np.float64], frames: Mapping[str, Frame | None] | None

@@ -71,7 +71,7 @@ class Delays:
     def __str__(self) -> str:
         """Describe them in words."""
         words = [
-            f"{name} {'unknown' if delay is None else _signed(delay)}{_range(change)}"
+            f"{name} {'unknown' if delay is None else _add_sign(delay)}{_describe_growth(change)}"
             for name, delay, change in zip(self.cameras, self.snapshots, self.changes, strict=True)
         ]
         return (
@@ -87,13 +87,15 @@ class Delays:
         return {"snapshots": delays, "changes": changes, "note": str(self)}
 
 
-def _signed(value: float) -> str:
+def _add_sign(value: float) -> str:
     return f"{round(value, 3) + 0.0:+.3f}"
 
 
-def _range(change: float | None) -> str:
+def _describe_growth(change: float | None) -> str:
     """Say by how much a delay changes within the capture, where that is worth a word."""
-    return "" if change is None or abs(change) < NOTICEABLE else f" (growing by {_signed(2 * change)} until the end)"
+    if change is None or abs(change) < NOTICEABLE:
+        return ""
+    return f" (growing by {_add_sign(2 * change)} during the capture)"
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 from imgcal.association import Associations
 from imgcal.medians import MEDIAN_SQUARED, RELATIVE_DEVIATION, median, median_of_known
 from imgcal.messages import plural
-from imgcal.monitoring import LEAST_MOTION, REST_SIGMAS, show_the_same
+from imgcal.monitoring import LEAST_MOTION, REST_SIGMAS, count_independent, show_the_same
 from imgcal.types import Observations
 
 JOINING_SIGMAS = 8.0
@@ -112,7 +112,7 @@ def weaken_rests(labelled: Associations, observations: Observations) -> Observat
         return observations
     share, factor = _share_of_flicker(uv, sigma, seen, groups), np.ones(len(uv))
     for group in groups:
-        factor[group] = len(group) * (1 - share) + share
+        factor[group] = len(group) / count_independent(np.array(float(len(group))), share)
     return replace(observations, sigma=observations.sigma * torch.from_numpy(factor).sqrt()[:, None, None])
 
 
@@ -137,20 +137,29 @@ def find_rests(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows, t
     Returns:
         (S,) the first snapshot of each one's rest; its own number if the object has moved.
     """
+    camera = int(seen.sum((0, 2)).argmax())
+    first = _find_rests_in_a_row(uv, sigma, seen, part, together, camera)
+    places = np.flatnonzero(first == np.arange(len(uv)))
+    earliest = places[_find_returns(uv[places], sigma[places], seen[places], part[places], camera)]
+    return np.asarray(earliest[np.searchsorted(places, first)])
+
+
+def _find_rests_in_a_row(
+    uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows, together: int, most: int
+) -> Rows:
+    """Find rests that began a few snapshots before; as `find_rests`, with the camera that sees most."""
     count = len(uv)
     first, asked = np.arange(count), np.zeros(count, dtype=np.bool_)
     near, far = min(together + 2, count), min(REMEMBERED * together + 1, count)
-    most = int(seen.sum((0, 2)).argmax())
     for cameras in (slice(most, most + 1), slice(None)):  # one camera first: most captures have no rest
         own = uv[:, cameras], sigma[:, cameras], seen[:, cameras]
         pairs = (_are_alike(*_apart(lag), own[0], own[1], own[2], REST_SIGMAS) for lag in range(1, near))
         if not any(alike.any() for alike in pairs):
-            break
-    else:
-        for lag in range(1, far):  # somebody may pass between
-            asked[lag:] |= _are_alike(*_apart(lag), uv, sigma, seen, JOINING_SIGMAS)
+            return first
+    for lag in range(1, far):  # somebody may pass between
+        asked[lag:] |= _are_alike(*_apart(lag), uv, sigma, seen, JOINING_SIGMAS)
     rests: deque[int] = deque(maxlen=REMEMBERED * together)
-    for row in range(count) if asked.any() else ():
+    for row in range(count):
         if asked[row]:
             earlier = np.array([rest for rest in rests if part[rest] == part[row]], dtype=np.int64)
             alike = earlier[_are_alike(np.array([row]), earlier, uv, sigma, seen, JOINING_SIGMAS)]
@@ -158,10 +167,7 @@ def find_rests(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows, t
                 first[row] = alike[-1]
                 continue
         rests.append(row)
-    places = np.flatnonzero(first == np.arange(count))
-    return places[_find_returns(uv[places], sigma[places], seen[places], part[places], most)][
-        np.searchsorted(places, first)
-    ]
+    return first
 
 
 def _find_returns(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], part: Rows, camera: int) -> Rows:
@@ -230,5 +236,5 @@ def _average(uv: Floats, sigma: Floats, seen: NDArray[np.bool_], share: float) -
     taken |= seen & ~taken.any(0)
     count = np.maximum(taken.sum(0), 1)
     mean = np.where(taken[..., None], uv, 0.0).sum(0) / count[..., None]
-    own = np.where(taken, variance, 0.0).sum(0) / count * (1 - share + share / count)
+    own = np.where(taken, variance, 0.0).sum(0) / count / count_independent(count.astype(np.float64), share)
     return mean, np.where(taken.any(0), np.sqrt(own), 1.0)

@@ -21,8 +21,7 @@ from imgcal.watch.timing import LEAP
 TICK = 0.05  # s between two scans
 GIVEN_UP = 2.0  # s for which an unreadable file may still be incomplete
 REMEMBERED = 4096  # names of read files kept per camera; earlier names count as read
-ASKED_AGAIN = 8  # read files per scan that are asked whether they have been written again ...
-LATER = 0.5  # ... which they have if they are younger by these seconds: a copy may get its time last
+LATER = 0.5  # s by which a read file that was written again is younger: a copy may get its time last
 
 
 @dataclass(frozen=True)
@@ -164,7 +163,8 @@ class _Camera:
         self._folder = folder
         self._floor = None if after is None else natural_key(after)
         self._read: OrderedDict[str, int] = OrderedDict()  # modification time then, ns
-        self._asked, self._told = 0, False  # read files asked whether they have changed; one has
+        self._asking: Iterator[str] = iter(())  # read files to ask, one per scan, whether they were written again
+        self._told = False  # one was
         self._growing: dict[str, tuple[int, int]] = {}  # size and modification time in the last scan
         self._since: dict[str, float] = {}  # when a file was first found stable but unreadable
 
@@ -199,15 +199,13 @@ class _Camera:
 
     def find_rewritten(self) -> Path | None:
         """Find a read file that has been written again, as in a ring of names; only once."""
-        names = list(self._read) if not self._told else []
-        for number in range(self._asked, self._asked + min(ASKED_AGAIN, len(names))):
-            name = names[number % len(names)]
-            with contextlib.suppress(OSError):  # deleted meanwhile
-                if (self._folder / name).stat().st_mtime_ns > self._read[name] + LATER * 1e9:
-                    self._told = True
-                    return self._folder / name
-        self._asked = (self._asked + ASKED_AGAIN) % max(len(names), 1)
-        return None
+        name = None if self._told else next(self._asking, None)
+        if name is None:
+            self._asking = iter(list(self._read))
+            return None
+        with contextlib.suppress(OSError, KeyError):  # deleted or forgotten meanwhile
+            self._told = (self._folder / name).stat().st_mtime_ns > self._read[name] + LATER * 1e9
+        return self._folder / name if self._told else None
 
     def gives_up(self, path: Path, now: float) -> bool:
         """Tell whether a stable file has been unreadable for too long."""

@@ -24,7 +24,7 @@ from imgcal.evaluation.detectors import judge
 from imgcal.types import CameraRig, Detections
 from scripts.benchmarks.lights import normalized_error
 from scripts.benchmarks.rig_streams import Conditions, Stream
-from scripts.output import ROOT, command, fill, markdown, surroundings, write_json
+from scripts.output import ROOT, command, markdown, publish, surroundings
 
 RESULT, PAGE = ROOT / "docs" / "benchmarks" / "exposure_delays.json", ROOT / "docs" / "method.md"
 RATE, COUNT = 20.0, 60
@@ -148,10 +148,7 @@ def main() -> None:
     """Measure, write and print."""
     options = tyro.cli(Options, description=__doc__)
     result = measure(options.seeds)
-    write_json(options.out, result)
-    if options.out == RESULT:
-        fill(options.page, {"exposure delays": table(result)})
-    print(table(result))
+    publish(result, options.out, RESULT, options.page, "exposure delays", table(result))
 
 
 if __name__ == "__main__":

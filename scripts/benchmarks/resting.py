@@ -25,7 +25,7 @@ from imgcal.geometry import RigidTransform
 from imgcal.monitoring import RigBelief
 from imgcal.types import CameraRig, Detections
 from scripts.benchmarks.rig_streams import Bump, Conditions, Stream
-from scripts.output import ROOT, command, fill, markdown, surroundings, write_json
+from scripts.output import ROOT, command, markdown, publish, surroundings
 
 RESULT, PAGE = ROOT / "docs" / "benchmarks" / "resting.json", ROOT / "docs" / "method.md"
 RATE, SECONDS, REST, MOVE = 20.0, 40.0, 4.0, 0.5
@@ -147,10 +147,7 @@ def main() -> None:
     """Measure, write and print."""
     options = tyro.cli(Options, description=__doc__)
     result = measure(options.seeds)
-    write_json(options.out, result)
-    if options.out == RESULT:
-        fill(options.page, {"object at rest": table(result)})
-    print(table(result))
+    publish(result, options.out, RESULT, options.page, "object at rest", table(result))
 
 
 if __name__ == "__main__":
