@@ -17,11 +17,11 @@ class Splats(NamedTuple):
     visible: Tensor  # (B, N) bool; invisible splats may hold anything
 
     def drop_undrawable(self) -> "Splats":
-        """Replace splats that are invisible or not finite by ones that draw nothing.
+        """Replace splats that are invisible, not finite or without a positive size by ones that draw nothing.
 
         Multiplying by zero is not enough: NaN times zero is still NaN, in the image and in the gradient.
         """
-        drawn = self.uv.isfinite().all(-1) & self.visible
+        drawn = self.uv.isfinite().all(-1) & self.visible & (self.sizes > 0) & self.sizes.isfinite()
         return Splats(
             torch.where(drawn[..., None], self.uv, 0.0),
             torch.where(drawn, self.sizes, 1.0),

@@ -106,7 +106,7 @@ def _widest(sizes: Array, visible: Flags) -> float:
     widest = 0.0
     for b in range(sizes.shape[0]):
         for n in range(sizes.shape[1]):
-            if visible[b, n] and sizes[b, n] > widest:
+            if visible[b, n] and widest < sizes[b, n] < np.inf:
                 widest = sizes[b, n]
     return widest
 
@@ -118,7 +118,7 @@ def _place(uv: Array, sizes: Array, visible: Flags, longest: int, edges: Array, 
     for b in range(uv.shape[0]):
         for n in range(uv.shape[1]):
             u, v = uv[b, n]
-            if not (visible[b, n] and np.isfinite(u) and np.isfinite(v)):
+            if not (visible[b, n] and np.isfinite(u) and np.isfinite(v) and 0 < sizes[b, n] < np.inf):
                 starts[b, n], edges[b, n] = NOWHERE, 0
                 continue
             scale = 1 / (math.sqrt(2) * sizes[b, n])

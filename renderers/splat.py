@@ -33,8 +33,8 @@ def splat(
 
     A pixel holds ``colour * intensity * integral of exp(-r^2 / (2 size^2))`` over its area: a wide splat peaks at its
     colour, a narrow one dims but keeps its mass ``2 pi size^2``, wherever in the pixel it lies. Differentiable in
-    ``uv``, ``colours``, ``size`` and ``intensity``; a fiducial that is invisible, not finite or far outside the image
-    draws nothing and gets zero gradients. Light below the rounding of a splat's peak may be left out.
+    ``uv``, ``colours``, ``size`` and ``intensity``; a fiducial that is invisible, far outside the image, or not finite
+    in place or size draws nothing and gets zero gradients. Light below the rounding of a splat's peak may be left out.
 
     Where splats overlap, ``"add"`` sums their light, in any order (values may exceed 1 and are not clamped). ``"over"``
     composites front to back: a splat has the opacity ``intensity * profile``, clamped to [0, 1], and hides what lies
@@ -102,7 +102,9 @@ def splat(
             _check_out(out, shape, uv.device, splats)
         if compositing == "add":
             return _add(splats, shape, out)
-        composed = _over(splats.drop_undrawable(), _reach(size), image_size, depth).reshape(shape)
+        drawn = splats.drop_undrawable()
+        reach = _reach(drawn.sizes if isinstance(size, Tensor) else size)
+        composed = _over(drawn, reach, image_size, depth).reshape(shape)
         return composed if out is None else out.copy_(composed)
 
 

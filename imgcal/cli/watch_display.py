@@ -77,14 +77,15 @@ class Display:
         if state is not None and state.refused is not None:
             parts.append("not learning now")
         parts.append(f"{plural(tally.snapshots, 'snapshot')}, {self._rate:.3g}/s")
-        return " | ".join([*parts, *self._counts(), *self._clocks(), *self._shaking(), *self._unsynchronized()])
+        watches = (self._clocks(), self._shaking(), self._unsynchronized(), self._stamps())
+        return " | ".join([*parts, *self._counts(), *(said for watch in watches for said in watch)])
 
     def result(self, rig: Path) -> str:
         """Say in one line what came of it, and what did not: `rig` is the file."""
         tally, reasons = self._tally, self._intake.reasons
         said = f"{plural(tally.snapshots, 'snapshot')}, {plural(sum(tally.events.values()), 'event')}: {rig}"
         latest = [f"latest unreadable input: {reasons[-1]}"] if reasons else []
-        return " | ".join([said, *self._counts(), *latest])
+        return " | ".join([said, *self._counts(), *self._stamps(), *latest])
 
     def _counts(self) -> list[str]:
         """Name what did not go as it should, with its number."""
@@ -111,6 +112,11 @@ class Display:
         tolerance = 1e3 * min(map(synchronizer.tolerance, names))
         said = f"time stamps more than {tolerance:.3g} ms (--tolerance) off the other cameras': set their clocks"
         return [f"{list_names(names)}: {said}"]
+
+    def _stamps(self) -> list[str]:
+        """Say what is wrong with all time stamps."""
+        advice = self._intake.synchronizer.advice
+        return [advice] if advice else []
 
     def _clocks(self) -> list[str]:
         """Name the cameras whose time stamps do not say when they expose."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imgcal.io import Frame
+from imgcal.messages import list_names
 from imgcal.types import Detections
 from imgcal.watch.exposures import CameraBlobs, Exposure, frame_digest
 from imgcal.watch.timing import LEAP, Timing
@@ -32,6 +33,8 @@ EARLY = 0.05
 """Share of the median interval by which it may come early."""
 ALONE = 30
 """Successive snapshots of one camera alone, while the others are together, that show that its time stamps are off."""
+LEAST_LEAPING = 10
+"""Minimum number of snapshots, most of them after a jump, that show that time stamps are not in seconds."""
 NEIGHBOUR = 1.1
 """Part of a camera's usual interval in which others must have exposed: a faster camera is often alone rightly."""
 LONGEST_ASTRAY = 100
@@ -158,6 +161,8 @@ class Synchronizer:
         self._alone: Counter[str] = Counter()  # successive snapshots of one camera alone, close to others
         self.alone: tuple[str, ...] = ()
         """Cameras whose time stamps always differ from the others': their clocks do."""
+        self._repeated: Counter[str] = Counter()  # exposures of a camera whose time stamp it had sent shortly before
+        self._released = 0  # snapshots
         self._offset: dict[str, float] = {}  # last time stamp minus this machine's clock at arrival
         self._gone: _Pending | None = None  # the last released snapshot without a name
         self._names: deque[str] = deque(maxlen=REMEMBERED)
@@ -169,6 +174,20 @@ class Synchronizer:
     def waiting(self) -> int:
         """Number of unfinished snapshots."""
         return len(self._pending)
+
+    @property
+    def advice(self) -> str:
+        """What is wrong with all time stamps; empty = nothing that shows.
+
+        Repeated exposures have repeated time stamps rightly, but hardly any source repeats most of them.
+        """
+        received = self.counts["received"]
+        repeating = [name for name in self.camera_names if 2 * self._repeated[name] > received[name] >= ALONE]
+        if repeating:
+            return f"{list_names(repeating)}: most time stamps repeat an earlier one: give each exposure its own"
+        if 2 * self.leaps > self._released >= LEAST_LEAPING:
+            return f"time stamps jump by more than {LEAP:.0f} s at every other snapshot: give them in seconds"
+        return ""
 
     def add(self, exposure: Exposure, now: float = 0.0) -> tuple[TimedSnapshot, ...]:
         """Take an exposure of one of the cameras.
@@ -236,6 +255,8 @@ class Synchronizer:
         self.counts["out_of_order"][camera] += exposure.time < before
         if exposure.time not in self._stamps[camera]:  # a repetition says nothing about the interval
             self._stamps[camera].append(exposure.time)
+        elif exposure.snapshot is None:
+            self._repeated[camera] += 1
         self._newest[camera] = max(before, exposure.time)
         tolerance = self.tolerance(camera)
         pending = self._place(exposure, tolerance, now)
@@ -274,6 +295,7 @@ class Synchronizer:
         return self._clock(now) - pending.latest > self.timing.patience
 
     def _has_continued(self, pending: _Pending) -> TimedSnapshot:
+        self._released += 1
         if pending.name is None:
             self._gone = replace(pending, exposures={})  # frames are large
         else:

@@ -120,6 +120,18 @@ def test_both_modes_agree_where_nothing_overlaps() -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, -1.0, 0.0])
+def test_fiducials_without_a_positive_finite_size_draw_nothing(bad: float, mode: Mode) -> None:
+    uv = torch.tensor([[10.0, 12.0], [20.0, 4.0]], requires_grad=True)
+    size = torch.tensor([1.5, bad], requires_grad=True)
+    found = splat(uv, torch.eye(3)[:2], size, (32, 24), compositing=mode)
+    assert torch.equal(found, splat(uv[:1], torch.eye(3)[:1], size[:1], (32, 24), compositing=mode))
+    found.square().sum().backward()
+    assert uv.grad.isfinite().all() and uv.grad[0].any() and not uv.grad[1].any()
+    assert size.grad[0].isfinite() and size.grad[0] != 0 and size.grad[1] == 0
+
+
+@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e30])
 def test_fiducials_that_are_not_drawn_leave_images_and_gradients_clean(bad: float, mode: Mode) -> None:
     values = {k: v for k, v in scene((2,), dtype=torch.float32).items() if k != "visible"}

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from imgcal.cli import watch_display as module
 from imgcal.cli.watch_display import Display
-from imgcal.watch import SourceReader, Tally, Unreadable
+from imgcal.watch import CameraBlobs, Exposure, SourceReader, Tally, Unreadable
 from tests.imgcal.watch.states import RIG, event, some_state
 
 
@@ -67,6 +67,15 @@ def test_cameras_whose_stamps_go_with_no_other_are_named(monkeypatch):
     with shown.show_tally(tally):
         said = "cam02: time stamps more than 5 ms (--tolerance) off the other cameras': set their clocks"
         assert "| 3 jumps of all clocks |" in shown.line() and shown.line().endswith(f"| {said}")
+
+
+def test_time_stamps_that_do_not_advance_are_told_now_and_at_the_end(monkeypatch):
+    shown, _, tally = display(monkeypatch, False)
+    for _ in range(100):
+        shown._intake.synchronizer.add(Exposure("cam02", 5.0, CameraBlobs.of([])))
+    said = "| cam02: most time stamps repeat an earlier one: give each exposure its own"
+    with shown.show_tally(tally):
+        assert shown.line().endswith(said) and said in shown.result(Path("out/rig.yaml"))
 
 
 def test_a_camera_that_shakes_is_named(monkeypatch):

@@ -225,6 +225,32 @@ def test_cameras_whose_stamps_go_with_no_other_are_named():
     assert found.count("ac") == 100 and found[-40:] == ["abc"] * 40
 
 
+@pytest.mark.parametrize(
+    "stamp, said",
+    [
+        (lambda k: k / 20, ""),
+        (lambda k: 1.79e9, "a, b, c: most time stamps repeat an earlier one: give each exposure its own"),
+        (lambda k: k // 20, "a, b, c: most time stamps repeat an earlier one: give each exposure its own"),
+        (lambda k: 50.0 * k, "time stamps jump by more than 10 s at every other snapshot: give them in seconds"),
+        (lambda k: k / 20 + 100.0 * (k > 40), ""),
+    ],
+)
+def test_time_stamps_that_do_not_advance_or_are_not_in_seconds_are_named(stamp, said):
+    sync = Synchronizer(ABC, Timing())
+    for k in range(100):
+        for camera in ABC:
+            sync.add(at(camera, float(stamp(k))), now=k / 20)
+    assert sync.advice == said
+
+
+def test_exposures_that_are_sent_twice_are_no_fault_of_the_time_stamps():
+    sync = Synchronizer(ABC, Timing())
+    for k in range(100):
+        for camera in "aabbcc":
+            sync.add(at(camera, k / 20))
+    assert sync.advice == ""
+
+
 def test_a_camera_that_sends_more_often_than_others_is_not_beside_them():
     sync = Synchronizer(ABC, Timing())
     for k in range(1200):
