@@ -16,7 +16,7 @@ from imgcal.estimation.covariance import camera_covariance
 from imgcal.estimation.curvature import curvature_covariance
 from imgcal.estimation.map_estimate import Estimate
 from imgcal.estimation.rig_error import step_by_error
-from imgcal.geometry import RigidTransform, rotate, rotation_from_vector, vector_from_rotation
+from imgcal.geometry import RigidTransform, cross_matrix, rotate, rotation_from_vector, vector_from_rotation
 from imgcal.types import CameraRig
 
 EXTRINSICS = 6
@@ -51,19 +51,22 @@ class Gauge:
             factory: the calibration to compare with.
         """
         squares, positions, moved = _error_squares(factory), factory.positions, _motions(rig, factory)
-        weights = torch.ones(rig.num_cameras, dtype=torch.float64)
-        moved = cls(weights)._common(moved, squares).inverse() @ moved
+        gauge = cls(torch.ones(rig.num_cameras, dtype=torch.float64))
+        scale, at = positions.new_tensor(VOTE_SCALE), cross_matrix(positions)
         # First the geometric median, which is robust up to half of the cameras; then Cauchy weights about it.
         for vote in (lambda apart: 1 / apart, lambda apart: 1 / (1 + (apart / apart.median()).square())):
+            moved = gauge._common(moved, squares).inverse() @ moved
+            errors = _errors(moved)
+            shifts = errors[:, 3:] + rotate(moved.rotation, positions) - positions
+            steps = torch.cat((errors[:, :3], shifts), dim=-1)
+            # What is left is small for most cameras: to first order, all follow a change of the common motion at once.
             for _ in range(ROUNDS):
-                errors = _errors(moved)
-                shifts = errors[:, 3:] + rotate(moved.rotation, positions) - positions
-                apart = _scale(torch.cat((errors[:, :3], shifts), dim=-1)).norm(dim=-1).clamp_min(LEAST_APART)
-                weights = vote(apart)
-                weights = weights / weights.sum()
-                # One step is enough from the previous alignment.
-                moved = _average(errors, cls(weights)._averaging(squares)).inverse() @ moved
-        return cls(weights)
+                common = gauge._averaging(squares) @ errors.flatten()
+                turned = common[:3]
+                step = torch.cat((turned.expand_as(shifts), common[3:] - at @ turned), dim=-1)
+                weights = vote(((steps - step) / scale).norm(dim=-1).clamp_min(LEAST_APART))
+                gauge = cls(weights / weights.sum())
+        return gauge
 
     def align(self, rig: CameraRig, factory: CameraRig) -> CameraRig:
         """Align a whole rig (*B) with another one, which may have fewer batch axes."""

@@ -186,6 +186,8 @@ class NoiseCorrelation:
 
     def settle(self, cameras: Collection[int]) -> None:
         """Ignore the latest and the next snapshots of cameras that have changed."""
+        if not cameras:
+            return
         for shift in islice(reversed(self.shifts), self._withheld):
             shift[list(cameras)] = np.nan
         self.settled_at |= dict.fromkeys(cameras, self.taken + SETTLING_SNAPSHOTS)

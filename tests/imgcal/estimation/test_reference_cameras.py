@@ -59,8 +59,8 @@ def test_the_vote_is_that_of_rigs_laid_anew_each_round_at_a_fraction_of_the_work
         weights = weights / weights.sum()
     moves, average = [], reference_cameras._average
     monkeypatch.setattr(reference_cameras, "_average", lambda *given: (moves.append(1), average(*given))[1])
-    torch.testing.assert_close(Gauge.from_majority(rig, factory).weights, weights, rtol=1e-6, atol=1e-9)
-    assert len(moves) <= 2 * ROUNDS + ALIGNMENTS
+    torch.testing.assert_close(Gauge.from_majority(rig, factory).weights, weights, rtol=1e-5, atol=1e-9)
+    assert len(moves) <= 2 * ALIGNMENTS
 
 
 def test_a_rig_that_is_aligned_again_and_again_stays_a_rig() -> None:
