@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: during imports, beside worker processes, in a loop. Light, since it is loaded first."""
+"""Ctrl-C, SIGTERM, SIGHUP: during imports, beside worker processes, in a loop. Light, since it is loaded first."""
 
 import contextlib
 import os
@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
+ENDING = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))  # not on Windows
 Handler = Callable[[int, FrameType | None], object] | signal.Handlers
 
 
@@ -26,14 +27,14 @@ def unwind_at_termination() -> Iterator[None]:
 
 
 class Stopped(threading.Event):
-    """Set by Ctrl-C, or by SIGTERM."""
+    """Set by Ctrl-C, by SIGTERM, or by SIGHUP."""
 
     interrupted = False  # by Ctrl-C
 
 
 @contextlib.contextmanager
 def stop_at_signals() -> Iterator[Stopped]:
-    """Let SIGINT and SIGTERM set an event, so that a loop ends cleanly; a second one does not wait.
+    """Let signals that end a program set an event, so that a loop ends cleanly; a second one does not wait.
 
     Yields:
         The event.
@@ -48,7 +49,7 @@ def stop_at_signals() -> Iterator[Stopped]:
 
     before: dict[signal.Signals, Any] = {}
     if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in ENDING:
             if signal.getsignal(number) != signal.SIG_IGN:  # in the background of a shell, Ctrl-C is not for us
                 before[number] = signal.signal(number, stop)
     try:
