@@ -30,6 +30,21 @@ def with_article(noun: str) -> str:
     return f"{'an' if noun[:1].lower() in 'aeio' else 'a'} {noun}"
 
 
+def round_to(value: float, digits: int) -> str:
+    """Write a number with some significant digits, but no exponent from 1e-4 to 1e15.
+
+    Examples:
+        >>> round_to(2237.4, 3), round_to(12.0, 1), round_to(0.0314, 2)
+        ('2240', '10', '0.031')
+    """
+    return f"{float(f'{value:.{digits}g}'):.15g}"
+
+
+def plus_minus(value: float, sigma: float, digits: int = 3) -> str:
+    """Write a value with its standard deviation: `127 +- 10`."""
+    return f"{round_to(value, digits)} +- {round_to(sigma, 1)}"
+
+
 def list_names(names: Iterable[str]) -> str:
     """Join names by commas; a long list shows only the first few and the total."""
     whole = list(names)

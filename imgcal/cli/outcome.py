@@ -18,7 +18,7 @@ import imgcal
 from imgcal.errors import RefusedError
 from imgcal.estimation import Gauge
 from imgcal.io import RigCovariance
-from imgcal.messages import list_names, plural
+from imgcal.messages import list_names, plural, plus_minus
 from imgcal.pipeline import (
     DOUBTFUL,
     Calibration,
@@ -340,8 +340,8 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
     for offset in _offsets(result):
         if offset["fiducial"] in result["object_displaced"]:
             print(
-                f"note: fiducial {offset['fiducial']} of the object is {offset['offset_mm']:.3g} +- "
-                f"{offset['sigma_mm']:.1g} mm from its place in the object file",
+                f"note: fiducial {offset['fiducial']} of the object is "
+                f"{plus_minus(offset['offset_mm'], offset['sigma_mm'])} mm from its place in the object file",
                 file=sys.stderr,
             )
     for fiducial in result["object_lost"]:

@@ -40,7 +40,7 @@ LENS_KINDS, LENS_LOG_PRIOR = ("focal_length", "principal_point"), -3.0
 LENS_REST = 2.0
 """A change of the lens alone is the main kind only if it leaves this many times less unexplained than other kinds."""
 CERTAIN_SIGMAS = 5.0
-"""Least size, in standard deviations, of another kind of motion that is reported beside the main kind."""
+"""Least size, in standard deviations, of a motion that is reported, and of another kind of motion beside it."""
 DECIDE_AFTER = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """Numbers of snapshots since a change at which its kind is decided if possible."""
 
@@ -162,6 +162,8 @@ class PendingChange:
                 continue
             kinds[camera], kind = decision
             sizes = {} if kind is None else self.sizes(test, camera, kind)
+            if kind is not None and not sizes[kind][0] > CERTAIN_SIGMAS * sizes[kind][1]:
+                kind, sizes = None, {}  # the camera has hardly been seen since
             size = (math.nan, math.nan) if kind is None else sizes.pop(kind)
             scores = test.condition_on(self.others(camera)).each.scores()
             evidence = max(float(scores[name][camera]) for name in ([kind] if kind else CHANGES))

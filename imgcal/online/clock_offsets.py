@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from imgcal.detection import Frame
 from imgcal.geometry import RigidTransform
 from imgcal.medians import median, median_of_known
+from imgcal.messages import plus_minus
 from imgcal.monitoring import ClockSlip, MeasurementUpdate
 from imgcal.online.events import Event
 from imgcal.online.rig_state import UNTRUSTED, RigState
@@ -228,7 +229,7 @@ class ClockOffsets:
     ) -> Event:
         name = state.factory.camera_names[camera]
         how = "later" if offset > 0 else "earlier"
-        message = f"{name} exposes {1e3 * abs(offset):.3g} +- {1e3 * sigma:.1g} ms {how} than the other cameras"
+        message = f"{name} exposes {plus_minus(1e3 * abs(offset), 1e3 * sigma)} ms {how} than the other cameras"
         if abs(offset) < max(LEAST, 3 * sigma):
             message = f"{name} exposes at the same time as the other cameras again"
         frames = (offset / self._period, sigma / self._period)

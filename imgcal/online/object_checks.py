@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imgcal.geometry import RigidTransform
+from imgcal.messages import plus_minus
 from imgcal.monitoring import SHAPE, ObjectChange
 from imgcal.online.events import Event
 from imgcal.online.label_consistency import Checked
@@ -112,6 +113,6 @@ def object_event(change: ObjectChange, since: float, time: float, snapshot: int)
         message = f"the object differs from its file: {off}; it was made less accurately, or is a different object"
         size = (change.size, change.sigma)
         return Event(time, snapshot, "object_exchanged", None, since, None, *size, "mm", change.odds, message)
-    message = f"fiducial {change.fiducial} of the object is {change.size:.3g} +- {change.sigma:.1g} mm from its place"
+    message = f"fiducial {change.fiducial} of the object is {plus_minus(change.size, change.sigma)} mm from its place"
     size = (change.size, change.sigma)
     return Event(time, snapshot, "object_bent", None, since, None, *size, "mm", change.odds, message)

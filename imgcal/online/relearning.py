@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from torch import Tensor
 
 from imgcal.estimation import Gauge
+from imgcal.messages import plus_minus, round_to
 from imgcal.monitoring import CHANGES, Change, RigBelief
 from imgcal.online.events import ChangeKind, Event
 from imgcal.types import SHOWN_UNITS
@@ -85,7 +86,7 @@ class Relearning:
                 event = self.events.pop(camera)
                 del self.before[camera]
                 accuracy = change_sigma(std[camera], event.change)
-                how_well = "" if accuracy is None else f" to +- {accuracy:.2g} {event.unit}"
+                how_well = "" if accuracy is None else f" to +- {round_to(accuracy, 2)} {event.unit}"
                 events.append(
                     replace(
                         event,
@@ -101,7 +102,7 @@ class Relearning:
 def _describe(kind: str, size: float, sigma: float) -> str:
     """Say what a camera did, for example "turned 0.3 +- 0.01 deg"."""
     unit, scale = SHOWN_UNITS[kind]
-    return f"{HOW[kind]} {size * scale:.3g} +- {sigma * scale:.1g} {unit}"  # type: ignore[index]
+    return f"{HOW[kind]} {plus_minus(size * scale, sigma * scale)} {unit}"  # type: ignore[index]
 
 
 def relative_std(belief: RigBelief) -> Tensor:

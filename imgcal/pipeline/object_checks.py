@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from imgcal.errors import RefusedError
 from imgcal.estimation import BENT, SNAPSHOTS_TO_BEND, Estimate, FiducialOffset, ScaleEvidence, ShapeEvidence, offsets
+from imgcal.messages import plus_minus
 from imgcal.types import CalibrationObject
 
 CERTAIN = 4.0
@@ -74,7 +75,7 @@ def object_offsets(
         if offset.sigma > LEAST_KNOWN * obj.size:
             raise RefusedError(
                 f"{which} is not in its place, and the snapshots do not say where it is "
-                f"({offset.distance:.2g} +- {offset.sigma:.1g} mm)",
+                f"({plus_minus(offset.distance, offset.sigma, digits=2)} mm)",
                 **measure,
             )
     return found

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from imgcal.errors import RefusedError
+from imgcal.messages import plus_minus
 from imgcal.types.detections import Detections
 from imgcal.types.rig import SHOWN_UNITS
 
@@ -47,7 +48,7 @@ class MovedCamera:
         where = f"camera {self.camera} moved before {moment}"
         if self.size is None or self.sigma is None:
             return where
-        return f"{where} ({self.kind.replace('_', ' ')} {self.size:.3g} +- {self.sigma:.1g} {self.unit})"
+        return f"{where} ({self.kind.replace('_', ' ')} {plus_minus(self.size, self.sigma)} {self.unit})"
 
 
 class MovedError(RefusedError):

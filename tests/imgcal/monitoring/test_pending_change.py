@@ -10,7 +10,7 @@ from torch import Tensor
 
 import imgcal
 from imgcal.geometry import RigidTransform, rotation_from_vector
-from imgcal.monitoring import CHANGES, MeasurementUpdate, RigBelief, absorb
+from imgcal.monitoring import CHANGES, Change, MeasurementUpdate, RigBelief, absorb
 from imgcal.monitoring.pending_change import PendingChange, free_cameras
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Observations
@@ -59,6 +59,17 @@ def test_the_kind_the_size_and_what_is_believed_then() -> None:
     assert 0.4 < float(error @ torch.linalg.solve(belief.covariance(), error)) / len(error) < 1.8
     assert bool((belief.std()[1, :6] <= before.std()[1, :6] * 1.001).all())
     assert float((first.rig.focal_length - before.rig.focal_length)[1].norm()) > 0.5 * ZOOM
+
+
+def test_nothing_is_said_of_a_camera_that_has_shown_nothing_since() -> None:
+    before, result, _ = zoomed()
+    since = PendingChange.of(result, before, 0.0, {1: None})
+    own = slice(15, 30)
+    since.brought[own], since.brought[:, own], since.weighted[own] = 0.0, 0.0, 0.0
+    since.count = since.most
+    test, doubted = since.test(torch.zeros_like(before.unit)), Change(1, 8, "unknown", math.nan, math.nan)
+    (found,), kinds = since.decide_kinds(test, {1: doubted}, last=True)
+    assert (found.kind, kinds, found.also) == ("unknown", {1: None}, ()) and math.isnan(found.size)
 
 
 @pytest.mark.parametrize("joint", [0.0, 50.0, 150.0])
