@@ -137,9 +137,10 @@ class _Pending:
 class Synchronizer:
     """Combines exposures into snapshots, in bounded memory.
 
-    A snapshot is released when all active cameras have delivered, or when `patience` has passed. Snapshots are released
-    in the order of their times; named ones in the order of arrival. No single clock defines the time of a snapshot: it
-    is the median of the cameras' time stamps.
+    A snapshot is released when all active cameras have delivered, or when `patience` has passed: by this machine's clock
+    if nothing more waits to be read, otherwise by later time stamps, because a reader that was held up finds exposures
+    that came in time. Snapshots are released in the order of their times; named ones in the order of arrival. No single
+    clock defines the time of a snapshot: it is the median of the cameras' time stamps.
 
     Examples:
         >>> pair = Synchronizer(("left", "right"), Timing())
@@ -202,22 +203,26 @@ class Synchronizer:
         self.counts["received"][exposure.camera] += 1
         if exposure.snapshot is not None or not self._has_leapt(exposure, now):
             self._add(exposure, now)
-            return self.release_due(now)
+            return self._release()
         self.counts["clock_off"][exposure.camera] += 1
         self._astray[exposure.camera] = exposure
         self._astray_in_a_row += 1
         believed = [waiting for waiting in self._astray.values() if abs(waiting.time - exposure.time) <= LEAP]
         if 2 * len(believed) <= len(self._active_cameras()) and self._astray_in_a_row < LONGEST_ASTRAY:
-            return self.release_due(now)
+            return self._release()
         done = self.flush()
         self._reset()
         for waiting in sorted(believed, key=lambda waiting: waiting.time):
             self.counts["clock_off"][waiting.camera] -= 1
             self._add(waiting, now)
-        return done + self.release_due(now)
+        return done + self._release()
 
     def release_due(self, now: float) -> tuple[TimedSnapshot, ...]:
-        """Release snapshots that are due; call this now and then while nothing comes."""
+        """Release snapshots that are due; call this now and then while nothing comes, and nothing waits to be read."""
+        return self._release(now)
+
+    def _release(self, now: float | None = None) -> tuple[TimedSnapshot, ...]:
+        """Release snapshots that are due; `now` is None if more exposures may wait to be read."""
         done: list[TimedSnapshot] = []
         while self._pending and self._is_complete(self._pending[0], now):
             done.append(self._has_continued(self._pending.pop(0)))
@@ -285,14 +290,15 @@ class Synchronizer:
         self._pending.insert(later[0] if name is None and later else len(self._pending), new)
         return new
 
-    def _is_complete(self, pending: _Pending, now: float) -> bool:
+    def _is_complete(self, pending: _Pending, now: float | None) -> bool:
         if len(self._pending) > MOST_PENDING or all(
             name in pending.exposures or not self._is_due(name, pending) for name in self._active_cameras()
         ):
             return True
         if pending.name is not None:
-            return now - pending.arrived > self.timing.patience
-        return self._clock(now) - pending.latest > self.timing.patience
+            return now is not None and now - pending.arrived > self.timing.patience
+        clock = self._latest() if now is None else self._clock(now)
+        return clock - pending.latest > self.timing.patience
 
     def _has_continued(self, pending: _Pending) -> TimedSnapshot:
         self._released += 1
@@ -343,6 +349,11 @@ class Synchronizer:
     def _begins(self, name: str, latest: float) -> bool:
         few = len(self._stamps[name]) <= LEAST_INTERVALS
         return few and latest - self._newest.get(name, -math.inf) < BEGINNING
+
+    def _latest(self) -> float:
+        """Median of the active cameras' latest time stamps; of two, the later one: the other camera may be out."""
+        stamps = sorted(self._newest[name] for name in self._active_cameras() if name in self._newest)
+        return stamps[len(stamps) // 2] if stamps else math.nan
 
     def _clock(self, now: float) -> float:
         """Current time by the cameras' clocks: the median, of two the earlier one."""

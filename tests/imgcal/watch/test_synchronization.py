@@ -42,6 +42,24 @@ def test_a_missing_camera_is_waited_for_by_the_time_stamps_of_the_others():
     assert sync.waiting <= 7 and sync.counts["missing"]["c"] == len(done) > 10
 
 
+def test_exposures_that_waited_for_a_reader_that_was_held_up_are_not_late():
+    sync, now, done = Synchronizer(ABC, Timing(patience=0.1)), 0.0, []
+    for k in range(30):
+        now = max(now, k / 3)
+        for camera in ABC:
+            done += sync.add(at(camera, 1.7e9 + k / 3), now)
+            now += 0.3 * (camera == "a" and k % 4 == 3)  # after the first exposure, while the others already wait
+        done += sync.release_due(now)
+    assert cameras(done) == ["abc"] * 30 and not sync.counts["late"].total() + sync.counts["missing"].total()
+
+
+@pytest.mark.parametrize("name", [None, "1"])
+def test_a_missing_camera_is_waited_for_by_this_clock_when_nothing_more_comes(name):
+    sync = Synchronizer(ABC, Timing(patience=0.1))
+    assert sync.add(at("a", 1.7e9, name), 5.0) + sync.add(at("b", 1.7e9, name), 5.01) == ()
+    assert sync.release_due(5.05) == () and cameras(sync.release_due(5.2)) == ["ab"]
+
+
 def test_nobody_waits_for_a_camera_that_is_out_and_one_that_is_back_is_waited_for():
     sync = Synchronizer(ABC, Timing(patience=0.1))
     for k in range(60):
