@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imgcal.io import Frame
-from imgcal.messages import list_names
+from imgcal.messages import list_names, round_to
 from imgcal.types import Detections
 from imgcal.watch.exposures import CameraBlobs, Exposure, frame_digest
 from imgcal.watch.timing import LEAP, Timing
@@ -137,10 +137,10 @@ class _Pending:
 class Synchronizer:
     """Combines exposures into snapshots, in bounded memory.
 
-    A snapshot is released when all active cameras have delivered, or when `patience` has passed: by this machine's clock
-    if nothing more waits to be read, otherwise by later time stamps, because a reader that was held up finds exposures
-    that came in time. Snapshots are released in the order of their times; named ones in the order of arrival. No single
-    clock defines the time of a snapshot: it is the median of the cameras' time stamps.
+    A snapshot is released when all active cameras have delivered, or when `patience` has passed: by this machine's
+    clock if nothing more waits to be read, otherwise by later time stamps, because a reader that was held up finds
+    exposures that came in time. Snapshots are released in the order of their times; named ones in the order of arrival.
+    No single clock defines the time of a snapshot: it is the median of the cameras' time stamps.
 
     Examples:
         >>> pair = Synchronizer(("left", "right"), Timing())
@@ -162,6 +162,8 @@ class Synchronizer:
         self._alone: Counter[str] = Counter()  # successive snapshots of one camera alone, close to others
         self.alone: tuple[str, ...] = ()
         """Cameras whose time stamps always differ from the others': their clocks do."""
+        self._left_out: Counter[str] = Counter()  # successive exposures of a camera that were late or `clock_off`
+        self._ahead: dict[str, float] = {}  # s, last time stamp of a camera less the others' clock
         self._repeated: Counter[str] = Counter()  # exposures of a camera whose time stamp it had sent shortly before
         self._released = 0  # snapshots
         self._offset: dict[str, float] = {}  # last time stamp minus this machine's clock at arrival
@@ -178,7 +180,7 @@ class Synchronizer:
 
     @property
     def advice(self) -> str:
-        """What is wrong with all time stamps; empty = nothing that shows.
+        """What is wrong with the time stamps, of all cameras or of some; empty = nothing that shows.
 
         Repeated exposures have repeated time stamps rightly, but hardly any source repeats most of them.
         """
@@ -188,7 +190,10 @@ class Synchronizer:
             return f"{list_names(repeating)}: most time stamps repeat an earlier one: give each exposure its own"
         if 2 * self.leaps > self._released >= LEAST_LEAPING:
             return f"time stamps jump by more than {LEAP:.0f} s at every other snapshot: give them in seconds"
-        return ""
+        off = {name: self._ahead[name] for name in self.camera_names if self._left_out[name] >= ALONE}
+        said = [f"{name} {round_to(abs(by), 2)} s {'ahead' if by > 0 else 'behind'}" for name, by in off.items()]
+        what_to_do = "set the clock, or wait longer (--patience)"
+        return f"left out: time stamps of {list_names(said)}: {what_to_do}" if said else ""
 
     def add(self, exposure: Exposure, now: float = 0.0) -> tuple[TimedSnapshot, ...]:
         """Take an exposure of one of the cameras.
@@ -205,6 +210,7 @@ class Synchronizer:
             self._add(exposure, now)
             return self._release()
         self.counts["clock_off"][exposure.camera] += 1
+        self._leave_out(exposure)
         self._astray[exposure.camera] = exposure
         self._astray_in_a_row += 1
         believed = [waiting for waiting in self._astray.values() if abs(waiting.time - exposure.time) <= LEAP]
@@ -267,10 +273,18 @@ class Synchronizer:
         pending = self._place(exposure, tolerance, now)
         if pending is None:
             self.counts["late"][camera] += 1
+            self._leave_out(exposure)
         elif camera in pending.exposures:
             self.counts["duplicate"][camera] += 1
         else:
+            self._left_out[camera] = 0
             pending.add(exposure, tolerance)
+
+    def _leave_out(self, exposure: Exposure) -> None:
+        """Note how far off an exposure is that cannot be used."""
+        if exposure.snapshot is None:
+            self._left_out[exposure.camera] += 1
+            self._ahead[exposure.camera] = exposure.time - self._latest()
 
     def _place(self, exposure: Exposure, tolerance: float, now: float) -> _Pending | None:
         """Find the snapshot of an exposure, or start a new one; None = it was released already."""
@@ -366,6 +380,7 @@ class Synchronizer:
     def _reset(self) -> None:
         self.leaps += 1
         self._newest.clear()
+        self._left_out.clear()
         for stamps in self._stamps.values():
             stamps.clear()
         self._offset.clear()

@@ -261,6 +261,17 @@ def test_time_stamps_that_do_not_advance_or_are_not_in_seconds_are_named(stamp, 
     assert sync.advice == said
 
 
+@pytest.mark.parametrize("off, said", [(-5.0, "5 s behind"), (-0.4, "0.35 s behind"), (3600.0, "3600 s ahead")])
+def test_a_camera_whose_exposures_cannot_be_used_is_named(off, said):
+    sync, found = Synchronizer(ABC, Timing()), set()
+    for k in range(200):
+        for camera in ABC:
+            sync.add(at(camera, 1.7e9 + k / 20 + off * (camera == "b" and 50 <= k < 150)), now=k / 20)
+        found.add(sync.advice)
+        assert (sync.advice == "") == (not 79 <= k < 150), k
+    assert f"left out: time stamps of b {said}: set the clock, or wait longer (--patience)" in found
+
+
 def test_exposures_that_are_sent_twice_are_no_fault_of_the_time_stamps():
     sync = Synchronizer(ABC, Timing())
     for k in range(100):
