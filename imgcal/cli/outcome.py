@@ -308,7 +308,8 @@ def print_outcome(result: dict[str, Any], found: Findings, out: Path, report: bo
     earlier = "without a factory calibration " if before is None else f"before {before:.3f} px, {network}after "
     print(f"reprojection error {earlier}{after:.4f} px (RMS)")
     if guess is not None and not guess["used"]:
-        print("note: the network's guess was no better than the factory calibration: not used", file=sys.stderr)
+        said = "one rig from all of the network's guesses fits no better than the factory calibration: not used"
+        print(f"note: {said}", file=sys.stderr)
     print("; ".join(filter(None, (predicted_line(result["predicted_error"]), result["scale"]["note"]))))
     print(
         f"identity {result['identity']}, {plural(result['snapshots_used'], 'snapshot')} used, "

@@ -49,13 +49,18 @@ class Program:
         return {"imgcal": self.kind, "inputs": json.dumps(self.inputs), "outputs": json.dumps(self.outputs)}
 
 
+def _pack(tensor: Tensor) -> Tensor:
+    """Copy into rows one after another: a traced program keeps views that no other layout in memory allows."""
+    return tensor.clone(memory_format=torch.contiguous_format)
+
+
 class _Measurer(nn.Module):
     def __init__(self, network: Measurer) -> None:
         super().__init__()
         self.network = network
 
     def forward(self, patches: Tensor, radius: Tensor) -> tuple[Tensor, ...]:
-        found = self.network(patches, radius)
+        found = self.network(_pack(patches), radius)
         return found.offset, found.log_sigma, found.kind
 
 
@@ -65,7 +70,7 @@ class _Query(nn.Module):
         self.network = network
 
     def forward(self, crops: Tensor, place: Tensor, radius: Tensor, depth: Tensor, asked: Tensor) -> tuple[Tensor, ...]:
-        found = self.network(crops, Queries(place, radius, depth, asked))
+        found = self.network(_pack(crops), Queries(*map(_pack, (place, radius, depth, asked))))
         return found.logits, found.offset, found.log_sigma, found.present, found.cells
 
 
@@ -75,7 +80,7 @@ class _Points(nn.Module):
         self.network = network
 
     def forward(self, uv: Tensor, seen: Tensor) -> tuple[Tensor, ...]:
-        found = self.network(Views(uv=uv, seen=seen))[-1]
+        found = self.network(Views(uv=_pack(uv), seen=_pack(seen)))[-1]
         rig, pose = found.rig, found.rig_from_object
         lens = (rig.focal_length, rig.principal_point, rig.distortion)
         return *lens, rig.cam_from_rig.rotation, rig.cam_from_rig.translation, pose.rotation, pose.translation

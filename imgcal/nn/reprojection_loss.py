@@ -54,12 +54,19 @@ class ReprojectionLoss(nn.Module):
         self.obj, self.reduction = ObjectBuffers(obj), reduction
 
     def forward(self, prediction: Prediction, target: Prediction | Tensor, seen: Tensor | None = None) -> Tensor:
-        """Compute the loss in pixels, () or (*B); arguments as under Shape."""
+        """Compute the loss in pixels, () or (*B); arguments as under Shape.
+
+        Raises:
+            ValueError: target or seen have another shape.
+        """
         with torch.autocast(prediction.rig.focal_length.device.type, enabled=False):
             obj = self.obj()
             uv = project_fiducials(_exact(prediction).cameras_from_object, obj)
             if isinstance(target, Prediction):
                 target = project_fiducials(_exact(target).cameras_from_object, obj)
+            for name, found, expected in (("target", target, uv), ("seen", seen, uv[..., 0])):
+                if found is not None and found.shape != expected.shape:  # broadcast, it would mix cameras
+                    raise ValueError(f"{name}: found shape {tuple(found.shape)}, expected {tuple(expected.shape)}")
             each = rms_per_axis(uv - target, seen)
         if self.reduction == "none":
             return each

@@ -57,7 +57,9 @@ def test_results_go_to_standard_output_and_notes_to_standard_error(capsys: pytes
     ]
     notes = said.err.splitlines()
     assert all(note.startswith("note: ") for note in notes) and len(notes) == 7
-    assert "guess was no better" in notes[0] and notes.pop(1) == "note: rig and object seem to be in metres"
+    assert (
+        "network's guesses fits no better" in notes[0] and notes.pop(1) == "note: rig and object seem to be in metres"
+    )
     assert notes.pop(1) == "note: 3 blobs are listed twice"
     assert notes.pop(1) == "note: 2 snapshots show the object at rest"
     assert "focal length drifted 2.3 times" in notes[1]

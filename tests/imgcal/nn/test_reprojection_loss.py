@@ -46,6 +46,18 @@ def test_what_is_not_seen_does_not_count(rig, obj, poses, drifted):
     assert gradient.isfinite().all()
 
 
+def test_other_shapes_are_refused_instead_of_broadcast(rig, obj, poses, drifted):
+    predicted, _ = scene(rig, poses, drifted, 3)
+    uv = predicted.rig.project(predicted.rig_from_object.apply(obj.points)).uv
+    loss, seen = ReprojectionLoss(obj), torch.ones(uv.shape[:-1], dtype=torch.bool)
+    assert loss(predicted, uv, seen) < 1e-9
+    for wrong in (uv[:, :1], uv[:, :, :1], uv[:1], uv[0], uv[..., :1], torch.tensor(0.0), uv[:, None]):
+        with pytest.raises(ValueError, match=r"^target: found shape \("):
+            loss(predicted, wrong)
+    with pytest.raises(ValueError, match=r"^seen: found shape \(3, 1, "):
+        loss(predicted, uv, seen[:, :1])
+
+
 def test_half_precision_is_computed_in_single(rig, obj, poses, drifted):
     predicted, truth = (p.to(torch.bfloat16) for p in scene(rig, poses, drifted, 2))
     assert ReprojectionLoss(obj)(predicted, truth).dtype == torch.float32
