@@ -13,6 +13,7 @@ from torch import Tensor
 
 from imgcal.errors import InputError
 from imgcal.io import read_json, read_tensors, write_tensors
+from imgcal.messages import shorten
 from imgcal.training.experiment import Experiment
 
 FORMAT = "imgcal-training/1"
@@ -57,10 +58,15 @@ def load_state(path: str | Path, experiment: Experiment) -> TrainingState:
         values, saved = read_json(texts["values"]), read_json(texts["experiment"])
         if not isinstance(values, dict) or not isinstance(saved, dict):
             raise ValueError("no mapping")
-        # Keys newer than the state get their defaults.
-        saved = type(experiment).model_validate(saved, strict=False).model_dump(mode="json")
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: found no readable state in it: the file is damaged") from error
+    try:  # keys newer than the state get their defaults
+        saved = type(experiment).model_validate(saved, strict=False).model_dump(mode="json")
+    except ValueError as error:
+        name = shorten(str(saved.get("name", "unnamed")))
+        raise InputError(
+            f"{path}: found the state of another kind of experiment ({name}), expected one of {experiment.name}"
+        ) from error
     named = {name: saved.get(name) for name in values.get("files", {})}  # compares their content, not their paths
     difference = first_difference(saved, experiment.model_dump(mode="json") | named)
     if difference:

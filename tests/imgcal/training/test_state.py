@@ -47,6 +47,13 @@ def test_a_damaged_state_is_told(texts, experiment, tmp_path) -> None:
         load_state(tmp_path / "state", experiment())
 
 
+def test_the_state_of_another_kind_of_experiment_is_told(experiment, tmp_path) -> None:
+    texts = {"values": "{}", "experiment": '{"name": "ir-cnn", "crops": 12}'}
+    write_tensors(tmp_path / "state", {"network/a": torch.zeros(1)}, FORMAT, texts)
+    with pytest.raises(InputError, match=r"found the state of another kind of experiment \(ir-cnn\), expected one of "):
+        load_state(tmp_path / "state", experiment())
+
+
 def test_the_first_difference_that_matters() -> None:
     saved = {"name": "a", "loss": {"kind": "robust", "weights": [1, 2]}, "training": {"steps": 5, "seed": 1}}
     assert first_difference(saved, saved) is None
