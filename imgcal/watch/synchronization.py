@@ -33,6 +33,8 @@ EARLY = 0.05
 """Share of the median interval by which it may come early."""
 ALONE = 30
 """Successive snapshots of one camera alone, while the others are together, that show that its time stamps are off."""
+FASTEST_REPLAY = 300
+"""Seconds by time stamps to a second of this machine's clock above which they must be in other units."""
 LEAST_LEAPING = 10
 """Minimum number of snapshots, most of them after a jump, that show that time stamps are not in seconds."""
 NEIGHBOUR = 1.1
@@ -166,6 +168,7 @@ class Synchronizer:
         self._ahead: dict[str, float] = {}  # s, last time stamp of a camera less the others' clock
         self._repeated: Counter[str] = Counter()  # exposures of a camera whose time stamp it had sent shortly before
         self._released = 0  # snapshots
+        self._span = (0.0, 0.0), (0.0, 0.0)  # s: this machine's clock and time stamp of the first and the last exposure
         self._offset: dict[str, float] = {}  # last time stamp minus this machine's clock at arrival
         self._gone: _Pending | None = None  # the last released snapshot without a name
         self._names: deque[str] = deque(maxlen=REMEMBERED)
@@ -188,8 +191,9 @@ class Synchronizer:
         repeating = [name for name in self.camera_names if 2 * self._repeated[name] > received[name] >= ALONE]
         if repeating:
             return f"{list_names(repeating)}: most time stamps repeat an earlier one: give each exposure its own"
-        if 2 * self.leaps > self._released >= LEAST_LEAPING:
-            return f"time stamps jump by more than {LEAP:.0f} s at every other snapshot: give them in seconds"
+        passed, stamped = (last - first for first, last in zip(*self._span, strict=True))
+        if 2 * self.leaps > self._released >= LEAST_LEAPING or stamped > FASTEST_REPLAY * passed > 0:
+            return "time stamps go on much faster than time passes: give them in seconds"
         off = {name: self._ahead[name] for name in self.camera_names if self._left_out[name] >= ALONE}
         said = [f"{name} {round_to(abs(by), 2)} s {'ahead' if by > 0 else 'behind'}" for name, by in off.items()]
         what_to_do = "set the clock, or wait longer (--patience)"
@@ -264,6 +268,8 @@ class Synchronizer:
         self._absent[camera] = 0
         self._offset[camera] = exposure.time - now
         self.counts["out_of_order"][camera] += exposure.time < before
+        last = now, exposure.time
+        self._span = (self._span[0] if self._stamps[camera] else last), last
         if exposure.time not in self._stamps[camera]:  # a repetition says nothing about the interval
             self._stamps[camera].append(exposure.time)
         elif exposure.snapshot is None:
