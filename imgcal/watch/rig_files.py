@@ -14,6 +14,7 @@ from pathlib import Path
 from imgcal.errors import InputError
 from imgcal.io import RigCovariance, save_rig
 from imgcal.online import RigState
+from imgcal.watch.learning import ADAPTED, LEARNING
 
 STATE, CURRENT, HISTORY, FRAMES = "state.json", "rig.yaml", "history", "frames"
 LONGEST_END = 10.0  # s to wait at the end for unfinished writes
@@ -121,7 +122,7 @@ class RigFiles:
 
 
 def put_aside(folder: Path) -> bool:
-    """Reset a folder: delete an earlier run's state, and move its rig into the history.
+    """Reset a folder: delete an earlier run's state, move its rig into the history, and rename its adapted networks.
 
     Returns:
         Whether there was anything to reset.
@@ -129,13 +130,16 @@ def put_aside(folder: Path) -> bool:
     Raises:
         InputError: the folder cannot be written.
     """
-    state, rig = folder / STATE, folder / CURRENT
-    found = state.is_file() or rig.is_file()
+    state, rig, adapted = folder / STATE, folder / CURRENT, folder / LEARNING / ADAPTED
+    found = state.is_file() or rig.is_file() or adapted.is_dir()
     try:
         if state.is_file():  # first: a later start must not resume from it
             state.unlink()
         if rig.is_file():
             os.replace(rig, _history_path(folder, rig.stat().st_mtime))
+        if adapted.is_dir():  # a later start must not run them: they may be of another object
+            made = datetime.fromtimestamp(adapted.stat().st_mtime, UTC)
+            os.replace(adapted, adapted.with_name(f"{ADAPTED}-{made:%Y%m%d-%H%M%S}"))
     except OSError as error:
         problem = error.strerror or error
         raise InputError(f"{folder}: the state of an earlier run cannot be moved out of the way: {problem}") from error

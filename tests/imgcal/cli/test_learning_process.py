@@ -339,7 +339,10 @@ def test_adapted_networks_run_again_after_a_restart(workplace, tmp_path, monkeyp
     assert watch(workplace, tmp_path / "out", "--detector", "learned", "--learn") == 0
     assert used == ["learned"]
     assert watch(workplace, tmp_path / "out", "--detector", "learned", "--learn", "--fresh") == 0
-    assert used == ["learned"] and (made / "README.md").is_file()
+    (kept,) = made.parent.glob("adapted-*")
+    assert used == ["learned"] and (kept / "README.md").is_file()
+    assert watch(workplace, tmp_path / "out", "--detector", "learned", "--learn") == 0
+    assert used == ["learned"] and not made.exists()  # those of the run that was reset
 
 
 def test_what_cannot_learn_is_one_line(workplace, moments, tmp_path, capsys):
