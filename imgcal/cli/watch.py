@@ -10,13 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from rich.console import Console
 
 from imgcal.association import Proposer
 from imgcal.cli import arguments
 from imgcal.cli.common import RESULT, check_folder, check_inputs_survive, open_rig
 from imgcal.cli.interruption import stop_at_signals
-from imgcal.cli.watch_display import Display
+from imgcal.cli.watch_display import Display, Output
 from imgcal.cli.watch_poses import check_pose_outputs, open_pose_outputs
 from imgcal.cli.watch_sources import identify_source, open_source
 from imgcal.errors import InputError, RefusedError
@@ -73,8 +72,13 @@ class Watch(arguments.Watch):
         if self.learn:
             self._check_learning(given)
         detector = self._detector()
-        with holding(self.out) as folder:
-            self._watch(rig, given, detector, folder)
+        try:
+            with holding(self.out) as folder:
+                self._watch(rig, given, detector, folder)
+        except BrokenPipeError as error:  # a service must learn that nobody watches any more
+            sys.stdout = None
+            said = "whatever read the standard output is gone; the same command resumes from the saved state"
+            raise InputError(f"watch: {said}") from error
 
     def _watch(self, rig: CameraRig, given: CalibrationObject, detector: DetectorName | Proposer, folder: Path) -> None:
         """Open the input, then the outputs; follow the input to its end, and say what came of it."""
@@ -85,7 +89,7 @@ class Watch(arguments.Watch):
         rate = source.rate if isinstance(source, BlobTable) else None
         intake = SourceReader(source, rig, Timing(self.tolerance, self.patience), self.keep_all, known=earlier.known)
         hook = None if self.hook is None else Hook(self.hook)
-        display = Display(Console(file=sys.stdout, soft_wrap=True), intake, hook)
+        display = Display(Output(file=sys.stdout, soft_wrap=True), intake, hook)
         refusals = FirstRefusals(rig, obj)
         with contextlib.ExitStack() as stack:
             keeper = stack.enter_context(self._open_keeper(earlier.state, rig, obj, detector))

@@ -24,6 +24,14 @@ CLOCK_SIGMAS = 5.0
 LEAST_OFFSET = 5e-4  # s: smaller ones are the exposure's length
 
 
+class Output(Console):
+    """A console that tells when its reader is gone, instead of ending the program with exit code 1."""
+
+    def on_broken_pipe(self) -> None:
+        """Raise it again."""
+        raise BrokenPipeError
+
+
 class Display:
     """Shows the progress; with `rich` in a terminal."""
 

@@ -100,6 +100,20 @@ def test_lines_on_standard_input_and_garbage_among_them(blobs, tmp_path, monkeyp
     assert json.loads((tmp_path / "out" / "state.json").read_text())["progress"]["time"] == pytest.approx(19 / 60)
 
 
+def test_a_reader_of_its_output_that_goes_away_is_no_success(blobs, tmp_path):
+    (tmp_path / "lines").write_text("".join(lines(blobs)))
+    command = [sys.executable, "-m", "imgcal", "watch", "-", "--rig", "T4", "--object", "asymmetric8"]
+    read, write = os.pipe()
+    os.close(read)
+    with open(tmp_path / "lines") as given, os.fdopen(write, "w") as nobody:
+        found = subprocess.run(
+            [*command, "--out", str(tmp_path / "out")], stdin=given, stdout=nobody, stderr=subprocess.PIPE, text=True,
+            env=os.environ | {"PYTHONPATH": str(Path.cwd())},
+        )  # fmt: skip
+    assert found.returncode == 2 and (tmp_path / "out" / "state.json").is_file()
+    assert found.stderr.splitlines()[-1].startswith("imgcal: watch: whatever read the standard output is gone")
+
+
 def test_what_comes_on_standard_input_is_known_by_its_content(blobs, tmp_path, monkeypatch, capsys):
     def read(first, last, *more):
         (tmp_path / "lines").write_text("".join(lines(blobs)[4 * first : 4 * last]))
