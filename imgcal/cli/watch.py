@@ -121,9 +121,9 @@ class Watch(arguments.Watch):
 
             def looked() -> None:
                 display.draw()
-                learned = earlier.state is not None or loop.tally.learnt > 0
-                if cause := refusals.add(loop.tally.latest, learned):
-                    display.warn(f"nothing could be learned yet: {cause}")
+                if cause := refusals.add(loop.tally.latest):
+                    when = "any more" if earlier.state is not None or loop.tally.learnt else "yet"
+                    display.warn(f"nothing could be learned {when}: {cause}")
 
             loop.run(intake, stopped, looked)
         said = " | ".join([display.result(self.out / CURRENT), *_describe_outputs(loop)])

@@ -2,6 +2,7 @@ from .case import SHAPE, ClockSlip, ObjectChange
 from .change_test import CHANGES, ChangeTest, Comparison, OwnTest, camera_change_errors, change_std, pixel_changes
 from .clock_slip import project_fiducials
 from .cusum import Cusum, cusum_threshold
+from .far_turns import far_turned_cameras
 from .measurement_update import absorb
 from .object_motion import ObjectMotion
 from .pending_change import Change
@@ -42,6 +43,7 @@ __all__ = [
     "change_std",
     "count_independent",
     "cusum_threshold",
+    "far_turned_cameras",
     "make_posterior",
     "pixel_changes",
     "project_fiducials",

@@ -9,9 +9,9 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from imgcal.errors import RefusedError
 from imgcal.estimation import EstimationOptions
 from imgcal.geometry import RigidTransform
-from imgcal.monitoring.change_test import CHANGES, JUMPS, ChangeTest
+from imgcal.monitoring.change_test import CHANGES, ChangeTest
 from imgcal.monitoring.measurement_update import absorb
-from imgcal.monitoring.pending_change import free_cameras
+from imgcal.monitoring.pending_change import free_anywhere
 from imgcal.monitoring.recent_snapshots import SCREENED_AGES, RecentSnapshots
 from imgcal.monitoring.rig_belief import RigBelief
 from imgcal.types import Observations
@@ -176,7 +176,8 @@ def contradicting_camera(
     found: dict[int, float] = {}
     for camera in observations.seen[0].any(-1).nonzero()[:, 0].tolist():
         with contextlib.suppress(RefusedError):
-            result = absorb(free_cameras(belief, {camera: None}, JUMPS[-1]), observations, rig_from_object, options)
+            free = free_anywhere(belief, (camera,), [(observations, rig_from_object)])
+            result = absorb(free, observations, rig_from_object, options)
             if result.chi2 <= FIT_CHI2_PER_DOF * max(result.dof, 1):
                 found[camera] = result.evidence
     return max(found, key=lambda camera: found[camera], default=None)

@@ -23,7 +23,7 @@ from imgcal.monitoring.lens_misfit import LensMisfit
 from imgcal.monitoring.lens_warming import Warmed
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.object_change import MISFIT_LEAD, ObjectChanged
-from imgcal.monitoring.pending_change import free_cameras
+from imgcal.monitoring.pending_change import free_anywhere, free_cameras
 from imgcal.monitoring.rig_belief import RigBelief
 from imgcal.monitoring.shaking import Shaking, shake_cameras
 from imgcal.monitoring.unsynchronized_cameras import LEAST_SNAPSHOTS, Unsynchronized, unsynchronized_evidence
@@ -65,6 +65,8 @@ class Moved(Explanation):
     @staticmethod
     def _jump(case: Case, jump: float) -> Variant:
         """Free the cameras by a jump in pixels."""
+        if jump == JUMPS[-1]:
+            return Variant(free_anywhere(case.before, case.cameras, case.latest), case.latest)
         return Variant(free_cameras(case.before, dict.fromkeys(case.cameras), jump), case.latest)
 
     def premature(self, case: Case, found: Explained) -> str | None:

@@ -27,7 +27,7 @@ from imgcal.monitoring.measurement_update_cpu import DAMPED, MOST_DAMPING, SLACK
 from imgcal.monitoring.rig_arrays import RigArrays
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief
 from imgcal.monitoring.snapshot_information import SnapshotInformation
-from imgcal.types import CameraRig, Observations
+from imgcal.types import CameraRig, Observations, has_plausible_values
 
 
 def absorb(
@@ -47,7 +47,8 @@ def absorb(
         start: a belief about the same rig and object at which to start, which saves iterations; None = `belief`.
 
     Raises:
-        RefusedError: the observations do not determine the object's pose, or no minimum was found.
+        RefusedError: the observations do not determine the object's pose, no minimum was found, or the rig there has
+            impossible values, such as a negative focal length.
         ValueError: the number of poses differs from the number of snapshots.
     """
     if rig_from_object.translation.shape[0] != observations.seen.shape[0]:
@@ -82,7 +83,10 @@ def absorb(
     if found.status:
         raise RefusedError(f"estimation: {WHY_NOT[found.status]}")
     own, factor = torch.from_numpy(found.own), torch.from_numpy(found.factor)
-    now = RigBelief(_make_rig(found.rig, belief.rig), belief.obj, own, factor, unit)
+    rig = _make_rig(found.rig, belief.rig)
+    if not has_plausible_values(rig):
+        raise RefusedError("estimation: only a rig with impossible values explains these observations")
+    now = RigBelief(rig, belief.obj, own, factor, unit)
     carried = found.carried
     if carried.shape[1] < 6:  # a single light
         carried = np.concatenate((carried, np.zeros((len(carried), 6 - carried.shape[1], carried.shape[2]))), 1)

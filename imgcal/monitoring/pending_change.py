@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from imgcal.estimation import MOUNT_JOINT, displace, error_between
-from imgcal.monitoring.case import mean_evidence
+from imgcal.monitoring.case import Snapshot, mean_evidence
 from imgcal.monitoring.change_test import (
     CHANGES,
     FORMS_OF,
+    JUMPS,
     LARGE,
     MOTION_KINDS,
     TURNS,
@@ -23,6 +24,7 @@ from imgcal.monitoring.change_test import (
     change_std,
     pixel_changes,
 )
+from imgcal.monitoring.far_turns import have_turned_far, place_cameras, resect_cameras
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belief, widen
 from imgcal.monitoring.rig_filter import YOUNG_SECONDS
 from imgcal.types import CameraRig
@@ -113,6 +115,10 @@ class PendingChange:
         self.brought, self.weighted = self.brought + information, self.weighted + brought.pull[0] + information @ at
         self.count, self.seconds = self.count + 1, self.seconds + seconds
 
+    def has_turned_far(self, camera: int) -> bool:
+        """Tell whether a camera is turned far from its pose before."""
+        return bool(have_turned_far(self.before.rig, self.origin.rig)[camera])
+
     def others(self, camera: int) -> dict[int, str | None]:
         """The other cameras that changed, and how."""
         return {other: kind for other, kind in self.kinds.items() if other != camera}
@@ -136,6 +142,8 @@ class PendingChange:
             The kind to believe (None = any) and the kind to report (None = no single kind); None = cannot be decided
             yet.
         """
+        if self.has_turned_far(camera):
+            return None, "rotation"
         odds: dict[str | None, float] = {None: test.odds({**self.others(camera), camera: None})}
         for kind, forms in FORMS_OF.items():
             found = [test.odds({**self.others(camera), camera: form}) for form in forms]
@@ -167,7 +175,7 @@ class PendingChange:
             size = (math.nan, math.nan) if kind is None else sizes.pop(kind)
             scores = test.condition_on(self.others(camera)).each.scores()
             evidence = max(float(scores[name][camera]) for name in ([kind] if kind else CHANGES))
-            motion = {one: sizes[one] for one in MOTION_KINDS if one in sizes}
+            motion = {} if self.has_turned_far(camera) else {one: sizes[one] for one in MOTION_KINDS if one in sizes}
             also = tuple((one, *of) for one, of in motion.items() if of[0] >= CERTAIN_SIGMAS * of[1])
             found = Change(camera, change.since, kind or "unknown", *size, decided=True, evidence=evidence, also=also)
             decided.append(found)
@@ -187,18 +195,20 @@ class PendingChange:
     def adopt_kinds(self, test: ChangeTest) -> tuple[RigBelief, RigBelief, Tensor]:
         """Restrict the changes of cameras to the `kinds`.
 
-        The earlier belief is moved along with the cameras first: a large rotation is not linear.
+        The earlier belief is moved along with the cameras first: a large rotation is not linear, and one that is far
+        was not estimated in this chart.
 
         Returns:
             The belief before, the belief now, and its information (D, D), both without drift since.
         """
-        step, std = torch.zeros_like(self.before.unit), change_std(self.kinds, pixel_changes(self.before.rig))
+        before = place_cameras(self.before, self.origin.rig, self.kinds)
+        step, std = torch.zeros_like(before.unit), change_std(self.kinds, pixel_changes(before.rig))
         for camera, kind in self.kinds.items():
             if kind is not None:
                 step[camera, CHANGES[kind]] = test.condition_on(self.others(camera)).jump(camera, kind)[0]
             if kind in TURNS:
                 std[camera, CHANGES["position"]] = MOUNT_JOINT * step[camera, CHANGES[kind]].norm()
-        first = widen(replace(self.before, rig=self.before.rig.retract(step)), std.square())
+        first = widen(replace(before, rig=before.rig.retract(step)), std.square())
         information = first.information + self.brought
         factor = torch.linalg.cholesky(information)
         pull = first.information @ self.distance(first) + self.weighted
@@ -219,6 +229,12 @@ def _main_kind(odds: Mapping[str | None, float]) -> str | None:
 def free_cameras(belief: RigBelief, changes: Mapping[int, str | None], jump: float = LARGE) -> RigBelief:
     """Let cameras have changed in some form (None = any) by a jump in pixels."""
     return widen(belief, change_std(changes, pixel_changes(belief.rig), jump).square())
+
+
+def free_anywhere(belief: RigBelief, cameras: Collection[int], snapshots: Sequence[Snapshot]) -> RigBelief:
+    """Let cameras have moved anywhere before some snapshots; those that have turned far start where these show them."""
+    placed = place_cameras(belief, resect_cameras(belief, snapshots, cameras), cameras)
+    return free_cameras(placed, dict.fromkeys(cameras), JUMPS[-1])
 
 
 def _distance(rig: CameraRig, object_offset: Tensor, origin: RigBelief) -> Tensor:

@@ -39,6 +39,7 @@ from imgcal.monitoring.explanations import (
     explained_by_moves,
     weigh,
 )
+from imgcal.monitoring.far_turns import have_turned_far, place_cameras, resect_cameras
 from imgcal.monitoring.lens_misfit import LensMisfit
 from imgcal.monitoring.lens_warming import Warmed
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
@@ -52,7 +53,7 @@ from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belie
 from imgcal.monitoring.rig_filter import RigFilter
 from imgcal.monitoring.shaking import ShakeLevel
 from imgcal.monitoring.unsynchronized_cameras import drop_cameras
-from imgcal.types import Observations
+from imgcal.types import CameraRig, Observations
 
 FEW_SNAPSHOTS = 16
 """With at most this many snapshots before a change, the earlier knowledge is unreliable: it bends by more than its
@@ -447,8 +448,8 @@ class RigMonitor:
         """Learn a case's latest snapshots again, with cameras that moved before them.
 
         If hardly anything was known before, only the factory calibration is kept from that time, and a camera that saw
-        too little then, or whose labels did not fit, has not moved. If that is true of all, only their earlier labels
-        are forgotten.
+        too little then, or whose labels did not fit, has not moved, unless it is turned far. If that is true of all,
+        only their earlier labels are forgotten.
 
         Args:
             case: the snapshots and the belief before them.
@@ -461,18 +462,22 @@ class RigMonitor:
             RefusedError: see `absorb`; the monitor is unchanged.
         """
         forget, nan, horizon = self._is_new(case.count), math.nan, self.filter.horizon
+        anywhere = forget or jump == JUMPS[-1]
+        placed = resect_cameras(case.before, case.latest, free) if anywhere else case.before.rig
         if forget and horizon is None and not self.filter.calibrated:
-            misfit = _misfit_cameras(case)
+            far = have_turned_far(case.before.rig, placed)
+            misfit = {camera for camera in _misfit_cameras(case) if not far[camera]}
             free = {camera: kind for camera, kind in free.items() if camera not in misfit}
             if not free and self._beginning is not None:  # nothing moved: forget the wrong labels only
                 earlier = [(drop_cameras(one, misfit), pose) for one, pose in case.snapshots[: -case.count]]
                 return MonitorUpdate(self._restart(self._beginning, [*earlier, *case.latest], case.pauses))
         early = self._moved_early | free.keys()
-        before = self._factory_with_free(early) if forget else free_cameras(case.before, free, jump)
+        before = place_cameras(case.before, placed, free)
+        before = self._factory_with_free(early, placed) if forget else free_cameras(before, free, jump)
         result = self._restart(before, case.latest, case.pauses[-case.count :])
         if horizon is not None:
             self._moved_early = early
-            horizon.free(self._factory_with_free(early), free)
+            horizon.free(self._factory_with_free(early, placed), free)
         number, new = self.filter.count - case.count, dict[int, Change]()
         for camera, kind in free.items():
             if forget or (kind is None and camera not in self.open):
@@ -487,9 +492,10 @@ class RigMonitor:
         self._moved_at |= dict.fromkeys(new, self.filter.count)
         return MonitorUpdate(result, tuple(new.values()))
 
-    def _factory_with_free(self, cameras: Collection[int]) -> RigBelief:
-        """The factory calibration with some cameras unconstrained."""
-        return free_cameras(self._prior, dict.fromkeys(sorted(cameras)), JUMPS[-1])
+    def _factory_with_free(self, cameras: Collection[int], rig: CameraRig | None = None) -> RigBelief:
+        """The factory calibration with some cameras unconstrained, where they are turned far in a rig (None = now)."""
+        placed = place_cameras(self._prior, self.filter.belief.rig if rig is None else rig, cameras)
+        return free_cameras(placed, dict.fromkeys(sorted(cameras)), JUMPS[-1])
 
     def _begin_pending(
         self, result: MeasurementUpdate, before: RigBelief, seconds: float, kinds: dict[int, str | None]

@@ -242,7 +242,7 @@ def _find(
     if not sought.due:
         return None
     generator = np.random.default_rng(sought.taken)
-    anywhere = resect_camera(*sought.collect(), known.rig.select([camera]), generator)
+    anywhere = resect_camera(*sought.collect(), known.rig.select([camera]), known.std[[camera]], generator)
     if anywhere is None:
         return None
     sought.place = anywhere.camera

@@ -233,7 +233,8 @@ class RigKeeper:
             again = told is not None and told.change == "unknown"
             if told is not None and again and told.since is not None:
                 since = told.since
-            event = memory.relearning.report_change(change, since, memory.time, memory.count - 1, memory.before)
+            known = memory.before, memory.belief.rig
+            event = memory.relearning.report_change(change, since, memory.time, memory.count - 1, *known)
             if not again or event.change != "unknown":  # a camera that keeps moving is reported once
                 events.append(event)
         if (of_object := found.object_change) is not None:

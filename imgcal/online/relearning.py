@@ -8,15 +8,18 @@ from dataclasses import dataclass, field, replace
 from torch import Tensor
 
 from imgcal.estimation import Gauge
+from imgcal.geometry import geodesic_angle
 from imgcal.messages import plus_minus, round_to
 from imgcal.monitoring import CHANGES, Change, RigBelief
 from imgcal.online.events import ChangeKind, Event
-from imgcal.types import SHOWN_UNITS
+from imgcal.types import SHOWN_UNITS, CameraRig
 
 RELEARNT = 1.1
 """Largest standard deviations of a relearned camera, relative to those before it moved."""
 RELEARNING_SNAPSHOTS = 4
 """Number of snapshots between two checks for that."""
+NEARLY_UPRIGHT = math.radians(10.0)
+"""Largest other rotation of a camera whose images are turned by 180 degrees: it was mounted upside down."""
 EXTRINSICS_AND_PINHOLE = 10
 """Number of a camera's values that are compared: distortion is not affected by the changes that are reported."""
 
@@ -37,7 +40,9 @@ class Relearning:
     events: dict[int, Event] = field(default_factory=dict)  # camera -> its latest report
     before: dict[int, Tensor] = field(default_factory=dict)  # camera -> (K,) std before it moved
 
-    def report_change(self, change: Change, since: float, time: float, number: int, before: RigBelief) -> Event:
+    def report_change(
+        self, change: Change, since: float, time: float, number: int, before: RigBelief, now: CameraRig
+    ) -> Event:
         """Report a change.
 
         Args:
@@ -46,6 +51,7 @@ class Relearning:
             time: s since the epoch, now.
             number: of the update.
             before: a belief before the change.
+            now: the rig as it is known after it.
         """
         kind: ChangeKind = change.kind  # type: ignore[assignment]
         name = self.names[change.camera]
@@ -55,6 +61,8 @@ class Relearning:
         how = HOW[kind] if size is None else " and ".join(_describe(*part) for part in parts)
         evidence = change.evidence if math.isfinite(change.evidence) else None
         message = f"{name} {how}"
+        if shows_upside_down(before.rig, now, change.camera):
+            message += ": its images are turned by 180 degrees"
         if len(self.names) == 2:
             message += f", or {self.names[1 - change.camera]}: with two cameras it is impossible to tell which"
         event = Event(time, number, "moved", name, since, kind, size, sigma, unit, evidence, message)
@@ -97,6 +105,12 @@ class Relearning:
                     )
                 )
         return events
+
+
+def shows_upside_down(before: CameraRig, now: CameraRig, camera: int) -> bool:
+    """Tell whether a camera's images are turned by 180 degrees against those before, whatever else it did."""
+    turn = now.cam_from_rig.rotation[camera] @ before.cam_from_rig.rotation[camera].mT
+    return float(geodesic_angle(turn, turn.new_tensor([-1.0, -1.0, 1.0]).diag())) < NEARLY_UPRIGHT
 
 
 def _describe(kind: str, size: float, sigma: float) -> str:

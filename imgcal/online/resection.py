@@ -30,6 +30,8 @@ LEAST_SHARE = 0.7
 """Minimum share of possible matches: per snapshot, the smaller of the numbers of blobs and fiducials."""
 LEAST_LEAD = 1.3
 """Minimum ratio of matches to those of any pose that gives other labels."""
+EXTRINSICS = 6
+"""Number of a camera's first parameters that are its pose."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,11 @@ class Resected:
 
 
 def resect_camera(
-    blobs: Sequence[NDArray[np.float64]], points_rig: Tensor, camera: CameraRig, generator: np.random.Generator
+    blobs: Sequence[NDArray[np.float64]],
+    points_rig: Tensor,
+    camera: CameraRig,
+    std: Tensor,
+    generator: np.random.Generator,
 ) -> Resected | None:
     """Label the blobs of the last snapshot by the only pose of the camera that explains all snapshots.
 
@@ -49,6 +55,7 @@ def resect_camera(
         blobs: (M_s, 2) pixels for each of S snapshots.
         points_rig: (S, N, 3) mm, the fiducials.
         camera: a rig of one camera; only its lens is taken from it.
+        std: (1, K) its uncertainty; only that of the lens counts.
         generator: selects triples if there are many.
 
     Returns:
@@ -65,7 +72,7 @@ def resect_camera(
     count = sum((found >= 0).sum(1) for found in labels)
     best = int(np.argmax(count))
     first = [found[best] for found in labels]
-    fitted = _fit(camera, points_rig, blobs, first)
+    fitted = _fit(camera, std, points_rig, blobs, first)
     if fitted is None:
         return None
     inside = fitted.expand(len(points)).project(points_rig).visible[:, 0].sum(-1).numpy()
@@ -165,9 +172,13 @@ def _matches(
 
 
 def _fit(
-    camera: CameraRig, points_rig: Tensor, blobs: Sequence[NDArray[np.float64]], labels: list[NDArray[np.int64]]
+    camera: CameraRig,
+    std: Tensor,
+    points_rig: Tensor,
+    blobs: Sequence[NDArray[np.float64]],
+    labels: list[NDArray[np.int64]],
 ) -> CameraRig | None:
-    """Fit the camera's pose to its labels; None if there are too few."""
+    """Fit the camera's pose, and its lens within a standard deviation (1, K), to its labels; None if they are few."""
     snapshot = np.repeat(np.arange(len(labels)), [len(found) for found in labels])
     fiducial, uv = np.concatenate(labels), np.concatenate(list(blobs))
     rows = np.flatnonzero(fiducial >= 0)
@@ -178,15 +189,16 @@ def _fit(
     observations = Observations(
         given, torch.full_like(given[..., 0], 1.0), torch.ones_like(given[..., 0], dtype=torch.bool)
     )
-    fixed = torch.zeros(1, camera.num_parameters, dtype=points_rig.dtype)
+    lens = std.to(points_rig.dtype).clone()
+    lens[:, :EXTRINSICS] = 0.0
     fit = estimate(
         observations,
         camera,
         CalibrationObject(cloud, torch.ones_like(cloud)),
-        prior_std=fixed,
+        prior_std=lens,
         options=EstimationOptions(loss="cauchy"),
     )
-    return replace(camera, cam_from_rig=camera.cam_from_rig @ fit.rig_from_object[0].reshape(1))
+    return replace(fit.rig, cam_from_rig=camera.cam_from_rig @ fit.rig_from_object[0].reshape(1))
 
 
 def _pose(camera: CameraRig) -> NDArray[np.float64]:

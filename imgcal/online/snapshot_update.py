@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from torch import Tensor
 
-from imgcal.monitoring import MonitorUpdate, RigFilter, RigMonitor
+from imgcal.monitoring import MonitorUpdate, RigFilter, RigMonitor, far_turned_cameras
 from imgcal.online.drift_watch import DriftWatch
 from imgcal.online.events import Event
 from imgcal.online.keeper_memory import LEAST_LOOKS, KeeperMemory
@@ -30,10 +30,11 @@ def learn_snapshot(memory: KeeperMemory, checked: Checked) -> MonitorUpdate:
         RefusedError: see `RigMonitor.update`.
     """
     monitor, still_open, time = memory.monitor, memory.monitor.open, memory.time
-    off = {
-        camera: memory.off.get(camera, time)
-        for camera in np.flatnonzero(checked.off & (memory.looks >= LEAST_LOOKS)).tolist()
-    }
+    unsure = set(np.flatnonzero(checked.off & (memory.looks < LEAST_LOOKS)).tolist())
+    if unsure:
+        shown = memory.observed(checked.blobs), checked.rig_from_object
+        unsure -= far_turned_cameras(memory.belief, [shown], unsure)
+    off = {camera: memory.off.get(camera, time) for camera in set(np.flatnonzero(checked.off).tolist()) - unsure}
     waiting = [camera for camera in off if camera not in memory.off and camera not in still_open]
     moved = [camera for camera in off if camera in memory.off and camera not in still_open]
     fiducial = np.where(np.isin(checked.blobs.camera, waiting), -1, checked.blobs.fiducial)

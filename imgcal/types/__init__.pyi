@@ -15,6 +15,7 @@ from .limits import (
     check_rig,
     check_rig_shapes,
     find_repeated,
+    has_plausible_values,
 )
 from .moved_camera import Kind, MovedCamera, MovedError
 from .observations import Observations
@@ -76,6 +77,7 @@ __all__ = [
     "check_rig",
     "check_rig_shapes",
     "find_repeated",
+    "has_plausible_values",
     "limits",
     "object_difference",
     "pack21",

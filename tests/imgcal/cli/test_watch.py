@@ -256,23 +256,27 @@ def test_images_in_another_convention_are_named(blobs, stream, tmp_path, capsys)
     assert f"nothing could be learned from any snapshot: {UPSIDE_DOWN}" in capsys.readouterr().err
 
 
-def test_the_cause_of_the_first_refusals_is_told_once_and_only_before_anything_is_learned(blobs, stream):
+def test_the_cause_of_the_first_refusals_is_told_once_and_again_after_something_was_learned(blobs, stream):
     refusals, table = FirstRefusals(stream.rig, stream.obj), upside_down(blobs, stream.rig)
     states = [SimpleNamespace(refused="no", detections=table.of_snapshots(s, s + 1)) for s in range(30)]
-    told = [refusals.add(state, learned=False) for state in states for _ in range(2)]
-    while (cause := refusals.add(None, learned=False)) is None:
+    told = [refusals.add(state) for state in states for _ in range(2)]
+    while (cause := refusals.add(None)) is None:
         time.sleep(0.01)
     assert not any(told) and cause.startswith(UPSIDE_DOWN)
-    assert refusals.add(None, learned=False) is None and refusals.find_cause() == cause
-    learned = FirstRefusals(stream.rig, stream.obj)
-    assert not any(learned.add(state, learned=True) for state in states) and learned.find_cause() is None
+    assert refusals.add(None) is None and refusals.find_cause() == cause
+    for _ in range(2):
+        assert refusals.add(SimpleNamespace(refused=None, detections=blobs.of_snapshots(0, 1))) is None
+    assert refusals.find_cause() is None
+    for state in states[:5]:
+        refusals.add(state)
+    assert (refusals.find_cause() or "").startswith(UPSIDE_DOWN)
 
 
 def test_normalized_centres_are_told_as_such(blobs, stream):
     refusals, size = FirstRefusals(stream.rig, stream.obj), stream.rig.image_size.double().numpy()[blobs.camera]
     table = replace(blobs, uv=(blobs.uv + 0.5) / size)
     for s in range(5):
-        refusals.add(SimpleNamespace(refused="no", detections=table.of_snapshots(s, s + 1)), learned=False)
+        refusals.add(SimpleNamespace(refused="no", detections=table.of_snapshots(s, s + 1)))
     assert "normalized by the images' width and height" in refusals.find_cause()
 
 

@@ -30,7 +30,7 @@ def tries(monkeypatch):
     def nearby(*given):
         counts["nearby"] += 1
 
-    def anywhere(blobs, places, lens, generator):
+    def anywhere(blobs, places, lens, std, generator):
         counts["anywhere"] += 1
         assert len(blobs) == len(places) <= camera_search.ASKED_TOGETHER
 
@@ -140,7 +140,7 @@ def test_where_a_camera_was_found_it_is_found_again_without_a_search(stream, mon
     assert len(rows) >= 4
     asked = []
 
-    def anywhere(blobs, places, lens, generator):
+    def anywhere(blobs, places, lens, std, generator):
         asked.append(len(blobs))
         return None if len(asked) == 1 else Resected(rows, turned.select([CAMERA]))
 

@@ -15,7 +15,7 @@ from imgcal.errors import InputError
 from imgcal.monitoring import CHANGES
 from imgcal.online import Event, RigKeeper, RigState
 from imgcal.synthesis import simulate_volume, true_detections
-from imgcal.types import CameraRig, Detections, RigPrior
+from imgcal.types import CameraRig, Detections, RigPrior, check_rig
 from scripts.benchmarks.rig_streams import Bump, Conditions, Slip, Stream
 
 
@@ -244,6 +244,51 @@ def test_a_camera_that_turns_far_is_never_ok_and_is_found_again() -> None:
     assert last.change == "rotation" and last.size == pytest.approx(20.0, abs=0.5)
     assert last.since is not None and abs(last.since * 60 - 20) <= 1
     assert float(state.gauge.difference(state.rig, made.rig)[0, :3].norm()) < math.radians(0.2)
+
+
+def upside_down(made: Stream, count: int, since: int) -> tuple[list[Event], RigState]:
+    """Turn the images of the second camera by 180 degrees from a snapshot on."""
+    last, events = made.factory.image_size[1].numpy() - 1.0, []
+    with RigKeeper(made.factory, made.obj) as keeper:
+        for number, (time, blobs) in enumerate(made.snapshots(count)):
+            turned = (blobs.camera == 1)[:, None] & (number >= since)
+            state = keeper.update(replace(blobs, uv=np.where(turned, last - blobs.uv, blobs.uv)), time)
+            check_rig(state.rig)
+            events += state.events
+    return events, state
+
+
+def others(state: RigState, truth: CameraRig) -> float:
+    """RMS of the errors of all cameras but the second, which is turned, in standard deviations."""
+    roll = torch.zeros(truth.num_cameras, truth.num_parameters, dtype=torch.float64)
+    roll[1, 2] = math.pi
+    error = state.gauge.difference(state.rig, truth.retract(roll))
+    kept = [camera for camera in range(truth.num_cameras) if camera != 1]
+    return float((error / state.std)[kept].square().mean().sqrt())
+
+
+@pytest.mark.parametrize("labelled", [False, True])
+def test_a_camera_whose_images_turn_by_180_degrees_is_reported_as_that(labelled: bool) -> None:
+    made = stream(1, conditions=Conditions(labelled=labelled))
+    events, last = upside_down(made, 100, since=60)
+    assert {(event.kind, event.camera) for event in events} <= {("moved", "cam02"), ("relearnt", "cam02")}
+    moved = [event for event in events if event.kind == "moved"][-1]
+    assert moved.change == "rotation" and moved.size == pytest.approx(180.0, abs=0.5)
+    assert "its images are turned by 180 degrees" in moved.message
+    assert last.rig.focal_length[1].numpy() == pytest.approx(made.rig.focal_length[1].numpy(), rel=0.01)
+    assert others(last, made.rig) < 2.0
+
+
+@pytest.mark.parametrize(("seed", "labelled"), [(1, False), (2, False), (3, False), (1, True)])
+def test_a_camera_whose_images_are_turned_from_the_start_takes_nothing_with_it(seed: int, labelled: bool) -> None:
+    """The object was blamed, and the other cameras' rig was too small by several percent."""
+    made = stream(seed, conditions=Conditions(labelled=labelled))
+    made.obj = made.obj.as_exact()
+    events, last = upside_down(made, 160, since=0)
+    assert {event.camera for event in events} == {"cam02"}
+    assert not any(event.kind.startswith("object") for event in events)
+    assert any("its images are turned by 180 degrees" in event.message for event in events)
+    assert others(last, made.rig) < 2.0
 
 
 def test_a_camera_that_turns_away_is_in_doubt_at_once_and_then_lost() -> None:

@@ -14,11 +14,11 @@ def test_a_camera_is_known_again_when_it_is_known_as_well_as_before() -> None:
     rig, obj = imgcal.load_rig("T4").to(torch.float64), imgcal.load_object("asymmetric8")
     known = RigBelief.of_prior(rig, obj)
     relearning = Relearning(rig.camera_names)
-    first = relearning.report_change(Change(1, 0, "unknown", math.nan, math.nan), 1.0, 1.1, 4, known)
+    first = relearning.report_change(Change(1, 0, "unknown", math.nan, math.nan), 1.0, 1.1, 4, known, rig)
     assert (first.camera, first.change, first.size, first.message) == ("cam02", "unknown", None, "cam02 moved")
     assert first.evidence is None  # JSON knows no nan
     change = Change(1, 0, "rotation", math.radians(0.3), math.radians(0.01), evidence=812.0)
-    told = relearning.report_change(change, 1.0, 1.2, 8, known)
+    told = relearning.report_change(change, 1.0, 1.2, 8, known, rig)
     assert (told.change, told.unit, told.evidence) == ("rotation", "deg", 812.0)
     assert told.size == pytest.approx(0.3)
     assert told.message == "cam02 turned 0.3 +- 0.01 deg"
@@ -38,16 +38,29 @@ def test_a_camera_is_known_again_when_it_is_known_as_well_as_before() -> None:
 def test_of_two_cameras_it_is_said_that_it_may_be_the_other() -> None:
     rig, obj = imgcal.load_rig("T4").to(torch.float64).select([0, 2]), imgcal.load_object("asymmetric8")
     change = Change(1, 0, "unknown", math.nan, math.nan)
-    told = Relearning(rig.camera_names).report_change(change, 1.0, 1.1, 4, RigBelief.of_prior(rig, obj))
+    told = Relearning(rig.camera_names).report_change(change, 1.0, 1.1, 4, RigBelief.of_prior(rig, obj), rig)
     assert told.message == "cam03 moved, or cam01: with two cameras it is impossible to tell which"
 
 
 def test_a_shift_beside_a_turn_is_reported_in_the_message() -> None:
     rig, obj = imgcal.load_rig("T4").to(torch.float64), imgcal.load_object("asymmetric8")
     change = Change(1, 0, "rotation", math.radians(5), math.radians(0.02), also=(("position", 12.34, 0.52),))
-    told = Relearning(rig.camera_names).report_change(change, 1.0, 1.1, 4, RigBelief.of_prior(rig, obj))
+    told = Relearning(rig.camera_names).report_change(change, 1.0, 1.1, 4, RigBelief.of_prior(rig, obj), rig)
     assert told.message == "cam02 turned 5 +- 0.02 deg and was shifted by 12.3 +- 0.5 mm"
     assert (told.change, told.unit) == ("rotation", "deg")
+
+
+def test_images_that_are_turned_by_180_degrees_are_named() -> None:
+    rig, obj = imgcal.load_rig("T4").to(torch.float64), imgcal.load_object("asymmetric8")
+    step = torch.zeros(4, 15, dtype=torch.float64)
+    step[1, 2] = math.pi
+    change = Change(1, 0, "rotation", math.pi, math.radians(0.02))
+    known = RigBelief.of_prior(rig, obj)
+    told = Relearning(rig.camera_names).report_change(change, 1.0, 1.1, 4, known, rig.retract(step))
+    assert told.message == "cam02 turned 180 +- 0.02 deg: its images are turned by 180 degrees"
+    step[1, 2] = math.pi / 2
+    told = Relearning(rig.camera_names).report_change(change, 1.0, 1.1, 4, known, rig.retract(step))
+    assert told.message == "cam02 turned 180 +- 0.02 deg"
 
 
 def test_a_camera_that_may_be_anywhere_makes_no_other_one_uncertain() -> None:

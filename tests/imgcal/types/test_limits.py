@@ -9,7 +9,7 @@ import imgcal
 from imgcal.errors import InputError
 from imgcal.geometry import RigidTransform
 from imgcal.synthesis import simulate_truth, true_detections
-from imgcal.types import check_rig
+from imgcal.types import check_rig, has_plausible_values
 
 
 @pytest.fixture(scope="module")
@@ -158,3 +158,10 @@ def test_objects_that_cannot_be_are_refused(change, scene):
     rig, obj, detections = scene
     with pytest.raises(InputError, match="fiducial 0"):
         imgcal.calibrate(detections, rig, replace(obj, **change))
+
+
+def test_values_that_an_estimate_cannot_have_are_told_apart(scene):
+    rig, _, _ = scene
+    assert has_plausible_values(rig)
+    assert not has_plausible_values(replace(rig, focal_length=-rig.focal_length))
+    assert not has_plausible_values(replace(rig, distortion=rig.distortion * torch.nan))
