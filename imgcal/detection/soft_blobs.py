@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from imgcal.detection.centroids import Blobs
 from imgcal.detection.checks import Frame
 from imgcal.detection.options import DetectionOptions
+from imgcal.detection.populations import select_usable
 from imgcal.types import BlobFlag
 
 SOFT = 1.75  # px, blur of a soft blob: the windows suit blobs up to a blur of 2 px
@@ -27,8 +28,10 @@ _MERGED = np.uint8(BlobFlag.MERGED)
 
 
 def has_soft_blobs(blobs: Blobs, frame: Frame) -> bool:
-    """Check whether any blob of a frame is soft, and the frame large enough to be halved."""
-    return bool(_select_smooth(blobs, SOFT).any()) and min(frame.shape) >= LEAST_SIDE
+    """Check whether any usable blob of a frame is soft, and the frame large enough to be halved."""
+    if min(frame.shape) < LEAST_SIDE or blobs.blur.max(initial=0.0) < SOFT:  # nearly always
+        return False
+    return bool((_select_smooth(blobs, SOFT) & select_usable(blobs)).any())
 
 
 def halve_frame(frame: Frame, options: DetectionOptions, scale: int) -> tuple[Frame, DetectionOptions, int]:
