@@ -11,6 +11,7 @@ from imgcal.detection.centroids import Blobs, measure
 from imgcal.detection.checks import Frame
 from imgcal.detection.options import DetectionOptions
 from imgcal.detection.populations import DIMMER, select_usable, usual_size
+from imgcal.detection.soft_blobs import halve_frame, has_soft_blobs, replace_soft
 from imgcal.medians import median
 
 LARGER = 32.0  # px, largest radius that a search with the usual limit still finds
@@ -19,7 +20,7 @@ FEW = 4  # usable blobs of a frame below which the search for much larger ones i
 
 
 def find_blobs(frame: Frame, options: DetectionOptions, scale: int) -> Blobs:
-    """Find the blobs of a frame; their camera is 0.
+    """Find the blobs of a frame, and soft ones again at half its resolution; their camera is 0.
 
     Args:
         frame: (H, W) grey values.
@@ -28,8 +29,12 @@ def find_blobs(frame: Frame, options: DetectionOptions, scale: int) -> Blobs:
     """
     contiguous = frame if frame.flags.c_contiguous else frame.copy()
     if options.max_radius is None:
-        return _find_all_sizes(contiguous, options, scale)
-    return _find(contiguous, block_means(contiguous, options, scale), options, scale)
+        blobs = _find_all_sizes(contiguous, options, scale)
+    else:
+        blobs = _find(contiguous, block_means(contiguous, options, scale), options, scale)
+    if has_soft_blobs(blobs, frame):
+        return replace_soft(blobs, find_blobs(*halve_frame(frame, options, scale)))
+    return blobs
 
 
 def _find_all_sizes(frame: Frame, options: DetectionOptions, scale: int) -> Blobs:

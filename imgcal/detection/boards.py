@@ -91,7 +91,7 @@ def find_board(frame: Frame, board: Board) -> Blobs:
     sigma = corner_sigma(board.points[seen.fiducial, :2], seen.uv)
     flags = np.full(count, int(BlobFlag.NONE), dtype=np.uint8)
     camera, radius = np.zeros(count, dtype=np.int64), np.full(count, np.nan)
-    return Blobs(seen.uv, sigma, radius, flags, camera, np.ones(count), seen.fiducial)
+    return Blobs(seen.uv, sigma, radius, flags, camera, np.ones(count), seen.fiducial, np.zeros(count))
 
 
 def require_board(blobs: Sequence[Blobs], snapshots: Iterable[Mapping[str, Frame | None]], board: Board) -> None:
@@ -416,7 +416,7 @@ def _find_by_thresholds(grey: NDArray[np.uint8]) -> Blobs:
     count = len(uv)
     return Blobs(
         uv, np.full(count, UNKNOWN_SIGMA), radius, flags, np.zeros(count, np.int64), np.ones(count),
-        np.full(count, -1, np.int64),
+        np.full(count, -1, np.int64), np.zeros(count),
     )  # fmt: skip
 
 

@@ -29,6 +29,7 @@ class Blobs:
     camera: NDArray[np.int64]  # (K,) index of the frame
     contrast: NDArray[np.float64]  # (K,) brightest pixel above the background, share of full scale
     fiducial: NDArray[np.int64]  # (K,) label, -1 = unknown from the image
+    blur: NDArray[np.float64]  # (K,) pixels, Gaussian blur of the edge; 0 = unknown
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Blobs:
         """Keep some of the K blobs, given as a mask (K,) or as indices."""
@@ -73,7 +74,7 @@ def measure(frame: Frame, candidates: Candidates, options: DetectionOptions, sca
     count = len(boxes)
     blobs = Blobs(
         np.zeros((count, 2)), np.zeros(count), np.zeros(count), np.zeros(count, np.uint8), np.zeros(count, np.int64),
-        np.zeros(count), np.full(count, -1, np.int64),
+        np.zeros(count), np.full(count, -1, np.int64), np.zeros(count),
     )  # fmt: skip
     kept = np.zeros(count, np.bool_)
     saturation = 0.995 * scale if options.saturation is None else options.saturation
@@ -85,7 +86,7 @@ def measure(frame: Frame, candidates: Candidates, options: DetectionOptions, sca
         (candidates.tile, candidates.labels, boxes, candidates.label, candidates.whole),
         (scale, scale if options.polarity == "dark" else -1, float(saturation)),
         tuple(map(float, limits)),
-        (blobs.uv, blobs.sigma, blobs.radius, blobs.contrast, blobs.flags, kept),
+        (blobs.uv, blobs.sigma, blobs.radius, blobs.contrast, blobs.flags, blobs.blur, kept),
     )
     return blobs.select(_first(blobs, kept))
 

@@ -116,6 +116,7 @@ def detect_snapshot(
         camera,
         np.concatenate([np.zeros(0), *(blobs.contrast for blobs in found)]),
         np.concatenate([np.zeros(0, np.int64), *(blobs.fiducial for blobs in found)]),
+        np.concatenate([np.zeros(0), *(blobs.blur for blobs in found)]),
     )
     return blobs if whole_capture or board is not None else drop_dim([blobs], options)[0]
 

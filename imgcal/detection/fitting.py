@@ -51,11 +51,11 @@ def fit_centre(rows, pixels, start, clipped, noise):
         noise: standard deviation of a pixel.
 
     Returns:
-        Centre x, y; its information, 1 / px^2 for unit noise (mean of the axes, 0 where the fit has failed); and the
-        mean squared residual.
+        Centre x, y; its information, 1 / px^2 for unit noise (mean of the axes, 0 where the fit has failed); the mean
+        squared residual; and the blur of the edge (px).
     """
     now, known, cost = _descend(rows, pixels, start, clipped, noise)
-    first, left = (now[5], now[6], known, cost / max(pixels - PARAMETERS, 1)), pixels
+    first, left = (now[5], now[6], known, cost / max(pixels - PARAMETERS, 1), _find_blur(now)), pixels
     for _ in range(DEFECTS):
         if known == 0.0:
             cost = _draw(rows, left, now)  # the last residuals are those of a refused step
@@ -66,7 +66,13 @@ def fit_centre(rows, pixels, start, clipped, noise):
     freedom = max(left - PARAMETERS, 1)
     if left == pixels or cost > (CLEAN * noise) ** 2 * freedom:
         return first
-    return now[5], now[6], known, cost / freedom
+    return now[5], now[6], known, cost / freedom, _find_blur(now)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _find_blur(p):
+    """Blur of the edge of an ellipse (px)."""
+    return (p[2] * p[4] - p[3] * p[3]) ** -0.25
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -53,7 +53,7 @@ def measure_all(frame, candidates, levels, limits, blobs):
     """
     tile, labels, boxes, label, whole = candidates
     full_scale, invert, saturation = levels
-    uv, sigma, radius, contrast, flags, kept = blobs
+    uv, sigma, radius, contrast, flags, blur, kept = blobs
     widest = 0
     for k in range(len(boxes)):
         widest = max(widest, half_size(boxes[k], whole[k]))
@@ -98,7 +98,7 @@ def measure_all(frame, candidates, levels, limits, blobs):
             start = start_ellipse(peak, radius[k], clipped, moments, middle)
             count = _gather(grey, x, y, own, other, spare, plane, saturation if clipped else 1e9, start, fit)
             if count > PARAMETERS:
-                x0, y0, known, residual = fit_centre(fit, count, start, clipped, noise)
+                x0, y0, known, residual, blur[k] = fit_centre(fit, count, start, clipped, noise)
         fits = known * radius[k] ** 2 > max(noise**2, residual) and residual - noise**2 < (MISFIT * peak) ** 2
         if fits and (x0 - middle[0]) ** 2 + (y0 - middle[1]) ** 2 < FARTHEST**2:
             variance = max(noise**2, residual) / known + (slope * brightness / known) ** 2

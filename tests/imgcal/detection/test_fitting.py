@@ -51,9 +51,17 @@ def test_the_centre_of_a_clean_disc_is_found(radius: float, squeeze: float) -> N
     centre = np.array([0.37, -0.21])
     grey = disc(centre, radius, squeeze=squeeze, angle=0.5)
     start = begin(grey, radius * np.sqrt(squeeze), centre + np.array([0.15, -0.1]))
-    u, v, known, residual = fitted(grey, start, 1.0)
+    u, v, known, residual, _ = fitted(grey, start, 1.0)
     np.testing.assert_allclose((u, v), centre, atol=0.01)
     assert known > 0 and residual < (0.01 * 200) ** 2
+
+
+@pytest.mark.parametrize("radius", [4.0, 8.0])
+@pytest.mark.parametrize("blur", [0.7, 1.5, 2.5])
+def test_the_blur_of_the_edge_is_found(radius: float, blur: float) -> None:
+    grey = disc((0.37, -0.21), radius, blur=blur)
+    *_, found = fitted(grey, begin(grey, np.sqrt(grey.sum() / grey.max() / np.pi), (0.37, -0.21)), 1.0)
+    np.testing.assert_allclose(found, np.hypot(blur, 12**-0.5), rtol=0.06)  # with the pixel's own width
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -61,7 +69,7 @@ def test_noisy_discs_end_where_scipy_ends(seed: int) -> None:
     centre = np.random.default_rng(seed).uniform(-0.5, 0.5, 2)
     grey = disc(centre, 5.0, noise=3.0, seed=seed)
     start = begin(disc(centre, 5.0), 5.0, (0.0, 0.0))
-    u, v, known, residual = fitted(grey, start, 3.0)
+    u, v, known, residual, _ = fitted(grey, start, 3.0)
     best = least_squares(lambda p: (model(p) - grey).ravel(), start, x_scale="jac")
     assert np.hypot(u - best.x[5], v - best.x[6]) < 0.1 / np.sqrt(known) * 3.0  # a tenth of its sigma
     assert residual == pytest.approx(2 * best.cost / (grey.size - PARAMETERS), rel=0.01)
@@ -82,14 +90,14 @@ def test_a_clipped_disc_is_found_without_its_top() -> None:
     centre = np.array([-0.3, 0.4])
     grey = np.minimum(disc(centre, 5.0, contrast=600.0), 235.0)
     rows = grey < 234.0
-    u, v, known, _ = fitted(grey, begin(grey, 5.0, (0.0, 0.0), clipped=True), 1.0, True, rows)
+    u, v, known, *_ = fitted(grey, begin(grey, 5.0, (0.0, 0.0), clipped=True), 1.0, True, rows)
     np.testing.assert_allclose((u, v), centre, atol=0.03)
     assert known > 0
 
 
 def test_what_is_no_blob_says_that_nothing_is_known() -> None:
     grey = np.random.default_rng(0).normal(0, 3.0, X.shape)
-    _, _, known, _ = fitted(grey, begin(disc((0.0, 0.0), 4.0), 4.0, (0.0, 0.0)), 3.0)
+    known = fitted(grey, begin(disc((0.0, 0.0), 4.0), 4.0, (0.0, 0.0)), 3.0)[2]
     assert known < 0.1 * fitted(disc((0.0, 0.0), 4.0), begin(disc((0.0, 0.0), 4.0), 4.0, (0.0, 0.0)), 3.0)[2]
 
 
