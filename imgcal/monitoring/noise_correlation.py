@@ -42,7 +42,11 @@ WITHHELD_SECONDS, MOST_WITHHELD = 2.0, 0.25
 found, the shift of its image would pass for a persistent error that hides it."""
 USUAL, USUAL_SECONDS, USUAL_SNAPSHOTS = 0.4, 0.1, 256
 """Autocorrelation of the errors of infrared cameras at short intervals, its decay time (s, to 1/e), and the number of
-snapshots until which a calibrated rig is assumed to have no less: fewer snapshots cannot tell."""
+snapshots until which a rig is assumed to have no less, unless its errors seem to be independent."""
+INDEPENDENT = 0.5
+"""Share of the usual autocorrelation from one snapshot to the next below which the measured one must be, by two
+standard deviations, for the errors of an uncalibrated rig to seem independent. On the recorded wand it is 0.1 to 0.4
+after 48 snapshots (the usual one is 0.34 at 60 Hz), in simulations at most 0.08."""
 
 # Time between snapshots.
 FASTEST, SLOWEST = 1 / 60, 1.0
@@ -93,7 +97,10 @@ class NoiseCorrelation:
     lasting: Tensor = field(init=False)  # (C,) px, one standard deviation of a persistent image shift
     shifts: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=MEMORY_SNAPSHOTS))  # (C, 2) px
     taken: int = 0  # snapshots
-    usual: float = 1.0  # least correlation time until enough snapshots are taken
+    usual: float = (
+        1.0  # least correlation time until enough snapshots are taken; of an uncalibrated rig, in weights only
+    )
+    calibrated: bool = field(default=True, metadata={"saved": False})  # it started with a calibration's result
     interval: float = 0.0  # s between snapshots; 0 = unknown
     settled_at: dict[int, int] = field(default_factory=dict)  # snapshot number from which a changed camera counts again
     scale: Tensor = field(init=False)  # (C,) px, scale of the shifts' t distribution
@@ -113,11 +120,23 @@ class NoiseCorrelation:
         if seconds > PAUSE * (self.interval or FASTEST):
             self.off = torch.full_like(self.off, math.nan)
 
-    def expect_usual(self) -> None:
-        """Assume the usual correlation at this rate until enough snapshots have been taken."""
+    def expect_usual(self, calibrated: bool = True) -> None:
+        """Assume the usual correlation at this rate until enough snapshots have been taken.
+
+        An uncalibrated rig must not seem to be known too well too early, but its cameras are tested as if nothing were
+        assumed: they have not settled. Its assumption ends when its errors seem to be independent.
+        """
+        self.calibrated = calibrated
+        if not calibrated and (not self.interval or (self.usual == 1.0 and self.taken >= FIRST_MEASUREMENTS[0])):
+            return
         self.usual = usual_time(self.interval) if self.taken < USUAL_SNAPSHOTS else 1.0
-        if self.taken < FIRST_MEASUREMENTS[0]:
+        if calibrated and self.taken < FIRST_MEASUREMENTS[0]:
             self.time = torch.full_like(self.time, self.usual)
+
+    @property
+    def assumed_time(self) -> Tensor:
+        """Correlation time by which snapshots are weighed: (C,) snapshots."""
+        return self.time.clamp_min(self.usual)
 
     @property
     def model_error(self) -> Tensor:
@@ -169,9 +188,10 @@ class NoiseCorrelation:
             observations: of a snapshot.
             least: (N,) factors on the standard deviations because of an object at rest, see `Rest`.
         """
-        if not bool((self.time > 1).any() or (least > 1).any()):
+        time = self.assumed_time
+        if not bool((time > 1).any() or (least > 1).any()):
             return observations
-        root = (self.time / self._weight).sqrt()[:, None]
+        root = (time / self._weight).sqrt()[:, None]
         self.off = torch.full_like(self.off, math.nan)
         shake = None if observations.shake is None else observations.shake * root.maximum(least.min())[:, 0]
         return replace(observations, sigma=observations.sigma * root.maximum(least), shake=shake)
@@ -216,8 +236,10 @@ class NoiseCorrelation:
         seen = np.isfinite(series[..., 0])
         variance = np.nansum(np.square(series), axis=(0, 2)) / (2 * np.maximum(seen.sum(0), 1))
         whitened = series / np.sqrt(np.maximum(variance, 1e-12))[:, None]
+        if not self.calibrated and self._seem_independent(whitened):
+            self.usual = 1.0
         together = float(correlation_time(whitened[:, None])[0])
-        time = np.maximum(correlation_time(series), max(together, self.usual))
+        time = np.maximum(correlation_time(series), max(together, self.usual if self.calibrated else 1.0))
         self.time = torch.from_numpy(time)
         # A passing error is rare and large: the tail of the distribution shows it better than the variance.
         length = np.where(seen, np.linalg.norm(series, axis=-1), np.nan)
@@ -225,6 +247,13 @@ class NoiseCorrelation:
         self.lasting = torch.from_numpy(np.where(time > 1, tail / TAIL_SIGMAS, 0.0))
         usual = np.nan_to_num(median_of_known(length))
         self.scale = torch.from_numpy(np.maximum(usual / MEDIAN, LEAST_LASTING))
+
+    def _seem_independent(self, whitened: NDArray[np.float64]) -> bool:
+        """Tell whether successive shifts (T, C, 2) of all cameras are clearly less alike than usual errors."""
+        products = whitened[1:] * whitened[:-1]
+        count = int(np.isfinite(products).sum())
+        usual = USUAL * math.exp(-(self.interval or FASTEST) / USUAL_SECONDS)
+        return count > 0 and float(np.nanmean(products)) + 2 / math.sqrt(count) < INDEPENDENT * usual
 
 
 def usual_time(seconds: float) -> float:

@@ -170,8 +170,7 @@ class RigMonitor:
             result = absorb(self.filter.belief, observations, rig_from_object, self.filter.options)
             return MonitorUpdate(replace(result, belief=self.filter.belief), learnt=False)
         seconds = self.rest.pause()
-        if self.filter.calibrated:
-            self.noise.expect_usual()
+        self.noise.expect_usual(self.filter.calibrated)
         observations = self.noise.weigh(self.shaking.apply_to(observations), least)
         new = [camera for camera in moved if camera not in self.quarantine.cameras]
         if new:
@@ -190,11 +189,11 @@ class RigMonitor:
         if not self.rest.began:  # the errors of a rest are not those of other snapshots
             return
         self.shaking.observe(observations, residual)
-        before = self.noise.time
+        before, assumed = self.noise.time, self.noise.assumed_time
         self.noise.add(observations, residual)
         if self.noise.time is not before:
             self._recent.lasting = self.noise.model_error
-            self.filter.rescale((self.noise.time / before).sqrt())
+            self.filter.rescale((self.noise.assumed_time / assumed).sqrt())
 
     def seen_points(self, camera: int) -> Tensor:
         """Where a camera has lately seen fiducials or lights: (P, 3) mm in the rig's frame."""

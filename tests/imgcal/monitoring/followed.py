@@ -1,4 +1,4 @@
-"""A stream that a filter follows without tests for changes."""
+"""A stream that a filter follows without tests for changes, and a monitor that expects independent errors."""
 
 from dataclasses import dataclass
 
@@ -6,8 +6,8 @@ import torch
 
 import imgcal
 from imgcal.geometry import RigidTransform
-from imgcal.monitoring import RecentSnapshots, RigBelief, RigFilter
-from imgcal.types import Observations
+from imgcal.monitoring import RecentSnapshots, RigBelief, RigFilter, RigMonitor
+from imgcal.types import CalibrationObject, CameraRig, Observations
 from scripts.benchmarks.rig_streams import Conditions, Stream
 
 
@@ -39,3 +39,10 @@ def followed(count: int, seed: int = 5, rate: float = 60.0, **happened) -> Follo
         beliefs.append(follows.belief)
         snapshots.append((observations, result.rig_from_object))
     return Followed(stream, follows, recent, beliefs, snapshots)
+
+
+def monitor_of(rig: CameraRig, obj: CalibrationObject) -> RigMonitor:
+    """Monitor a rig whose errors are not expected to last: those of a simulation do not."""
+    monitor = RigMonitor(RigFilter(rig, obj))
+    monitor.noise.expect_usual = lambda calibrated: None  # type: ignore[method-assign]
+    return monitor

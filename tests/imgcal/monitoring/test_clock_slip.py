@@ -6,8 +6,8 @@ import pytest
 
 import imgcal
 from imgcal.estimation import initial_pose
-from imgcal.monitoring import RigFilter, RigMonitor
 from scripts.benchmarks.rig_streams import Bump, Conditions, Slip, Stream
+from tests.imgcal.monitoring.followed import monitor_of
 
 BEFORE = 40
 
@@ -15,7 +15,7 @@ BEFORE = 40
 def told(**happened) -> tuple[list, list]:
     """Follow a rig until something is told: changes, and slips."""
     stream = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 5, Conditions(labelled=True), **happened)
-    monitor, pose = RigMonitor(RigFilter(stream.factory, stream.obj)), None
+    monitor, pose = monitor_of(stream.factory, stream.obj), None
     seen, _ = stream.labelled(0, BEFORE + 30)
     for number in range(BEFORE + 30):
         observations = seen.of_snapshots([number])

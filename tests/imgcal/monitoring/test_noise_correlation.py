@@ -95,6 +95,21 @@ def test_a_calibrated_rig_expects_what_is_usual_until_it_knows_better() -> None:
     assert float(noise.time.max()) < 3
 
 
+@pytest.mark.parametrize(("lasting", "ends"), [(0.0, True), (0.5, False)])
+def test_an_uncalibrated_rig_is_weighed_as_usual_unless_its_errors_seem_independent(lasting: float, ends: bool) -> None:
+    generator, noise, error = torch.Generator().manual_seed(1), NoiseCorrelation(4), 0.0
+    for number in range(128):
+        noise.pass_time(FASTEST)
+        noise.expect_usual(calibrated=False)
+        fresh = torch.randn(1, 4, 1, 2, generator=generator, dtype=torch.float64)
+        error = lasting * error + (1 - lasting**2) ** 0.5 * fresh  # of the whole image
+        noise.add(observations(4), error.expand(1, 4, 5, 2))
+        if number < FIRST_MEASUREMENTS[0] - 1:
+            assert noise.time.tolist() == [1.0] * 4  # cameras are tested as if nothing were assumed
+            assert noise.assumed_time.tolist() == pytest.approx([usual_time(FASTEST)] * 4)
+    assert (noise.usual == 1.0) == ends and (float(noise.assumed_time.min()) < 2) == ends
+
+
 @pytest.mark.parametrize("late", [6, 60, 120])
 def test_a_shift_that_has_begun_lately_is_no_persistent_error_yet(late: int) -> None:
     noise = follow([0.9, 0.9], count=1024 - late)

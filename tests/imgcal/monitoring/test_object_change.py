@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import imgcal
-from imgcal.monitoring import SHAPE, RigBelief, RigFilter, RigMonitor, absorb, object_change
+from imgcal.monitoring import SHAPE, RigBelief, RigFilter, absorb, object_change
 from imgcal.monitoring.case import Case
 from imgcal.monitoring.explanations import weigh
 from imgcal.monitoring.object_change import (
@@ -21,6 +21,7 @@ from imgcal.monitoring.object_change import (
 from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import Observations
 from renderers import palette
+from tests.imgcal.monitoring.followed import monitor_of
 
 NOISE = 0.1
 
@@ -32,7 +33,7 @@ def test_a_change_of_the_object_is_told_and_learnt(fiducial: int | None, toleran
     if tolerance:
         obj = replace(obj, tolerance=torch.full((8,), tolerance, dtype=torch.float64), scale_tolerance=1e-4)
     truth = simulate_truth(factory, obj, 60, generator, PhysicalDrift())
-    monitor, points, told, found = RigMonitor(RigFilter(factory, obj)), obj.points.clone(), [], None
+    monitor, points, told, found = monitor_of(factory, obj), obj.points.clone(), [], None
     for s in range(60):
         if s == 45 and fiducial is not None:
             points[fiducial] += torch.tensor([0.6, -0.5, 0.6])
@@ -55,7 +56,7 @@ def test_a_change_of_the_object_is_told_and_learnt(fiducial: int | None, toleran
 def test_a_single_camera_does_not_tell_a_change_of_the_object_from_a_wrong_label() -> None:
     factory, obj, generator = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), torch.Generator().manual_seed(3)
     truth = simulate_truth(factory, obj, 70, generator, PhysicalDrift())
-    monitor, points, told, found = RigMonitor(RigFilter(factory, obj)), obj.points.clone(), [], []
+    monitor, points, told, found = monitor_of(factory, obj), obj.points.clone(), [], []
     for s in range(70):
         if s == 45:
             points[2] += torch.tensor([3.0, -2.5, 3.0])
@@ -78,7 +79,7 @@ def test_another_object_of_the_same_design_is_told_as_that_and_no_camera_is_blam
     generator = torch.Generator().manual_seed(seed)
     truth = simulate_truth(factory, obj, 40, generator, PhysicalDrift())
     other = obj.points + spread * torch.randn(8, 3, generator=generator, dtype=torch.float64)
-    monitor, told, found = RigMonitor(RigFilter(factory, obj)), [], []
+    monitor, told, found = monitor_of(factory, obj), [], []
     for s in range(40):
         image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(other if s >= 30 else obj.points))
         uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
@@ -105,7 +106,7 @@ def test_a_fiducial_that_never_was_where_the_file_says_is_told() -> None:
     factory, obj, generator = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), torch.Generator().manual_seed(8)
     truth, points = simulate_truth(factory, obj, 16, generator, PhysicalDrift()), obj.points.clone()
     points[5] += torch.tensor([0.6, -0.5, 0.6])
-    monitor, found, told = RigMonitor(RigFilter(factory, obj)), [], []
+    monitor, found, told = monitor_of(factory, obj), [], []
     for s in range(16):
         image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(points))
         uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)
@@ -124,7 +125,7 @@ def test_an_object_that_never_was_as_its_file_says_is_told_however_it_is_turned(
     generator = torch.Generator().manual_seed(seed)
     truth = simulate_truth(factory, obj, 16, generator, PhysicalDrift())
     other = obj.points + 0.15 * torch.randn(8, 3, generator=generator, dtype=torch.float64)
-    monitor, found = RigMonitor(RigFilter(factory, obj)), []
+    monitor, found = monitor_of(factory, obj), []
     for s in range(16):
         image = truth.rig.expand(1).project(truth.rig_from_object[s : s + 1].apply(other))
         uv = image.uv + NOISE * torch.randn(image.uv.shape, generator=generator, dtype=torch.float64)

@@ -10,7 +10,7 @@ import torch
 import imgcal
 from imgcal.errors import RefusedError
 from imgcal.geometry import RigidTransform
-from imgcal.monitoring import CHANGES, Change, RigFilter, RigMonitor, explanations
+from imgcal.monitoring import CHANGES, Change, RigMonitor, explanations
 from imgcal.monitoring.case import Case
 from imgcal.monitoring.change_search import ALARM_CHI2
 from imgcal.monitoring.explanations import Diagnosis, Steady, Verdict, weigh
@@ -20,6 +20,7 @@ from imgcal.synthesis import PhysicalDrift, simulate_truth
 from imgcal.types import CameraRig, Observations
 from scripts.benchmarks.rig_streams import Bump, Conditions, Slip, Stream
 from tests.imgcal.monitoring.followed import followed as steadily
+from tests.imgcal.monitoring.followed import monitor_of
 
 NOISE = 0.1
 SIZES = {"rotation": math.radians(0.1), "position": 1.0, "focal_length": 3.0, "principal_point": 1.0}
@@ -43,7 +44,7 @@ def followed(
         torch.Generator().manual_seed(seed),
     )
     truth = simulate_truth(factory, obj, count, generator, PhysicalDrift())
-    monitor, rig, told = RigMonitor(RigFilter(factory, obj)), truth.rig, []
+    monitor, rig, told = monitor_of(factory, obj), truth.rig, []
     for s in range(count):
         for camera, kind in bumps.get(s, {}).items():
             part, step = CHANGES[kind], torch.zeros(4, 15, dtype=torch.float64)
@@ -160,7 +161,7 @@ def test_the_others_stay_known() -> None:
 def test_a_large_turn_is_learnt_whether_it_was_announced_or_not(told_before: bool) -> None:
     factory, obj, generator = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), torch.Generator().manual_seed(6)
     truth = simulate_truth(factory, obj, 26, generator, PhysicalDrift())
-    monitor, rig, told, refused = RigMonitor(RigFilter(factory, obj)), truth.rig, [], 0
+    monitor, rig, told, refused = monitor_of(factory, obj), truth.rig, [], 0
     for s in range(26):
         if s == 20:
             step = torch.zeros(4, 15, dtype=torch.float64)
@@ -199,7 +200,7 @@ def test_of_a_camera_that_moves_within_the_first_snapshots_no_other_and_no_objec
     times = torch.arange(50, dtype=torch.float64) / seen.rate
     made.frequency = made.frequency * seen.rate / 60
     poses, (observations, rigs) = made.poses_at(times), made.labelled(0, 50)
-    monitor, told, restarts = RigMonitor(RigFilter(made.factory, made.obj)), [], 0
+    monitor, told, restarts = monitor_of(made.factory, made.obj), [], 0
     for s in range(50):
         one = observations.of_snapshots([s])
         found = monitor.update(one, poses[s : s + 1], 1 / seen.rate)
@@ -217,7 +218,7 @@ def test_a_camera_of_which_it_cannot_be_told_yet_is_undecided_until_it_is() -> N
     conditions = Conditions(labelled=True, rate=30.0)
     made = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 23, conditions, [bump])
     poses, (observations, _) = made.poses_at(torch.arange(60, dtype=torch.float64) / 30), made.labelled(0, 60)
-    monitor, told, undecided = RigMonitor(RigFilter(made.factory, made.obj)), [], []
+    monitor, told, undecided = monitor_of(made.factory, made.obj), [], []
     for s in range(60):
         one = observations.of_snapshots([s])
         told += [(s, change.camera) for change in monitor.update(one, poses[s : s + 1], 1 / 30).changes]
@@ -229,7 +230,7 @@ def test_a_camera_of_which_it_cannot_be_told_yet_is_undecided_until_it_is() -> N
 
 
 def test_an_undecided_camera_is_weighed_less_and_less_often(monkeypatch) -> None:
-    """It is late from the first snapshot on, which takes some thirty snapshots to tell."""
+    """It is late from the first snapshot on, which takes some forty snapshots to tell."""
     made = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 0, Conditions(), slips=[Slip(0, 1, 0.02)])
     states, weighed = list[imgcal.RigState](), list[int]()
 
@@ -243,8 +244,8 @@ def test_an_undecided_camera_is_weighed_less_and_less_often(monkeypatch) -> None
         for time, blobs in made.snapshots(40):
             states.append(keeper.update(blobs, time))
     late = [n for n in weighed if n >= 20]
-    assert late and len(late) <= 6  # of twenty snapshots
-    assert weighed[0] < 5
+    assert late and len(late) <= 8  # of twenty snapshots
+    assert weighed[0] <= 5
 
 
 def watched(stream: Stream, count: int) -> list[tuple[int, int]]:
@@ -252,7 +253,7 @@ def watched(stream: Stream, count: int) -> list[tuple[int, int]]:
     seen, _ = stream.labelled(0, count)
     rate = stream.conditions.rate
     poses = stream.poses_at(torch.arange(count, dtype=torch.float64) / rate)
-    monitor, told = RigMonitor(RigFilter(stream.factory, stream.obj)), []
+    monitor, told = monitor_of(stream.factory, stream.obj), []
     for number in range(count):
         with contextlib.suppress(RefusedError):
             found = monitor.update(seen.of_snapshots([number]), poses[number : number + 1], 1 / rate)
@@ -281,7 +282,7 @@ def test_a_camera_that_was_held_and_surely_stands_still_is_learnt_from_what_it_s
     made = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 4, Conditions(labelled=True))
     seen, _ = made.labelled(0, 40)
     poses = made.poses_at(torch.arange(40, dtype=torch.float64) / 60)
-    monitor, learnt = RigMonitor(RigFilter(made.factory, made.obj)), []
+    monitor, learnt = monitor_of(made.factory, made.obj), []
     restart = monitor.filter.restart
     monitor.filter.restart = lambda *given, **new: learnt.append(len(given[1])) or restart(*given, **new)  # type: ignore[method-assign, func-returns-value]
     monkeypatch.setattr(Diagnosis, "decide", lambda _, case, patient: weigh(case, [Steady()]))
@@ -297,7 +298,7 @@ def test_an_error_that_begins_in_quarantine_may_pass_too() -> None:
     poses = made.poses_at(torch.arange(240, dtype=torch.float64) / 60)
     seen, _ = made.labelled(0, 240)
     seen.uv[95:110, 2] += 2.5
-    monitor, told = RigMonitor(RigFilter(made.factory, made.obj)), []
+    monitor, told = monitor_of(made.factory, made.obj), []
     monitor.noise.usual = 2.0  # errors last, as on real streams
     monitor.noise.time = torch.full((4,), 2.0, dtype=torch.float64)
     for number in range(240):
@@ -313,7 +314,7 @@ def test_of_two_cameras_in_quarantine_only_the_one_whose_image_is_shifted_has_mo
     made = Stream(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 4, Conditions(labelled=True), bumps=[bump])
     poses = made.poses_at(torch.arange(120, dtype=torch.float64) / 60)
     seen, _ = made.labelled(0, 120)
-    monitor, told = RigMonitor(RigFilter(made.factory, made.obj)), []
+    monitor, told = monitor_of(made.factory, made.obj), []
     monitor.noise.usual = 2.0  # errors last, as on real streams
     monitor.noise.time = torch.full((4,), 2.0, dtype=torch.float64)
     for number in range(120):
@@ -327,7 +328,7 @@ def test_of_two_cameras_in_quarantine_only_the_one_whose_image_is_shifted_has_mo
 
 @pytest.mark.parametrize(("shifts", "shifted"), [((2.0, 2.0), (2,)), ((2.0, 0.0), ()), ((2.0, 2.0, 0.0), (2,))])
 def test_a_camera_that_sees_the_object_in_its_place_again_has_not_moved(shifts: tuple[float, ...], shifted) -> None:
-    made, monitor = steadily(20), RigMonitor(RigFilter(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")))
+    made, monitor = steadily(20), monitor_of(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"))
     monitor.noise.time[:], monitor.noise.lasting[:] = 4.0, 0.05
     latest = []
     for (observations, pose), shift in zip(made.snapshots[-len(shifts) :], shifts, strict=True):
@@ -348,7 +349,7 @@ def test_a_camera_that_sees_the_object_in_its_place_again_has_not_moved(shifts: 
     ],
 )
 def test_an_error_that_fades_when_an_episode_ends_may_pass(shifts: tuple[float, ...], episode: int, fades) -> None:
-    made, monitor = steadily(20), RigMonitor(RigFilter(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")))
+    made, monitor = steadily(20), monitor_of(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"))
     monitor.filter, monitor._recent = made.filter, made.recent
     monitor.noise.time[:], monitor.noise.lasting[:] = 4.0, 0.05
     monitor.quarantine.add([2], uncertain=False)

@@ -48,7 +48,7 @@ def test_an_object_that_is_not_as_its_file_says_is_told_and_learnt(
     keeper, points, (event,), refused = watched(change, SINCE + 30)
     assert (event.kind, event.camera) == (kind, None)
     assert event.size is not None and event.sigma is not None and event.since is not None
-    assert abs(event.size - size) < 5 * event.sigma < 0.2 * size
+    assert abs(event.size - size) < 5 * event.sigma < 0.25 * size
     assert abs(60 * event.since - SINCE) <= 1
     assert refused <= LATEST
     off = keeper.belief.points_object - points

@@ -72,6 +72,14 @@ def test_a_rig_that_stands_still_raises_no_alarm_and_a_turned_camera_is_reported
     assert {kind for _, kind, _ in reported} <= {"moved", "relearnt"}
 
 
+def test_a_rig_that_begins_with_its_factory_calibration_raises_no_alarm(recording) -> None:
+    """Its errors last: taken for independent, half a second of labels at the edge of an image is too certain."""
+    factory, obj, blobs = recording
+    with imgcal.RigKeeper(factory, obj) as keeper:
+        events = [e for number, one in frames(blobs, 0, 450) for e in keeper.update(one, number / RATE).events]
+    assert {(event.kind, event.camera) for event in events if event.kind not in QUIET} == set()
+
+
 def test_a_camera_that_was_turned_far_is_reported_once_and_then_stays_known(recording, calibrated) -> None:
     """It is at odds with the rig for 50 frames before the kind of its change is certain."""
     _, obj, blobs = recording
