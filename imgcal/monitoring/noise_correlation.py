@@ -97,9 +97,7 @@ class NoiseCorrelation:
     lasting: Tensor = field(init=False)  # (C,) px, one standard deviation of a persistent image shift
     shifts: deque[NDArray[np.float64]] = field(default_factory=lambda: deque(maxlen=MEMORY_SNAPSHOTS))  # (C, 2) px
     taken: int = 0  # snapshots
-    usual: float = (
-        1.0  # least correlation time until enough snapshots are taken; of an uncalibrated rig, in weights only
-    )
+    usual: float = 1.0  # least correlation time until enough snapshots are taken, see `expect_usual`
     calibrated: bool = field(default=True, metadata={"saved": False})  # it started with a calibration's result
     interval: float = 0.0  # s between snapshots; 0 = unknown
     settled_at: dict[int, int] = field(default_factory=dict)  # snapshot number from which a changed camera counts again
@@ -123,8 +121,8 @@ class NoiseCorrelation:
     def expect_usual(self, calibrated: bool = True) -> None:
         """Assume the usual correlation at this rate until enough snapshots have been taken.
 
-        An uncalibrated rig must not seem to be known too well too early, but its cameras are tested as if nothing were
-        assumed: they have not settled. Its assumption ends when its errors seem to be independent.
+        For an uncalibrated rig, this holds for the weights of snapshots alone, which must not seem to teach too much too
+        early; its cameras are tested for changes as before. It ends when errors seem to be independent.
         """
         self.calibrated = calibrated
         if not calibrated and (not self.interval or (self.usual == 1.0 and self.taken >= FIRST_MEASUREMENTS[0])):
