@@ -121,8 +121,8 @@ class NoiseCorrelation:
     def expect_usual(self, calibrated: bool = True) -> None:
         """Assume the usual correlation at this rate until enough snapshots have been taken.
 
-        For an uncalibrated rig, this holds for the weights of snapshots alone, which must not seem to teach too much too
-        early; its cameras are tested for changes as before. It ends when errors seem to be independent.
+        For an uncalibrated rig, this holds for the weights of snapshots alone, which must not seem to teach too much
+        too early; its cameras are tested for changes as before. It ends when errors seem to be independent.
         """
         self.calibrated = calibrated
         if not calibrated and (not self.interval or (self.usual == 1.0 and self.taken >= FIRST_MEASUREMENTS[0])):
