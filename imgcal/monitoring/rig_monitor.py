@@ -170,7 +170,8 @@ class RigMonitor:
             result = absorb(self.filter.belief, observations, rig_from_object, self.filter.options)
             return MonitorUpdate(replace(result, belief=self.filter.belief), learnt=False)
         seconds = self.rest.pause()
-        self.noise.expect_usual(self.filter.calibrated)
+        if self.filter.calibrated or horizon is None:  # within a horizon, errors do not add up
+            self.noise.expect_usual(self.filter.calibrated)
         observations = self.noise.weigh(self.shaking.apply_to(observations), least)
         new = [camera for camera in moved if camera not in self.quarantine.cameras]
         if new:
