@@ -147,7 +147,7 @@ def fill(page: Path, sections: Mapping[str, str]) -> None:
 def publish(result: dict[str, Any], out: Path, official: Path, page: Path, name: str, table: str) -> None:
     """Write a result and print its table; write the official one's into its page as well, where `name` marks it."""
     write_json(out, result)
-    if out == official:
+    if out.resolve() == official.resolve():
         fill(page, {name: table})
     print(table)
 
