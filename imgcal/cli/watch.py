@@ -33,7 +33,6 @@ from imgcal.watch import (
     SUBJECTS,
     BlobTable,
     EarlierRun,
-    FirstRefusals,
     Folder,
     Hook,
     JsonLines,
@@ -46,6 +45,7 @@ from imgcal.watch import (
     Poses,
     Progress,
     Qualisys,
+    RefusalCauses,
     Source,
     SourceReader,
     Tally,
@@ -90,7 +90,7 @@ class Watch(arguments.Watch):
         intake = SourceReader(source, rig, Timing(self.tolerance, self.patience), self.keep_all, known=earlier.known)
         hook = None if self.hook is None else Hook(self.hook)
         display = Display(Output(file=sys.stdout, soft_wrap=True), intake, hook)
-        refusals = FirstRefusals(rig, obj)
+        refusals = RefusalCauses(rig, obj)
         with contextlib.ExitStack() as stack:
             keeper = stack.enter_context(self._open_keeper(earlier.state, rig, obj, detector))
             stack.enter_context(intake).wait_until_open()  # before anything is written
@@ -184,7 +184,7 @@ class Watch(arguments.Watch):
         return None if earlier.state is None else "resumed from the saved state"
 
     def _conclude(
-        self, said: str, loop: Loop, intake: SourceReader, source: Source, refusals: FirstRefusals, interrupted: bool
+        self, said: str, loop: Loop, intake: SourceReader, source: Source, refusals: RefusalCauses, interrupted: bool
     ) -> str:
         """Return the last line: `said`, and what had been read before.
 
@@ -278,7 +278,7 @@ def _describe_outputs(loop: Loop) -> list[str]:
     return parts
 
 
-def _explain_no_learning(tally: Tally, intake: SourceReader, refusals: FirstRefusals) -> str:
+def _explain_no_learning(tally: Tally, intake: SourceReader, refusals: RefusalCauses) -> str:
     """Say why nothing was learned."""
     if tally.latest is not None:
         cause = refusals.find_cause() or tally.latest.refused

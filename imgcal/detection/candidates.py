@@ -108,7 +108,7 @@ def outline(frame: Frame, screening: Screening, options: DetectionOptions, scale
         oversize = np.append(~small, False)[labels[raised + 1] - 1].any((1, 2))  # label 0, no component, is the last
         raised, excess = raised[oversize], LEVEL_STEP * excess[oversize]
         level[raised] = screening.base[raised] + excess
-    saturation = 0.995 * scale if options.saturation is None else options.saturation
+    saturation = options.first_clipped(scale)
     whole = boxes
     if _split(screening.blocks, screening.base, tile, smooth, labels, len(boxes), saturation, level):
         merged = labels.copy()

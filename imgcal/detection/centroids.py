@@ -77,7 +77,7 @@ def measure(frame: Frame, candidates: Candidates, options: DetectionOptions, sca
         np.zeros(count), np.full(count, -1, np.int64), np.zeros(count),
     )  # fmt: skip
     kept = np.zeros(count, np.bool_)
-    saturation = 0.995 * scale if options.saturation is None else options.saturation
+    saturation = options.first_clipped(scale)
     least = 0.0 if options.threshold is None else options.threshold
     limits = (least, options.min_radius, options.radius_limit, options.max_elongation)
     # Options may be whole numbers: without `float`, the kernel would be compiled again for them.

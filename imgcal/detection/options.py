@@ -35,6 +35,10 @@ class DetectionOptions:
     bit_depth: int | None = None  # None = 8 for uint8 frames; 10, 12, 14 or 16 for uint16, from the brightest pixel
     saturation: float | None = None  # first clipped grey value; None = 0.5 % below full scale
 
+    def first_clipped(self, scale: int) -> float:
+        """First clipped grey value of frames whose largest grey value is `scale`."""
+        return 0.995 * scale if self.saturation is None else self.saturation
+
     @property
     def radius_limit(self) -> float:
         """Largest radius (px) of a single blob."""

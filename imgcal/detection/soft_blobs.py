@@ -52,7 +52,7 @@ def halve_frame(frame: Frame, options: DetectionOptions, scale: int) -> tuple[Fr
     gain = 4 if 4 * scale <= DEEPEST else 1
     total = parts[0].astype(np.uint32) + parts[1] + parts[2] + parts[3]
     halves = total if gain == 4 else (total + 2) // 4
-    saturation = 0.995 * scale if options.saturation is None else options.saturation
+    saturation = options.first_clipped(scale)
     if options.polarity == "dark":
         halves[np.minimum.reduce(parts) <= scale - saturation] = 0
     else:

@@ -17,9 +17,8 @@ from imgcal.estimation.curvature import curvature_covariance
 from imgcal.estimation.map_estimate import Estimate
 from imgcal.estimation.rig_error import step_by_error
 from imgcal.geometry import RigidTransform, cross_matrix, rotate, rotation_from_vector, vector_from_rotation
-from imgcal.types import CameraRig
+from imgcal.types import EXTRINSICS, CameraRig
 
-EXTRINSICS = 6
 VOTE_SCALE = (0.01,) * 3 + (10.0,) * 3
 """Radians and millimetres with equal weight when cameras vote: they move an image equally at about arm's length."""
 ROUNDS = 15

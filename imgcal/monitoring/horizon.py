@@ -14,8 +14,7 @@ from torch import Tensor
 
 from imgcal.estimation import displace, error_between
 from imgcal.monitoring.rig_belief import RigBelief, cholesky_factor
-
-EXTRINSICS = 6
+from imgcal.types import EXTRINSICS
 
 
 @dataclass(frozen=True)

@@ -140,9 +140,8 @@ class CameraVisibility:
                 "through the middle of its image, and the camera will be found again"
             )
         if camera in self.silent and look.time - self.silent[camera] >= self._patience(camera):
-            return self.silent[
-                camera
-            ], "sends nothing usable when the other cameras do: it is off or stuck, or its clock is wrong"
+            why = "sends nothing usable when the other cameras do: it is off or stuck, or its clock is wrong"
+            return self.silent[camera], why
         first, times = self.missing.get(camera, (look.time, 0))
         if times >= ABSENT_SNAPSHOTS and look.time - first >= ABSENT_SECONDS:
             return first, "does not see the object, which should be in view: it is covered, or has turned away"

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from imgcal.estimation import EstimationOptions, estimate
 from imgcal.geometry import RigidTransform, undistort_cpu
-from imgcal.types import CalibrationObject, CameraRig, Observations
+from imgcal.types import EXTRINSICS, CalibrationObject, CameraRig, Observations
 
 TRIES = 1200
 """Number of blob triples to match with fiducial triples: about 300 tries find a correct one."""
@@ -30,8 +30,6 @@ LEAST_SHARE = 0.7
 """Minimum share of possible matches: per snapshot, the smaller of the numbers of blobs and fiducials."""
 LEAST_LEAD = 1.3
 """Minimum ratio of matches to those of any pose that gives other labels."""
-EXTRINSICS = 6
-"""Number of a camera's first parameters that are its pose."""
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from .parameter_vectors import pack21, unpack18, unpack21
 from .placement import CROP_MARGIN, CROP_SIZE, PATCH_SIZE, CropPlacement
 from .prediction import Prediction, Views
 from .rig import (
+    EXTRINSICS,
     PARAMETER_KINDS,
     PARAMETER_NAMES,
     PARAMETERS,
@@ -40,6 +41,7 @@ __all__ = [
     "BLOB_RADIUS",
     "CROP_MARGIN",
     "CROP_SIZE",
+    "EXTRINSICS",
     "FIDUCIAL_RADIUS",
     "MOST_LIGHTS",
     "MOST_PIXELS",

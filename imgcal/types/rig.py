@@ -39,6 +39,8 @@ PINHOLE = (
 """Free parameters of a camera before its lens: rotation (3, rad), position (3, mm), focal length (2, pixels), principal
 point (2, pixels). The K parameters of a rig's cameras are these and the D coefficients of `distortion`. Rotation:
 cam_from_rig = exp(w) cam_from_rig0. Position: of the camera in the rig."""
+EXTRINSICS = 6
+"""Number of a camera's first parameters: its rotation and position."""
 PARAMETER_KINDS = {
     "rotation": slice(0, 3),
     "position": slice(3, 6),

@@ -2,7 +2,6 @@ from .bags import Bag
 from .earlier_run import EarlierRun, Known, Progress
 from .event_log import EventLog, forget_after
 from .exposures import CameraBlobs, Exposure, FileStamp, Item, Source, Unreadable, check_exposure
-from .first_refusals import FirstRefusals
 from .folder import Folder
 from .hook import Hook
 from .json_lines import JsonLines
@@ -34,6 +33,7 @@ from .pose_zeromq import PosePublisher
 from .poses import PoseRecord, Poses, PoseSink
 from .qualisys import Qualisys
 from .recordings import BlobTable, Videos, holds_videos
+from .refusal_causes import RefusalCauses
 from .rig_files import CURRENT, STATE, RigFiles, put_aside
 from .source_reader import SourceReader
 from .synchronization import COUNTS, Synchronizer, TimedSnapshot
@@ -59,7 +59,6 @@ __all__ = [
     "EventLog",
     "Exposure",
     "FileStamp",
-    "FirstRefusals",
     "Folder",
     "Hook",
     "Item",
@@ -83,6 +82,7 @@ __all__ = [
     "Poses",
     "Progress",
     "Qualisys",
+    "RefusalCauses",
     "RigFiles",
     "Source",
     "SourceReader",

@@ -212,27 +212,27 @@ class Synchronizer:
         self.counts["received"][exposure.camera] += 1
         if exposure.snapshot is not None or not self._has_leapt(exposure, now):
             self._add(exposure, now)
-            return self._release()
+            return self.release_due()
         self.counts["clock_off"][exposure.camera] += 1
         self._leave_out(exposure)
         self._astray[exposure.camera] = exposure
         self._astray_in_a_row += 1
         believed = [waiting for waiting in self._astray.values() if abs(waiting.time - exposure.time) <= LEAP]
         if 2 * len(believed) <= len(self._active_cameras()) and self._astray_in_a_row < LONGEST_ASTRAY:
-            return self._release()
+            return self.release_due()
         done = self.flush()
         self._reset()
         for waiting in sorted(believed, key=lambda waiting: waiting.time):
             self.counts["clock_off"][waiting.camera] -= 1
             self._add(waiting, now)
-        return done + self._release()
+        return done + self.release_due()
 
-    def release_due(self, now: float) -> tuple[TimedSnapshot, ...]:
-        """Release snapshots that are due; call this now and then while nothing comes, and nothing waits to be read."""
-        return self._release(now)
+    def release_due(self, now: float | None = None) -> tuple[TimedSnapshot, ...]:
+        """Release snapshots that are due.
 
-    def _release(self, now: float | None = None) -> tuple[TimedSnapshot, ...]:
-        """Release snapshots that are due; `now` is None if more exposures may wait to be read."""
+        Args:
+            now: s, this machine's clock while nothing comes; None if more exposures may wait to be read.
+        """
         done: list[TimedSnapshot] = []
         while self._pending and self._is_complete(self._pending[0], now):
             done.append(self._has_continued(self._pending.pop(0)))

@@ -20,7 +20,7 @@ from imgcal.io import load_object, read_rig, save_detections, save_object, save_
 from imgcal.online import RigKeeper
 from imgcal.synthesis import Truth, simulate_volume, true_detections
 from imgcal.types import CalibrationObject, CameraRig, Detections, DriftRate, RigPrior
-from imgcal.watch import FirstRefusals, Progress, put_aside
+from imgcal.watch import Progress, RefusalCauses, put_aside
 from tests.imgcal.streams import Stream
 from tests.imgcal.watch.test_marker_files import points_of
 
@@ -256,8 +256,8 @@ def test_images_in_another_convention_are_named(blobs, stream, tmp_path, capsys)
     assert f"nothing could be learned from any snapshot: {UPSIDE_DOWN}" in capsys.readouterr().err
 
 
-def test_the_cause_of_the_first_refusals_is_told_once_and_again_after_something_was_learned(blobs, stream):
-    refusals, table = FirstRefusals(stream.rig, stream.obj), upside_down(blobs, stream.rig)
+def test_the_cause_of_the_refusal_causes_is_told_once_and_again_after_something_was_learned(blobs, stream):
+    refusals, table = RefusalCauses(stream.rig, stream.obj), upside_down(blobs, stream.rig)
     states = [SimpleNamespace(refused="no", detections=table.of_snapshots(s, s + 1)) for s in range(30)]
     told = [refusals.add(state) for state in states for _ in range(2)]
     while (cause := refusals.add(None)) is None:
@@ -273,7 +273,7 @@ def test_the_cause_of_the_first_refusals_is_told_once_and_again_after_something_
 
 
 def test_normalized_centres_are_told_as_such(blobs, stream):
-    refusals, size = FirstRefusals(stream.rig, stream.obj), stream.rig.image_size.double().numpy()[blobs.camera]
+    refusals, size = RefusalCauses(stream.rig, stream.obj), stream.rig.image_size.double().numpy()[blobs.camera]
     table = replace(blobs, uv=(blobs.uv + 0.5) / size)
     for s in range(5):
         refusals.add(SimpleNamespace(refused="no", detections=table.of_snapshots(s, s + 1)))

@@ -20,7 +20,7 @@ KEPT = 30
 """Latest snapshots that are kept for this."""
 
 
-class FirstRefusals:
+class RefusalCauses:
     """Refused snapshots of a rig since something was learned last."""
 
     def __init__(self, rig: CameraRig, obj: CalibrationObject) -> None:
