@@ -40,13 +40,13 @@ snapshot waits for a slow test for changes (`change_search.SLOW_TESTS`), too."""
 WITHHELD_SECONDS, MOST_WITHHELD = 2.0, 0.25
 """Seconds of latest snapshots that are left out, but at most this share of all: until a change of a camera has been
 found, the shift of its image would pass for a persistent error that hides it."""
-USUAL, USUAL_SECONDS, USUAL_SNAPSHOTS = 0.4, 0.1, 256
+USUAL, USUAL_SECONDS, USUAL_SNAPSHOTS = 0.4, 0.1, 512
 """Autocorrelation of the errors of infrared cameras at short intervals, its decay time (s, to 1/e), and the number of
 snapshots until which a rig is assumed to have no less, unless its errors seem to be independent."""
-INDEPENDENT = 0.5
+INDEPENDENT, LEAST_JUDGED = 0.5, 128
 """Share of the usual autocorrelation from one snapshot to the next below which the measured one must be, by two
-standard deviations, for the errors of an uncalibrated rig to seem independent. On the recorded wand it is 0.1 to 0.4
-after 48 snapshots (the usual one is 0.34 at 60 Hz), in simulations at most 0.08."""
+standard deviations, for the errors of an uncalibrated rig to seem independent, and the least number of snapshots to
+tell: the estimate follows the errors of the first ones, so that they seem independent."""
 
 # Time between snapshots.
 FASTEST, SLOWEST = 1 / 60, 1.0
@@ -234,7 +234,7 @@ class NoiseCorrelation:
         seen = np.isfinite(series[..., 0])
         variance = np.nansum(np.square(series), axis=(0, 2)) / (2 * np.maximum(seen.sum(0), 1))
         whitened = series / np.sqrt(np.maximum(variance, 1e-12))[:, None]
-        if not self.calibrated and self._seem_independent(whitened):
+        if not self.calibrated and self.taken >= LEAST_JUDGED and self._seem_independent(whitened):
             self.usual = 1.0
         together = float(correlation_time(whitened[:, None])[0])
         time = np.maximum(correlation_time(series), max(together, self.usual if self.calibrated else 1.0))

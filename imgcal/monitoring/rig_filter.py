@@ -16,9 +16,13 @@ from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belief
 from imgcal.types import CalibrationObject, CameraRig, DriftRate, Observations
 
-TOGETHER = (*range(2, 17), 20, 25, 32, 40, 50, 64, 80, 100, 128)
-"""Numbers of snapshots at which all so far are absorbed together again."""
-MEMORY = TOGETHER[-1]
+TOGETHER = (*range(2, 17), 20, 25, 32, 40, 50, 64, 80, 100, 128, 160, 200, 256, 320, 400, 512)
+"""Numbers of first snapshots at which all so far are absorbed together again ..."""
+FIRST_OF_CAMERA = frozenset((2, 4, 8, 16, 32))
+"""... and numbers of snapshots of any one camera: the less is known about it, the less linear are its equations."""
+LEAST_MEMORY, MEMORY, MOST_LABELS = 128, TOGETHER[-1], 2**15 + 2**13
+"""Number of first snapshots that are kept, where memory allows so many labels: at 60 Hz, a hand-held object shows too
+little in the first two seconds for linear equations."""
 YOUNG_SECONDS = 60.0
 """Time for which a rig may be assumed to stand still: its drift is far below the noise of a snapshot."""
 LEAST_AGING_SECONDS = 1.0
@@ -49,6 +53,7 @@ class RigFilter:
         "calibrated": ("calibrated", bool),
         "belief": ("belief", RigBelief),
         "count": ("count", int),
+        "shown": ("shown", Tensor),
         "young": ("_young", bool),
         "pace": ("pace", Tensor),
         "horizon": ("horizon", Horizon | None),
@@ -83,6 +88,7 @@ class RigFilter:
         self.rate, self.options = rate or rig.drift_rate or DriftRate(), options
         self.calibrated = start is not None  # it started with a calibration's result
         self.belief, self.count = start or (RigBelief.of_prior(rig, obj, prior_std), 0)  # and snapshots absorbed
+        self.shown = torch.zeros(rig.num_cameras, dtype=torch.int64)  # (C,) absorbed snapshots that a camera has seen
         self._young = start is None  # the first snapshots are still kept
         self.pace = torch.ones_like(self.belief.unit)  # (C, K) believed drift relative to `rate`
         self.horizon = None if horizon is None else Horizon(horizon, self.belief)
@@ -138,7 +144,9 @@ class RigFilter:
             self._first, horizon.away, self._early = alone.first, alone.away, []
         self.belief, self._waited, self.count = result.belief, self._waited - due, self.count + 1
         still = self._span <= YOUNG_SECONDS or not any(vars(self.rate).values())  # a steady rig never moves
-        self._young = self._young and (self.horizon is not None or (len(self._early) < MEMORY and still))
+        self.shown += observations.seen[0].any(-1)
+        memory = max(LEAST_MEMORY, min(MEMORY, MOST_LABELS // observations.seen.numel()))
+        self._young = self._young and (self.horizon is not None or (len(self._early) < memory and still))
         if self._young:
             self._early.append((observations, result.rig_from_object))
         else:
@@ -158,7 +166,10 @@ class RigFilter:
         count, horizon = len(self._early), self.horizon
         if horizon is not None and count > horizon.snapshots:
             return count > horizon.most
-        return count in TOGETHER
+        if count in TOGETHER or horizon is not None or not count:
+            return count in TOGETHER
+        shown = self.shown[self._early[-1][0].seen[0].any(-1)].tolist()
+        return not FIRST_OF_CAMERA.isdisjoint(shown)
 
     def learnt_since(self, number: int) -> int:
         """Number of snapshots from number `number` on that the belief rests on."""
@@ -199,7 +210,22 @@ class RigFilter:
         self.belief, self._first, self._early = result.belief, first, list(snapshots)
         self._young, self._span, self._waited = True, 0.0, 0.0
         self.count += new
+        for observations, _ in self._early[len(self._early) - new :]:
+            self.shown += observations.seen[0].any(-1)
         return result
+
+    def absorb_kept(self, first: RigBelief) -> MeasurementUpdate:
+        """Absorb the kept snapshots with another belief before the first of them; the filter stays as it is.
+
+        Raises:
+            RefusedError: see `absorb`.
+        """
+        return absorb(first, *stack_snapshots(self._early), self.options)
+
+    def begin_with(self, first: RigBelief, result: MeasurementUpdate) -> MeasurementUpdate:
+        """Continue from the result of `absorb_kept`."""
+        self._first, self.belief, self._waited = first, age_belief(result.belief, self._span, self.walk), 0.0
+        return replace(result, belief=self.belief)
 
     def replace_beliefs(self, first: RigBelief, belief: RigBelief) -> None:
         """Replace the beliefs: before the first kept snapshot, and now."""

@@ -17,7 +17,7 @@ from torch import Tensor
 from imgcal.errors import RefusedError
 from imgcal.estimation import POSE_PARAMETERS
 from imgcal.geometry import RigidTransform
-from imgcal.monitoring.case import Case, ClockSlip, ObjectChange, Snapshot
+from imgcal.monitoring.case import SHAPE, Case, ClockSlip, ObjectChange, Snapshot
 from imgcal.monitoring.change_search import (
     NEARBY_SNAPSHOTS,
     changed_cameras,
@@ -44,7 +44,16 @@ from imgcal.monitoring.lens_misfit import LensMisfit
 from imgcal.monitoring.lens_warming import Warmed
 from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.noise_correlation import NoiseCorrelation
-from imgcal.monitoring.object_change import MISFIT_LEAD, Misfit, ObjectChanged, has_never_fitted, may_have_changed
+from imgcal.monitoring.object_change import (
+    ALL_MM,
+    MISFIT_LEAD,
+    PRINT_FIDUCIALS,
+    Misfit,
+    ObjectChanged,
+    free_object,
+    has_never_fitted,
+    may_have_changed,
+)
 from imgcal.monitoring.pending_change import Change, PendingChange, free_cameras
 from imgcal.monitoring.quarantine import Quarantine
 from imgcal.monitoring.recent_snapshots import RecentSnapshots
@@ -60,6 +69,9 @@ FEW_SNAPSHOTS = 16
 stated uncertainty, and the wrong camera would be blamed. It is then forgotten ..."""
 OBJECT_SNAPSHOTS = 8
 """... and a change of the object is not considered before this many snapshots have been absorbed."""
+LOOSENED, LOOSE_ODDS = (16, 32, 64, 128, 256, 512), 5.0
+"""Numbers of first snapshots after which an object is tested for errors that its file does not state, and the log odds
+at which it has some."""
 UNDECIDED_SNAPSHOTS = 16
 """Snapshots for which a camera stays in doubt that seemed to have moved without a decision."""
 NEW_SHARE = 0.25
@@ -241,6 +253,7 @@ class RigMonitor:
             self._recent.relinearize(result)
             if (anew := self._diagnose_first_misfit(result)) is not None:
                 return replace(anew, changes=tuple(changes))
+            result = self._loosen_object(result)
             if self._pending is not None:
                 self._begin_pending(result, self._pending.before, self._pending.seconds, self._pending.kinds)
         quiet, busy = self._pending is None and alarm is None, bool(slow_tests(self._recent, self.filter.count))
@@ -473,6 +486,11 @@ class RigMonitor:
                 return MonitorUpdate(self._restart(self._beginning, [*earlier, *case.latest], case.pauses))
         early = self._moved_early | free.keys()
         before = place_cameras(case.before, placed, free)
+        if not forget and (unknown := self._hardly_seen(case, free)):
+            before = free_cameras(before, dict.fromkeys(unknown), JUMPS[-1])
+            free = {camera: kind for camera, kind in free.items() if camera not in unknown}
+            if not free:
+                return MonitorUpdate(self._restart(before, case.latest, case.pauses[-case.count :]))
         before = self._factory_with_free(early, placed) if forget else free_cameras(before, free, jump)
         result = self._restart(before, case.latest, case.pauses[-case.count :])
         if horizon is not None:
@@ -491,6 +509,17 @@ class RigMonitor:
             self._begin_pending(result, case.before, seconds, dict(free))
         self._moved_at |= dict.fromkeys(new, self.filter.count)
         return MonitorUpdate(result, tuple(new.values()))
+
+    def _hardly_seen(self, case: Case, cameras: Collection[int]) -> list[int]:
+        """Cameras that saw the object before a case's latest snapshots for no longer than an error may last.
+
+        Their first labels may have been off, so they need not have moved since. A calibrated rig's are known.
+        """
+        if self.filter.calibrated or self.filter.horizon is not None:
+            return []
+        shown = torch.stack([one.seen[0].any(-1) for one, _ in case.latest]).sum(0)
+        before, episodes = (self.filter.shown - shown).tolist(), self.noise.episodes
+        return [camera for camera in sorted(cameras) if episodes[camera] > 1 and before[camera] <= episodes[camera]]
 
     def _factory_with_free(self, cameras: Collection[int], rig: CameraRig | None = None) -> RigBelief:
         """The factory calibration with some cameras unconstrained, where they are turned far in a rig (None = now)."""
@@ -533,6 +562,29 @@ class RigMonitor:
         if not first or not has_never_fitted(result, count):
             return None
         return self._adopt_object(self._prior, *self._recent.latest(count))
+
+    def _loosen_object(self, result: MeasurementUpdate) -> MeasurementUpdate:
+        """Give an object that was taken as exact the usual tolerance if its first snapshots, `result`, show errors.
+
+        What is learned from errors of the object that nothing allows for is certain and wrong.
+        """
+        first, kept = self._prior, len(result.brought)
+        everything = not self.known_since and self._pending is None and self.filter.count == kept
+        if self.filter.calibrated or self.filter.horizon is not None or not everything or kept not in LOOSENED:
+            return result
+        obj = first.obj
+        if obj.unknown_markers or not obj.exact or obj.num_fiducials > PRINT_FIDUCIALS:
+            return result
+        loose = free_object(first, SHAPE, ALL_MM)
+        with contextlib.suppress(RefusedError):
+            free = self.filter.absorb_kept(loose)
+            if free.evidence - result.evidence > LOOSE_ODDS:
+                self._prior = loose
+                result = self.filter.begin_with(loose, free)
+                latest, pauses = self._recent.latest(len(self._recent))
+                self._recent = RecentSnapshots(result.belief, self.filter.walk, self.noise.model_error)
+                self._recent.replace(latest, pauses, result)
+        return result
 
     def diagnose_object(
         self, snapshots: Sequence[Snapshot], pauses: Sequence[float], learnt: bool
