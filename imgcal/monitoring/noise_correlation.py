@@ -40,9 +40,10 @@ snapshot waits for a slow test for changes (`change_search.SLOW_TESTS`), too."""
 WITHHELD_SECONDS, MOST_WITHHELD = 2.0, 0.25
 """Seconds of latest snapshots that are left out, but at most this share of all: until a change of a camera has been
 found, the shift of its image would pass for a persistent error that hides it."""
-USUAL, USUAL_SECONDS, USUAL_SNAPSHOTS = 0.4, 0.1, 512
-"""Autocorrelation of the errors of infrared cameras at short intervals, its decay time (s, to 1/e), and the number of
-snapshots until which a rig is assumed to have no less, unless its errors seem to be independent."""
+USUAL, USUAL_SECONDS = 0.4, 0.1
+"""Autocorrelation of the errors of infrared cameras at short intervals, and its decay time (s, to 1/e)."""
+USUAL_SNAPSHOTS, USUAL_UNCALIBRATED = 256, 512
+"""Numbers of snapshots until which a calibrated rig and another one are assumed to have no less."""
 INDEPENDENT, LEAST_JUDGED = 0.5, 128
 """Share of the usual autocorrelation from one snapshot to the next below which the measured one must be, by two
 standard deviations, for the errors of an uncalibrated rig to seem independent, and the least number of snapshots to
@@ -127,7 +128,8 @@ class NoiseCorrelation:
         self.calibrated = calibrated
         if not calibrated and (not self.interval or (self.usual == 1.0 and self.taken >= FIRST_MEASUREMENTS[0])):
             return
-        self.usual = usual_time(self.interval) if self.taken < USUAL_SNAPSHOTS else 1.0
+        most = USUAL_SNAPSHOTS if calibrated else USUAL_UNCALIBRATED
+        self.usual = usual_time(self.interval) if self.taken < most else 1.0
         if calibrated and self.taken < FIRST_MEASUREMENTS[0]:
             self.time = torch.full_like(self.time, self.usual)
 

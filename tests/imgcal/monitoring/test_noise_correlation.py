@@ -9,6 +9,7 @@ import torch
 from imgcal.monitoring.noise_correlation import (
     FASTEST,
     FIRST_MEASUREMENTS,
+    LEAST_JUDGED,
     LEAST_WEIGHT,
     MEMORY_SNAPSHOTS,
     NoiseCorrelation,
@@ -98,7 +99,7 @@ def test_a_calibrated_rig_expects_what_is_usual_until_it_knows_better() -> None:
 @pytest.mark.parametrize(("lasting", "ends"), [(0.0, True), (0.5, False)])
 def test_an_uncalibrated_rig_is_weighed_as_usual_unless_its_errors_seem_independent(lasting: float, ends: bool) -> None:
     generator, noise, error = torch.Generator().manual_seed(1), NoiseCorrelation(4), 0.0
-    for number in range(128):
+    for number in range(160):
         noise.pass_time(FASTEST)
         noise.expect_usual(calibrated=False)
         fresh = torch.randn(1, 4, 1, 2, generator=generator, dtype=torch.float64)
@@ -106,6 +107,7 @@ def test_an_uncalibrated_rig_is_weighed_as_usual_unless_its_errors_seem_independ
         noise.add(observations(4), error.expand(1, 4, 5, 2))
         if number < FIRST_MEASUREMENTS[0] - 1:
             assert noise.time.tolist() == [1.0] * 4  # cameras are tested as if nothing were assumed
+        if number < LEAST_JUDGED:  # the rig follows the errors of its first snapshots
             assert noise.assumed_time.tolist() == pytest.approx([usual_time(FASTEST)] * 4)
     assert (noise.usual == 1.0) == ends and (float(noise.assumed_time.min()) < 2) == ends
 

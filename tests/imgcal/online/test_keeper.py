@@ -13,6 +13,7 @@ import torch
 import imgcal
 from imgcal.errors import InputError
 from imgcal.monitoring import CHANGES
+from imgcal.monitoring.noise_correlation import NoiseCorrelation
 from imgcal.online import Event, RigKeeper, RigState
 from imgcal.synthesis import simulate_volume, true_detections
 from imgcal.types import CameraRig, Detections, RigPrior, check_rig
@@ -57,8 +58,9 @@ class Creeping(Stream):
         return self.rig.retract(step)
 
 
-def test_a_camera_that_keeps_turning_is_reported_once() -> None:
+def test_a_camera_that_keeps_turning_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """By a degree in two seconds: it moves on before it is known how it has moved."""
+    monkeypatch.setattr(NoiseCorrelation, "expect_usual", lambda self, calibrated: None)  # errors of a simulation
     steps = [Bump(64 + 2 * step, 1, "rotation", math.radians(1 / 60)) for step in range(60)]
     made = Creeping(imgcal.load_rig("T4"), imgcal.load_object("asymmetric8"), 2, bumps=steps)
     states = kept(made, 100)
