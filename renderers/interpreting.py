@@ -83,11 +83,8 @@ class Interpretable:
         """Return what is to be called with these arguments: machine code, or Python."""
         if _patience is None or named or self.function.__defaults__:
             return self.compile_for(*arguments, **named)
-        now = time.perf_counter()
-        if now - self.last_look > LOOK_EVERY:
-            self.last_look = now
-            if self._is_stored(arguments):
-                return self._compile(*arguments)
+        if self._is_stored(arguments):
+            return self._compile(*arguments)
         is_due = self._has_been_patient(self.limit) or _count_elements(arguments) > MOST_ELEMENTS
         return self._compile(*arguments) if is_due and not self.is_being_compiled() else self.interpret
 
@@ -152,14 +149,18 @@ class Interpretable:
         return found
 
     def _is_stored(self, arguments: tuple[Any, ...]) -> bool:
-        """Tell whether machine code for these arguments is in the cache."""
-        cache = self.compiled._cache
-        try:
-            stored = Path(cache._cache_file._index_path).stat().st_mtime_ns
-        except (AttributeError, OSError):  # a function that is not kept; nothing stored yet
+        """Tell whether machine code for these arguments was in the cache at the last look."""
+        cache, now = self.compiled._cache, time.perf_counter()
+        if now - self.last_look > LOOK_EVERY:
+            self.last_look = now
+            try:
+                stored = Path(cache._cache_file._index_path).stat().st_mtime_ns
+            except (AttributeError, OSError):  # a function that is not kept; nothing stored yet
+                return False
+            if stored != self.index[0]:
+                self.index = stored, set(cache._cache_file._load_index())
+        if not self.index[1]:
             return False
-        if stored != self.index[0]:
-            self.index = stored, set(cache._cache_file._load_index())
         types = tuple(map(self.compiled.typeof_pyval, arguments))
         return cache._index_key(types, self.compiled.targetctx.codegen()) in self.index[1]
 

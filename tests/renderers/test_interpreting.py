@@ -158,13 +158,27 @@ with interpret_first(math.inf):
     assert double(2) == 4 and len(double.overloads) == 1  # other arguments: still interpreted
 """
 
+BOTH = """
+import math, subprocess, sys
+from lab import double
+from renderers import interpreting
+from renderers.interpreting import interpret_first
 
-def test_what_another_process_has_compiled_is_loaded(tmp_path: Path):
+subprocess.run([sys.executable, "-c", "from lab import double; double(1.0); double(2)"], check=True)
+interpreting.LOOK_EVERY, double.interpretable.last_look = 3600.0, -math.inf
+with interpret_first(math.inf):
+    assert double(1.0) == 2.0 and double(2) == 4
+    assert sum(double.stats.cache_hits.values()) == len(double.overloads) == 2
+"""
+
+
+@pytest.mark.parametrize("script", [SCRIPT, BOTH])
+def test_what_another_process_has_compiled_is_loaded(tmp_path: Path, script: str):
     (tmp_path / "lab.py").write_text(LAB)
     environment = {
         "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
         "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]),
     }
-    command = [sys.executable, "-c", SCRIPT]
+    command = [sys.executable, "-c", script]
     done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-800:]
