@@ -20,7 +20,7 @@ TOGETHER = (*range(2, 17), 20, 25, 32, 40, 50, 64, 80, 100, 128, 160, 200, 256, 
 """Numbers of first snapshots at which all so far are absorbed together again ..."""
 FIRST_OF_CAMERA = frozenset((2, 4, 8, 16, 32))
 """... and numbers of snapshots of any one camera: the less is known about it, the less linear are its equations."""
-LEAST_MEMORY, MEMORY, MOST_LABELS = 128, TOGETHER[-1], 2**15 + 2**13
+LEAST_MEMORY, MEMORY, MOST_LABELS = 128, TOGETHER[-1], 2**15
 """Number of first snapshots that are kept, where memory allows so many labels: at 60 Hz, a hand-held object shows too
 little in the first two seconds for linear equations."""
 YOUNG_SECONDS = 60.0

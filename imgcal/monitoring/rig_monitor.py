@@ -69,7 +69,7 @@ FEW_SNAPSHOTS = 16
 stated uncertainty, and the wrong camera would be blamed. It is then forgotten ..."""
 OBJECT_SNAPSHOTS = 8
 """... and a change of the object is not considered before this many snapshots have been absorbed."""
-LOOSENED, LOOSE_ODDS = (16, 32, 64, 128, 256, 512), 5.0
+LOOSENED, LOOSE_ODDS = (16, 32, 64, 128, 256), 5.0
 """Numbers of first snapshots after which an object is tested for errors that its file does not state, and the log odds
 at which it has some."""
 UNDECIDED_SNAPSHOTS = 16
