@@ -21,8 +21,8 @@ TOGETHER = (*range(2, 17), 20, 25, 32, 40, 50, 64, 80, 100, 128, 160, 200, 256, 
 FIRST_OF_CAMERA = frozenset((2, 4, 8, 16, 32))
 """... and numbers of snapshots of any one camera: the less is known about it, the less linear are its equations."""
 LEAST_MEMORY, MEMORY, MOST_LABELS = 128, TOGETHER[-1], 2**15
-"""Number of first snapshots that are kept, where memory allows so many labels: at 60 Hz, a hand-held object shows too
-little in the first two seconds for linear equations."""
+"""Number of first snapshots that are kept: the second one of a rig that was not calibrated and has so few labels. At
+60 Hz, a hand-held object shows too little in two seconds for linear equations."""
 YOUNG_SECONDS = 60.0
 """Time for which a rig may be assumed to stand still: its drift is far below the noise of a snapshot."""
 LEAST_AGING_SECONDS = 1.0
@@ -145,8 +145,9 @@ class RigFilter:
         self.belief, self._waited, self.count = result.belief, self._waited - due, self.count + 1
         still = self._span <= YOUNG_SECONDS or not any(vars(self.rate).values())  # a steady rig never moves
         self.shown += observations.seen[0].any(-1)
-        memory = max(LEAST_MEMORY, min(MEMORY, MOST_LABELS // observations.seen.numel()))
-        self._young = self._young and (self.horizon is not None or (len(self._early) < memory and still))
+        most = LEAST_MEMORY if self.calibrated else max(LEAST_MEMORY, MOST_LABELS // observations.seen.numel())
+        few = len(self._early) < min(most, MEMORY)
+        self._young = self._young and (self.horizon is not None or (few and still))
         if self._young:
             self._early.append((observations, result.rig_from_object))
         else:
@@ -166,7 +167,7 @@ class RigFilter:
         count, horizon = len(self._early), self.horizon
         if horizon is not None and count > horizon.snapshots:
             return count > horizon.most
-        if count in TOGETHER or horizon is not None or not count:
+        if count in TOGETHER or horizon is not None or self.calibrated or not count:
             return count in TOGETHER
         shown = self.shown[self._early[-1][0].seen[0].any(-1)].tolist()
         return not FIRST_OF_CAMERA.isdisjoint(shown)
