@@ -97,7 +97,7 @@ def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     with workers(options.address, options.cores) as mapped:
         go_on(options, mapped)
-    known = json.loads(RESULT.read_text("utf-8"))["found"] if options.out == RESULT and RESULT.exists() else {}
+    known = json.loads(RESULT.read_text("utf-8"))["found"] if options.out.resolve() == RESULT and RESULT.exists() else {}
     anew = summarized([entry for entry in done(options.items) if entry["name"] in options.only])
     result: dict[str, Any] = {
         **surroundings(),
@@ -106,7 +106,7 @@ def main() -> None:
     }
     write_json(options.out, result)
     written = tables(result)
-    if options.out == RESULT:
+    if options.out.resolve() == RESULT:
         draw(result, PLOT)
         fill(PAGE, written)
     print("\n\n".join(written.values()))

@@ -276,7 +276,7 @@ def main() -> None:
         shutil.rmtree(folder)
     write_json(given.out, {**surroundings(), "command": f"python -m scripts.benchmarks.endurance {words}", **result})
     print(table(result))
-    if given.out == RESULT:
+    if given.out.resolve() == RESULT:
         fill(PAGE, {"endurance": table(result)})
 
 

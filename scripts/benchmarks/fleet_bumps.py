@@ -141,7 +141,7 @@ def main() -> None:
         write_json(options.out, result)
     sections = tables(result)
     print("\n\n".join(sections.values()))
-    if options.out == RESULT:
+    if options.out.resolve() == RESULT:
         fill(options.page, sections)
 
 

@@ -394,7 +394,7 @@ def main() -> None:
                 if not options.only or name in options.only:
                     result |= surroundings() | {name: measure(Path(folder), options)}
                     write_json(options.out, result)
-    if options.out == RESULT:
+    if options.out.resolve() == RESULT:
         fill(PAGE, tables(result))
         print("\n\n".join(tables(result).values()))
 

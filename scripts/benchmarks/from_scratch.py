@@ -261,7 +261,7 @@ def main() -> None:
             result["captures"] = on_captures(Path(os.environ["IMGCAL_CAPTURES"]))
         result["seconds"] = round(time.monotonic() - began)
     write_json(options.out, result)
-    if options.out == RESULT:
+    if options.out.resolve() == RESULT:
         fill(PAGE, {"from scratch": tables(read_json(RESULT))})
     print(tables(result))
 

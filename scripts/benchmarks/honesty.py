@@ -241,7 +241,7 @@ def main() -> None:
         result = before | {"noise_px": NOISE, "seconds": seconds, "rows": rows} | bent | {"estimate_seconds": effort()}
     write_json(options.out, result)
     kept.clear()
-    if options.out == RESULT:
+    if options.out.resolve() == RESULT:
         fill(PAGE, tables(read_json(RESULT)))
     for text in tables(result).values():
         print(text)

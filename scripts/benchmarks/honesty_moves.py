@@ -189,7 +189,7 @@ def main() -> None:
         "honesty moves": faults_table(result, "moves"),
         "honesty images": faults_table(result, "images"),
     }
-    if options.out == RESULT:
+    if options.out.resolve() == RESULT:
         read_json(RESULT)
         fill(PAGE, tables)
     print("\n\n".join(tables.values()))

@@ -177,7 +177,7 @@ def main() -> None:
         result = measure(options.captures, options.snapshots, chosen, mapped=mapped)
     write_json(options.out, before | {"seconds": round(time.monotonic() - began)} | result)
     kept.clear()
-    if options.out == RESULT:
+    if options.out.resolve() == RESULT:
         page = replaced(PAGE.read_text("utf-8"), {"honesty prediction": table(read_json(RESULT))}, PAGE)
         write_text(PAGE, page)
     print(table(result))

@@ -136,7 +136,7 @@ def main() -> None:
     write_json(options.out, before | measure(options))
     found = read_json(options.out)
     print(table(found), *found["outcomes"], sep="\n")
-    if options.out == RESULT:
+    if options.out.resolve() == RESULT:
         fill(PAGE, {"watch learning": table(found)})
 
 
