@@ -97,7 +97,8 @@ def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     with workers(options.address, options.cores) as mapped:
         go_on(options, mapped)
-    known = json.loads(RESULT.read_text("utf-8"))["found"] if options.out.resolve() == RESULT and RESULT.exists() else {}
+    official = options.out.resolve() == RESULT
+    known = json.loads(RESULT.read_text("utf-8"))["found"] if official and RESULT.exists() else {}
     anew = summarized([entry for entry in done(options.items) if entry["name"] in options.only])
     result: dict[str, Any] = {
         **surroundings(),
@@ -106,7 +107,7 @@ def main() -> None:
     }
     write_json(options.out, result)
     written = tables(result)
-    if options.out.resolve() == RESULT:
+    if official:
         draw(result, PLOT)
         fill(PAGE, written)
     print("\n\n".join(written.values()))
