@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imgcal.io import Frame
-from imgcal.messages import list_names, round_to
 from imgcal.types import Detections
 from imgcal.watch.exposures import CameraBlobs, Exposure, frame_digest
+from imgcal.watch.time_stamp_check import TimeStampCheck
 from imgcal.watch.timing import LEAP, Timing
 
 MOST_PENDING = 32
@@ -33,10 +33,6 @@ EARLY = 0.05
 """Share of the median interval by which it may come early."""
 ALONE = 30
 """Successive snapshots of one camera alone, while the others are together, that show that its time stamps are off."""
-FASTEST_REPLAY = 300
-"""Seconds by time stamps to a second of this machine's clock above which they must be in other units."""
-LEAST_LEAPING = 10
-"""Minimum number of snapshots, most of them after a jump, that show that time stamps are not in seconds."""
 NEIGHBOUR = 1.1
 """Part of a camera's usual interval in which others must have exposed: a faster camera is often alone rightly."""
 LONGEST_ASTRAY = 100
@@ -164,11 +160,7 @@ class Synchronizer:
         self._alone: Counter[str] = Counter()  # successive snapshots of one camera alone, close to others
         self.alone: tuple[str, ...] = ()
         """Cameras whose time stamps always differ from the others': their clocks do."""
-        self._left_out: Counter[str] = Counter()  # successive exposures of a camera that were late or `clock_off`
-        self._ahead: dict[str, float] = {}  # s, last time stamp of a camera less the others' clock
-        self._repeated: Counter[str] = Counter()  # exposures of a camera whose time stamp it had sent shortly before
-        self._released = 0  # snapshots
-        self._span = (0.0, 0.0), (0.0, 0.0)  # s: this machine's clock and time stamp of the first and the last exposure
+        self._check = TimeStampCheck(camera_names)
         self._offset: dict[str, float] = {}  # last time stamp minus this machine's clock at arrival
         self._gone: _Pending | None = None  # the last released snapshot without a name
         self._names: deque[str] = deque(maxlen=REMEMBERED)
@@ -183,21 +175,8 @@ class Synchronizer:
 
     @property
     def advice(self) -> str:
-        """What is wrong with the time stamps, of all cameras or of some; empty = nothing that shows.
-
-        Repeated exposures have repeated time stamps rightly, but hardly any source repeats most of them.
-        """
-        received = self.counts["received"]
-        repeating = [name for name in self.camera_names if 2 * self._repeated[name] > received[name] >= ALONE]
-        if repeating:
-            return f"{list_names(repeating)}: most time stamps repeat an earlier one: give each exposure its own"
-        passed, stamped = (last - first for first, last in zip(*self._span, strict=True))
-        if 2 * self.leaps > self._released >= LEAST_LEAPING or stamped > FASTEST_REPLAY * passed > 0:
-            return "time stamps go on much faster than time passes: give them in seconds"
-        off = {name: self._ahead[name] for name in self.camera_names if self._left_out[name] >= ALONE}
-        said = [f"{name} {round_to(abs(by), 2)} s {'ahead' if by > 0 else 'behind'}" for name, by in off.items()]
-        what_to_do = "set the clock, or wait longer (--patience)"
-        return f"left out: time stamps of {list_names(said)}: {what_to_do}" if said else ""
+        """What is wrong with the time stamps; empty = nothing that shows."""
+        return self._check.advise(self.counts["received"], self.leaps)
 
     def add(self, exposure: Exposure, now: float = 0.0) -> tuple[TimedSnapshot, ...]:
         """Take an exposure of one of the cameras.
@@ -268,12 +247,11 @@ class Synchronizer:
         self._absent[camera] = 0
         self._offset[camera] = exposure.time - now
         self.counts["out_of_order"][camera] += exposure.time < before
-        last = now, exposure.time
-        self._span = (self._span[0] if self._stamps[camera] else last), last
-        if exposure.time not in self._stamps[camera]:  # a repetition says nothing about the interval
-            self._stamps[camera].append(exposure.time)
-        elif exposure.snapshot is None:
-            self._repeated[camera] += 1
+        stamps = self._stamps[camera]
+        repeats = exposure.time in stamps
+        self._check.take(camera, now, exposure.time, bool(stamps), repeats and exposure.snapshot is None)
+        if not repeats:  # a repetition says nothing about the interval
+            stamps.append(exposure.time)
         self._newest[camera] = max(before, exposure.time)
         tolerance = self.tolerance(camera)
         pending = self._place(exposure, tolerance, now)
@@ -283,14 +261,13 @@ class Synchronizer:
         elif camera in pending.exposures:
             self.counts["duplicate"][camera] += 1
         else:
-            self._left_out[camera] = 0
+            self._check.use(camera)
             pending.add(exposure, tolerance)
 
     def _leave_out(self, exposure: Exposure) -> None:
         """Note how far off an exposure is that cannot be used."""
         if exposure.snapshot is None:
-            self._left_out[exposure.camera] += 1
-            self._ahead[exposure.camera] = exposure.time - self._latest()
+            self._check.leave_out(exposure.camera, exposure.time - self._latest())
 
     def _place(self, exposure: Exposure, tolerance: float, now: float) -> _Pending | None:
         """Find the snapshot of an exposure, or start a new one; None = it was released already."""
@@ -321,7 +298,7 @@ class Synchronizer:
         return clock - pending.latest > self.timing.patience
 
     def _has_continued(self, pending: _Pending) -> TimedSnapshot:
-        self._released += 1
+        self._check.released += 1
         if pending.name is None:
             self._gone = replace(pending, exposures={})  # frames are large
         else:
@@ -386,7 +363,7 @@ class Synchronizer:
     def _reset(self) -> None:
         self.leaps += 1
         self._newest.clear()
-        self._left_out.clear()
+        self._check.left_out.clear()
         for stamps in self._stamps.values():
             stamps.clear()
         self._offset.clear()
