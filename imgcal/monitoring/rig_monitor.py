@@ -69,9 +69,9 @@ FEW_SNAPSHOTS = 16
 stated uncertainty, and the wrong camera would be blamed. It is then forgotten ..."""
 OBJECT_SNAPSHOTS = 8
 """... and a change of the object is not considered before this many snapshots have been absorbed."""
-LOOSENED, LOOSE_ODDS = (16, 32, 64, 128, 256), 5.0
-"""Numbers of first snapshots after which an object is tested for errors that its file does not state, and the log odds
-at which it has some."""
+LOOSENED, MOST_TESTED, LOOSE_ODDS = (16, 32, 64, 128, 256), 2**14, 5.0
+"""Numbers of first snapshots after which an object is tested for errors that its file does not state, the largest
+number of labels that they may have, and the log odds at which it has some."""
 UNDECIDED_SNAPSHOTS = 16
 """Snapshots for which a camera stays in doubt that seemed to have moved without a decision."""
 NEW_SHARE = 0.25
@@ -572,8 +572,8 @@ class RigMonitor:
         everything = not self.known_since and self._pending is None and self.filter.count == kept
         if self.filter.calibrated or self.filter.horizon is not None or not everything or kept not in LOOSENED:
             return result
-        obj = first.obj
-        if obj.unknown_markers or not obj.exact or obj.num_fiducials > PRINT_FIDUCIALS:
+        obj, labels = first.obj, kept * first.rig.num_cameras * first.obj.num_fiducials
+        if obj.unknown_markers or not obj.exact or obj.num_fiducials > PRINT_FIDUCIALS or labels > MOST_TESTED:
             return result
         loose = free_object(first, SHAPE, ALL_MM)
         with contextlib.suppress(RefusedError):
