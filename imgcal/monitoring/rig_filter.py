@@ -16,7 +16,7 @@ from imgcal.monitoring.measurement_update import absorb, stack_snapshots
 from imgcal.monitoring.rig_belief import MeasurementUpdate, RigBelief, age_belief
 from imgcal.types import CalibrationObject, CameraRig, DriftRate, Observations
 
-TOGETHER = (*range(2, 17), 20, 25, 32, 40, 50, 64, 80, 100, 128, 160, 200, 256, 320, 400, 512)
+TOGETHER = (*range(2, 17), 20, 25, 32, 40, 50, 64, 80, 100, 128, 200, 320, 512)
 """Numbers of first snapshots at which all so far are absorbed together again ..."""
 FIRST_OF_CAMERA = frozenset((2, 4, 8, 16, 32))
 """... and numbers of snapshots of any one camera: the less is known about it, the less linear are its equations."""
