@@ -69,9 +69,12 @@ FEW_SNAPSHOTS = 16
 stated uncertainty, and the wrong camera would be blamed. It is then forgotten ..."""
 OBJECT_SNAPSHOTS = 8
 """... and a change of the object is not considered before this many snapshots have been absorbed."""
-LOOSENED, MOST_TESTED, LOOSE_ODDS = (16, 32, 64, 128, 256), 2**14, 5.0
+LOOSENED, MOST_TESTED, LOOSE_ODDS = (16, 32, 64, 128, 200), 2**13, 5.0
 """Numbers of first snapshots after which an object is tested for errors that its file does not state, the largest
 number of labels that they may have, and the log odds at which it has some."""
+OTHER_WEIGHTS = 0.8
+"""Ratio of the labels' standard deviations, after errors seem to be independent to before, below which the usual fit of
+snapshots is measured anew."""
 UNDECIDED_SNAPSHOTS = 16
 """Snapshots for which a camera stays in doubt that seemed to have moved without a decision."""
 NEW_SHARE = 0.25
@@ -206,7 +209,12 @@ class RigMonitor:
         self.noise.add(observations, residual)
         if self.noise.time is not before:
             self._recent.lasting = self.noise.model_error
-            self.filter.rescale((self.noise.assumed_time / assumed).sqrt())
+            ratio = (self.noise.assumed_time / assumed).sqrt()
+            self.filter.rescale(ratio)
+            if float(ratio.min()) < OTHER_WEIGHTS and not self.filter.calibrated:
+                self._misfit = (
+                    Misfit()
+                )  # how well the earlier snapshots fitted is no measure for those with more weight
 
     def seen_points(self, camera: int) -> Tensor:
         """Where a camera has lately seen fiducials or lights: (P, 3) mm in the rig's frame."""

@@ -94,3 +94,18 @@ def test_a_camera_whose_first_labels_were_off_has_not_moved() -> None:
     assert changes == []
     error = Gauge.from_majority(monitor.filter.belief.rig, made.rig).align(monitor.filter.belief.rig, made.rig)
     assert float(error.local(made.rig)[1, :3].norm()) < 0.005
+
+
+def test_snapshots_that_count_for_more_are_no_misfit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Errors seem to be independent after 132 snapshots; nothing is searched for what would explain the larger ones."""
+    asked = []
+    monkeypatch.setattr(RigMonitor, "_diagnose_misfit", lambda self, age: asked.append(self.filter.count))
+    factory, obj = imgcal.load_rig("T4"), imgcal.load_object("asymmetric8")
+    made = Stream(factory, obj, 1, Conditions(labelled=True))
+    poses = made.poses_at(torch.arange(270, dtype=torch.float64) / RATE)
+    seen, _ = made.labelled(0, 270)
+    monitor = RigMonitor(RigFilter(factory, obj))
+    for number in range(270):
+        monitor.update(seen.of_snapshots([number]), poses[number : number + 1], 1 / RATE)
+    assert monitor.noise.usual == 1.0
+    assert not asked
