@@ -191,8 +191,7 @@ class RigFilter:
                 left = horizon.remove(self.belief, seen_cameras(forgotten), seen_cameras(self._early), self._first)
                 self._first, horizon.away = left.first, left.away
         result = absorb(self._first, *stack_snapshots(self._early), self.options, start)
-        self.belief, self._waited = age_belief(result.belief, self._span, self.walk), 0.0
-        return replace(result.of_last(), belief=self.belief)
+        return self.begin_with(self._first, result)
 
     def restart(
         self, first: RigBelief, snapshots: Sequence[tuple[Observations, RigidTransform]], new: int = 0
@@ -224,9 +223,9 @@ class RigFilter:
         return absorb(first, *stack_snapshots(self._early), self.options)
 
     def begin_with(self, first: RigBelief, result: MeasurementUpdate) -> MeasurementUpdate:
-        """Continue from the result of `absorb_kept`."""
+        """Continue from the kept snapshots' joint update; returns it with the pose and residual of the last one."""
         self._first, self.belief, self._waited = first, age_belief(result.belief, self._span, self.walk), 0.0
-        return replace(result, belief=self.belief)
+        return replace(result.of_last(), belief=self.belief)
 
     def replace_beliefs(self, first: RigBelief, belief: RigBelief) -> None:
         """Replace the beliefs: before the first kept snapshot, and now."""

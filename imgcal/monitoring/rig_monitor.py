@@ -551,9 +551,15 @@ class RigMonitor:
             RefusedError: see `absorb`; the monitor is unchanged.
         """
         result = self.filter.restart(before, snapshots, new=len(snapshots) if new else 0)
+        self._replace_recent(snapshots, pauses, result)
+        return result
+
+    def _replace_recent(
+        self, snapshots: Sequence[Snapshot], pauses: Sequence[float], result: MeasurementUpdate
+    ) -> None:
+        """Begin the recent snapshots anew, with some and their joint update."""
         self._recent = RecentSnapshots(result.belief, self.filter.walk, self.noise.model_error)
         self._recent.replace(snapshots, pauses, result)
-        return result
 
     def _diagnose_misfit(self, age: int) -> MonitorUpdate | None:
         """Learn the object again if it has changed and the latest snapshots therefore fit worse."""
@@ -589,9 +595,7 @@ class RigMonitor:
             if free.evidence - result.evidence > LOOSE_ODDS:
                 self._prior = loose
                 result = self.filter.begin_with(loose, free)
-                latest, pauses = self._recent.latest(len(self._recent))
-                self._recent = RecentSnapshots(result.belief, self.filter.walk, self.noise.model_error)
-                self._recent.replace(latest, pauses, result)
+                self._replace_recent(*self._recent.latest(len(self._recent)), result)
         return result
 
     def diagnose_object(

@@ -51,7 +51,7 @@ def test_a_bumped_camera_is_followed_at_once_and_no_other_is_blamed(horizon, tur
 
 
 def test_without_a_horizon_what_is_known_of_other_cameras_is_kept():
-    stream = Stream("T4", "asymmetric8", 80)  # after 64, errors that do not last are known not to
+    stream = Stream("T4", "asymmetric8", 80)
     with RigKeeper(stream.rig, stream.obj) as keeper, RigKeeper(stream.rig, stream.obj, horizon=5) as short:
         everything, latest = run(stream, keeper, range(80))[-1], run(stream, short, range(80))[-1]
     assert bool((everything.std[:, 6] < 0.6 * latest.std[:, 6]).all())

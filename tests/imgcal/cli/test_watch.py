@@ -256,7 +256,7 @@ def test_images_in_another_convention_are_named(blobs, stream, tmp_path, capsys)
     assert f"nothing could be learned from any snapshot: {UPSIDE_DOWN}" in capsys.readouterr().err
 
 
-def test_the_cause_of_the_refusal_causes_is_told_once_and_again_after_something_was_learned(blobs, stream):
+def test_the_cause_of_the_first_refusals_is_told_once_and_again_after_something_was_learned(blobs, stream):
     refusals, table = RefusalCauses(stream.rig, stream.obj), upside_down(blobs, stream.rig)
     states = [SimpleNamespace(refused="no", detections=table.of_snapshots(s, s + 1)) for s in range(30)]
     told = [refusals.add(state) for state in states for _ in range(2)]
